@@ -1,0 +1,71 @@
+"""The command line: one table of commands, each loaded only when it is called."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from tactile_bayes import __version__
+from tactile_bayes.errors import EXIT_INTERRUPTED, TactileBayesError
+
+# name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
+COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("demo", "Run the main job on an embedded scan: map, estimate, figures, a table."),
+    "import": ("import_", "Bring other people's arrays, grids and images in."),
+    "map": ("map", "Build a tactile map from one or more scans (paper steps i-iii)."),
+    "calibrate": ("calibrate", "Learn a calibration: `calibrate size`."),
+    "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
+    "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
+    "simulate": ("simulate", "Make a scan with known truth from a scene."),
+    "show": ("show", "Say what any of our files is and how good it is."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group that lists its commands from a table and imports one when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        del ctx
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        del ctx
+        if cmd_name not in COMMANDS:
+            return None
+        module, _ = COMMANDS[cmd_name]
+        command = importlib.import_module(f"tactile_bayes.commands.{module}").command
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="tactile-bayes")
+def cli() -> None:
+    """Lump size with an honest credible interval from tactile maps. Research use only.
+
+    The way through: import (or simulate) -> map -> calibrate size -> estimate -> validate.
+    Start with `tactile-bayes demo`.
+    """
+
+
+def main() -> None:
+    """Run the program; every known error becomes one line on stderr and its documented exit code."""
+    try:
+        status = cli.main(prog_name="tactile-bayes", standalone_mode=False)
+    except click.Abort:
+        click.echo("interrupted", err=True)
+        sys.exit(EXIT_INTERRUPTED)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except TactileBayesError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(error.exit_code)
+    sys.exit(status if isinstance(status, int) else 0)

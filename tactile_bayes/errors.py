@@ -1,0 +1,80 @@
+"""Every error the program can explain in one line, each with the exit code it ends in.
+
+Exit codes: 0 done, 2 usage, 3 bad data, 4 device, 5 not converged, 6 no estimate, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+EXIT_DONE = 0
+EXIT_USAGE = 2
+EXIT_BAD_DATA = 3
+EXIT_DEVICE = 4
+EXIT_NOT_CONVERGED = 5
+EXIT_NO_ESTIMATE = 6
+EXIT_INTERRUPTED = 130
+
+
+class TactileBayesError(Exception):
+    """Base of all errors that end in one line on stderr and a documented exit code."""
+
+    exit_code = 1
+
+
+class UsageError(TactileBayesError):
+    """The options contradict each other or the state of the disk (for example, the output exists)."""
+
+    exit_code = EXIT_USAGE
+
+
+class BadDataError(TactileBayesError, ValueError):
+    """A file, array or table does not hold what it must.
+
+    Parameters
+    ----------
+    what
+        What is wrong, with the value: ``"frame_time_s runs backwards at index 7 (1.250 after 1.255)"``.
+    way_out
+        What the user can do about it.
+    path
+        The file, when one is at fault. Code that holds only arrays leaves it out; the reader fills it in.
+    """
+
+    exit_code = EXIT_BAD_DATA
+
+    def __init__(self, what: str, *, way_out: str = "", path: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.way_out = way_out
+        self.path = path
+
+    def __str__(self) -> str:
+        head = f"{self.path}: {self.what}" if self.path else self.what
+        return f"{head}; {self.way_out}" if self.way_out else head
+
+    def at(self, path: object) -> BadDataError:
+        """The same error, naming the file it was found in."""
+        return type(self)(self.what, way_out=self.way_out, path=self.path or str(path))
+
+
+class DeviceError(TactileBayesError):
+    """A port or a device did not answer as its protocol says."""
+
+    exit_code = EXIT_DEVICE
+
+
+class NotConvergedError(TactileBayesError):
+    """A sampler or solver stopped before its own criteria were met.
+
+    Parameters
+    ----------
+    message
+        What was not reached and how much longer to run.
+    diagnostics
+        The figures at the time of stopping (for example ``{"rhat": 1.03, "ess_bulk": 410.0}``).
+    """
+
+    exit_code = EXIT_NOT_CONVERGED
+
+    def __init__(self, message: str, *, diagnostics: dict[str, float] | None = None) -> None:
+        super().__init__(message)
+        self.diagnostics = diagnostics or {}

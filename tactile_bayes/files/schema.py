@@ -1,0 +1,68 @@
+"""The schemas in data_schema/: found in a wheel or a checkout, and applied with one-line errors."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import unreadable
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+
+
+@cache
+def load_schema(name: str) -> dict[str, Any]:
+    """The schema document ``data_schema/NAME`` (``size_calibration.schema.json``, ``trial.table.json``...)."""
+    for folder in (_PACKAGE / "data_schema", _PACKAGE.parent / "data_schema"):
+        if (folder / name).is_file():
+            document: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
+            return document
+    raise FileNotFoundError(f"schema {name} is not installed with this program")
+
+
+def check_document(document: object, schema_name: str, *, path: Path) -> None:
+    """Check a JSON document against its schema.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the field, its value and the rule it breaks.
+    """
+    import fastjsonschema
+
+    try:
+        _validator(schema_name)(document)
+    except fastjsonschema.JsonSchemaValueException as error:
+        where = ".".join(error.path[1:]) or "the document"
+        value = repr(error.value)
+        value = value if len(value) <= 60 else value[:57] + "..."
+        rule = error.message.split(" ", 1)[1] if " " in error.message else error.message
+        raise BadDataError(f"{where} {rule} (found {value})", way_out=f"see {schema_name}", path=str(path)) from None
+
+
+@cache
+def _validator(schema_name: str) -> Any:
+    import fastjsonschema
+
+    return fastjsonschema.compile(load_schema(schema_name))
+
+
+def read_json(path: Path, schema_name: str) -> dict[str, Any]:
+    """Read a JSON file and check it against its schema; see `check_document` for the errors."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise unreadable(path, error) from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise BadDataError(f"not a JSON file ({error})", way_out="give a file this program wrote", path=str(path)) from None
+    check_document(document, schema_name, path=path)
+    assert isinstance(document, dict)
+    return document
+
+
+def dump_json(document: object) -> str:
+    """JSON text with a fixed layout; refuses NaN and infinities, which JSON does not have."""
+    return json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n"

@@ -1,0 +1,1 @@
+"""Forward models: what a scene of lumps shows to the scan head."""

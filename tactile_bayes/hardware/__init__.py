@@ -1,0 +1,1 @@
+"""Serial devices: scan heads, magnetic trackers, emulators and the recorder."""

@@ -1,0 +1,1 @@
+"""From a scan to a tactile map (paper steps i to iii)."""

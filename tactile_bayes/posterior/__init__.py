@@ -1,0 +1,1 @@
+"""From a tactile map to a posterior over width, amplitude and size."""

@@ -1,0 +1,30 @@
+"""The named numbers of the paper and of this program, each with its source."""
+
+from __future__ import annotations
+
+from typing import Final
+
+RESEARCH_USE: Final = "Research use only: not a diagnostic device."
+
+# Wellman & Howe (1999), section 2.1 and figure 1.
+HEAD_ROWS: Final = 16  # across the head, x of the scanhead frame
+HEAD_COLUMNS: Final = 26  # along the head, y of the scanhead frame
+HEAD_PITCH_MM: Final = 1.5
+PRESSURE_RANGE_KPA: Final = (0.0, 34.0)
+FRAME_INTERVAL_S: Final = 0.005
+
+# "Anticipated user-applied pressures", section 2.1; the paper gives the gate no number of its own.
+PRESSURE_WINDOW_KPA: Final = (5.0, 14.0)
+
+# The head as simulated: an arc with rounded shoulders (shared design notes; the paper: "nearly a circular cylinder").
+HEAD_RADIUS_MM: Final = 35.0
+
+CELL_MM: Final = 1.0
+# A cell wider than this share of the narrower sigma is called coarse in the report.
+CELL_PER_SIGMA: Final = 0.75
+# Radius about the lump's centre inside which the map is fitted, where no size calibration says otherwise.
+FIT_RADIUS_MM: Final = 20.0
+
+NORMALISE: Final = ("mean", "gain", "none")
+METHODS: Final = ("optimise", "laplace", "ensemble")
+INTERVAL: Final = 0.95

@@ -1,0 +1,1 @@
+"""Method comparison of size estimates against excision."""
