@@ -1,0 +1,187 @@
+"""Rigid transforms, quaternions, the best-fit plane and the patient frame.
+
+Frames: `base` (tracker, paper O), `scanhead` (paper S), `plane` (paper P), `patient` (paper C). A transform is a
+(4, 4) matrix named by what it gives and takes: ``p_plane = plane_from_base @ p_base``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+
+FloatArray = NDArray[np.float64]
+
+
+def rotation_from_quaternion(quaternion_wxyz: FloatArray) -> FloatArray:
+    """Rotation matrices of unit quaternions, scalar first.
+
+    Parameters
+    ----------
+    quaternion_wxyz : (..., 4) array
+        Normalised here, so that rounding in a device does not stretch a head.
+
+    Returns
+    -------
+    (..., 3, 3) array
+        Proper rotations; ``p_outer = R @ p_inner``.
+    """
+    unit = quaternion_wxyz / np.linalg.norm(quaternion_wxyz, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(unit, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Unit quaternion, scalar first and not negative, of one (3, 3) rotation (eigenvector method, Bar-Itzhack 2000)."""
+    r = rotation
+    gram = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
+            [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
+            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
+        ]
+    )
+    _, vectors = np.linalg.eigh(gram)  # reads the lower triangle
+    x, y, z, w = vectors[:, -1]
+    quaternion = np.array([w, x, y, z])
+    return -quaternion if w < 0 else quaternion
+
+
+def unroll_quaternion_signs(quaternion_wxyz: FloatArray) -> FloatArray:
+    """Flip signs so that neighbours lie on one hemisphere: q and -q are one rotation, but not for interpolation."""
+    dots = np.einsum("ij,ij->i", quaternion_wxyz[1:], quaternion_wxyz[:-1])
+    signs = np.cumprod(np.concatenate([[1.0], np.where(dots < 0, -1.0, 1.0)]))
+    return quaternion_wxyz * signs[:, None]
+
+
+def rigid(rotation: FloatArray, translation_mm: FloatArray) -> FloatArray:
+    """(4, 4) transform of a (3, 3) rotation and a (3,) translation in mm."""
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = translation_mm
+    return transform
+
+
+def inverse(transform: FloatArray) -> FloatArray:
+    """Inverse of a rigid transform, exact to rounding."""
+    rotation = transform[:3, :3]
+    return rigid(rotation.T, -rotation.T @ transform[:3, 3])
+
+
+def apply(transform: FloatArray, points_mm: FloatArray) -> FloatArray:
+    """Transform (..., 3) points in mm."""
+    moved: FloatArray = points_mm @ transform[:3, :3].T + transform[:3, 3]
+    return moved
+
+
+def check_rigid(transform: FloatArray, *, name: str, tolerance: float = 1e-6) -> None:
+    """Raise `BadDataError` unless `transform` is a (4, 4) proper rigid motion."""
+    if transform.shape != (4, 4) or not np.isfinite(transform).all():
+        raise BadDataError(f"{name} must be a finite (4, 4) matrix (shape {transform.shape})")
+    rotation = transform[:3, :3]
+    departure = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if departure > tolerance or np.linalg.det(rotation) < 0 or not np.array_equal(transform[3], [0, 0, 0, 1]):
+        raise BadDataError(
+            f"{name} is not a rigid transform (R R^T departs from 1 by {departure:.1e})",
+            way_out="give a proper rotation and a translation in mm, last row 0 0 0 1",
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plane:
+    """A plane fitted to points, with how well it is determined.
+
+    Parameters
+    ----------
+    plane_from_base : (4, 4) array
+        Origin at the centroid, z along the sensor normal (into the tissue), x along the mean head x axis.
+    rms_mm
+        Root mean square distance of the points from the plane.
+    spread_mm : (3,) array
+        Standard deviations of the points along the principal axes, descending.
+    """
+
+    plane_from_base: FloatArray
+    rms_mm: float
+    spread_mm: FloatArray
+
+
+def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: FloatArray, head_z: FloatArray) -> Plane:
+    """Best-fit plane from the first two moments of taxel centres (paper step i).
+
+    Moments can be streamed and added, so the same plane comes from one scan or from its parts. The sign of the normal
+    follows `head_z`, because eigenvectors have none; the x axis follows `head_x`, because widths are calibrated
+    per axis of the head.
+
+    Parameters
+    ----------
+    centroid_mm : (3,) array
+        Mean of the taxel centres in `base`.
+    covariance_mm2 : (3, 3) array
+        Their covariance.
+    head_x, head_z : (3,) arrays
+        Mean directions of the head's x axis and of its normal (into the tissue) in `base`.
+
+    Raises
+    ------
+    BadDataError
+        When the points lie too nearly on a line to span a plane, or the normal disagrees with the head's.
+    """
+    variances, axes = np.linalg.eigh(covariance_mm2)
+    spread = np.sqrt(np.clip(variances, 0.0, None))[::-1]
+    if not spread[1] > 0.05 * spread[0] or not spread[1] > 1e-9:
+        raise BadDataError(
+            f"the taxel centres lie on a line (spread {spread[0]:.3g} by {spread[1]:.3g} mm)",
+            way_out="scan with strokes side by side",
+        )
+    normal = axes[:, 0]
+    agreement = float(normal @ head_z) / float(np.linalg.norm(head_z))
+    if abs(agreement) < 0.9:
+        angle = np.degrees(np.arccos(abs(agreement)))
+        raise BadDataError(
+            f"the plane of the motion and the head's face are {angle:.0f} degrees apart",
+            way_out="check the quaternion order (scalar first) and scanhead_from_tracker",
+        )
+    normal = normal if agreement > 0 else -normal
+    x_axis = head_x - (head_x @ normal) * normal
+    x_axis = x_axis / np.linalg.norm(x_axis)
+    rotation = np.stack([x_axis, np.cross(normal, x_axis), normal])
+    return Plane(rigid(rotation, -rotation @ centroid_mm), float(spread[2]), spread)
+
+
+def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:
+    """Patient frame from two landmarks and the direction into the body.
+
+    Origin at the xiphoid, y towards the sternal notch, z the part of `normal` (into the body) at right angles to y,
+    x = y cross z. The two landmarks of the paper fix only y; z is this program's choice of the third direction.
+
+    Raises
+    ------
+    BadDataError
+        When the landmarks coincide or their line runs along the normal.
+    """
+    along = sternal_notch_mm - xiphoid_mm
+    length = float(np.linalg.norm(along))
+    if not length > 1.0:
+        raise BadDataError(
+            f"sternal notch and xiphoid are {length:.2f} mm apart", way_out="touch both landmarks before the scan"
+        )
+    y_axis = along / length
+    z_axis = normal - (normal @ y_axis) * y_axis
+    size = float(np.linalg.norm(z_axis))
+    if size < 0.1:
+        raise BadDataError(
+            "the line of the landmarks runs along the plane's normal", way_out="touch both landmarks again"
+        )
+    z_axis = z_axis / size
+    rotation = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis])
+    return rigid(rotation, -rotation @ xiphoid_mm)

@@ -1,0 +1,101 @@
+"""The tactile map: what a scan became, with the recipe that made it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class MapRecipe:
+    """How a map was built: what a size calibration must share with the maps it is used on.
+
+    Parameters
+    ----------
+    source
+        ``"scan"`` or ``"grid"`` (a map imported as it is).
+    normalise
+        ``"mean"``, ``"gain"`` or ``"none"``.
+    cell_mm
+        Side of the square cells.
+    pressure_window_kpa
+        The gate on the frame's mean; None for an imported grid.
+    latency_ms
+        By how much a pose's stamp is late against the frames.
+    """
+
+    source: str
+    normalise: str
+    cell_mm: float
+    pressure_window_kpa: tuple[float, float] | None = None
+    latency_ms: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TactileMap:
+    """Mean normalised pressure on the best-fit plane.
+
+    Parameters
+    ----------
+    mean, variance : (ny, nx) arrays
+        Mean and within-cell variance of the readings; NaN where `count` is 0. Without unit after normalising,
+        kPa with ``normalise="none"``.
+    count : (ny, nx) int64 array
+        Readings a cell.
+    x_mm, y_mm : (nx,), (ny,) arrays
+        Cell centres in `plane`; x runs across the head, y along it.
+    recipe
+        How the map was built.
+    plane_from_base : (4, 4) array or None
+        None for an imported grid.
+    patient_from_plane : (4, 4) array or None
+        None without landmarks.
+    background
+        Level far from the lump that normalising defines (1 in the paper's Eqs 5 and 7); None when it is not known.
+    frame_count
+        Frames that went in. Cells share frames, so a map has fewer independent errors than readings.
+    quality
+        Counts and figures for the report (frames dropped low/high, tilt, rms...).
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    x_mm: FloatArray
+    y_mm: FloatArray
+    recipe: MapRecipe
+    plane_from_base: FloatArray | None = None
+    patient_from_plane: FloatArray | None = None
+    background: float | None = 1.0
+    frame_count: int = 0
+    quality: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = (len(self.y_mm), len(self.x_mm))
+        for name in ("mean", "variance", "count"):
+            if getattr(self, name).shape != shape:
+                raise BadDataError(
+                    f"{name} has shape {getattr(self, name).shape}", way_out=f"it must be {shape} (ny, nx)"
+                )
+        if self.count.size and self.count.min() < 0:
+            raise BadDataError(f"count holds {self.count.min()}", way_out="counts must not be negative")
+        if not self.recipe.cell_mm > 0:
+            raise BadDataError(f"cell_mm is {self.recipe.cell_mm}", way_out="it must be positive, in mm")
+        for name in ("mean", "variance", "count", "x_mm", "y_mm"):
+            view = getattr(self, name).view()
+            view.flags.writeable = False
+            object.__setattr__(self, name, view)
+        covered = self.count > 0
+        if np.isinf(self.mean[covered]).any():
+            raise BadDataError("mean holds infinite values", way_out="mark cells without data by count 0")
+
+    @property
+    def covered(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """(ny, nx) True where the map has data."""
+        covered: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & np.isfinite(self.mean)
+        return covered

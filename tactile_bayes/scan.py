@@ -1,0 +1,233 @@
+"""One examination's data: pressure frames, tracker poses, head and landmarks.
+
+A live device, a log and a simulation all yield these types. Arrays are kept as read-only views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray, check_rigid
+from tactile_bayes.presets import PRESSURE_RANGE_KPA
+
+CountArray = NDArray[np.uint16]
+
+
+def _check_finite(array: FloatArray, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
+    """The array as float64, after its shape (None is any length) and finiteness were checked."""
+    values = np.asarray(array, dtype=np.float64)
+    fits = values.ndim == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, values.shape, strict=True)
+    )
+    if not fits:
+        wanted = "(" + ", ".join("n" if want is None else str(want) for want in shape) + ")"
+        raise BadDataError(f"{name} has shape {values.shape}", way_out=f"it must be {wanted}")
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise BadDataError(
+            f"{name} has {len(bad)} values that are not finite (first at {index}: {values[index]})",
+            way_out="mask or repair them before import",
+        )
+    view = values.view()
+    view.flags.writeable = False
+    return view
+
+
+def _check_times(time_s: FloatArray, *, name: str) -> FloatArray:
+    values = _check_finite(time_s, name=name, shape=(None,))
+    back = np.flatnonzero(np.diff(values) < 0)
+    if len(back):
+        i = int(back[0]) + 1
+        raise BadDataError(
+            f"{name} runs backwards at index {i} ({values[i]:.6f} after {values[i - 1]:.6f})",
+            way_out="sort the records by time or cut the scan there",
+        )
+    if len(values) and values[0] < 0:
+        raise BadDataError(f"{name} starts at {values[0]:.6f} s", way_out="times must not be negative")
+    return values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadGeometry:
+    """Where the taxels sit and how the tracker is mounted.
+
+    Parameters
+    ----------
+    surface_mm : (rows, columns, 3) array
+        Taxel centres in `scanhead`: origin at the apex of the face, z into the tissue, axis 0 across the head (x),
+        axis 1 along it (y).
+    pitch_mm
+        Distance between neighbouring taxels.
+    scanhead_from_tracker : (4, 4) array
+        The lever arm: ``p_scanhead = scanhead_from_tracker @ p_tracker``.
+    """
+
+    surface_mm: FloatArray
+    pitch_mm: float
+    scanhead_from_tracker: FloatArray
+
+    def __post_init__(self) -> None:
+        surface = _check_finite(self.surface_mm, name="surface_mm", shape=(None, None, 3))
+        object.__setattr__(self, "surface_mm", surface)
+        if not 0 < self.pitch_mm < 100:
+            raise BadDataError(f"pitch_mm is {self.pitch_mm}", way_out="it must be positive, in mm")
+        transform = _check_finite(self.scanhead_from_tracker, name="scanhead_from_tracker", shape=(4, 4))
+        check_rigid(transform, name="scanhead_from_tracker")
+        object.__setattr__(self, "scanhead_from_tracker", transform)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows across the head and columns along it."""
+        return (self.surface_mm.shape[0], self.surface_mm.shape[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ElementCalibration:
+    """Bladder calibration of each taxel: pressure in kPa = gain x counts + offset.
+
+    Parameters
+    ----------
+    gain_kpa_per_count, offset_kpa : (rows, columns) arrays
+    saturation_count
+        Readings at or above it are saturated and carry no pressure.
+    """
+
+    gain_kpa_per_count: FloatArray
+    offset_kpa: FloatArray
+    saturation_count: int = 4095
+
+    def __post_init__(self) -> None:
+        gain = _check_finite(self.gain_kpa_per_count, name="gain_kpa_per_count", shape=(None, None))
+        offset = _check_finite(self.offset_kpa, name="offset_kpa", shape=gain.shape)
+        if gain.size and not gain.min() >= 0:
+            index = tuple(int(i) for i in np.argwhere(gain < 0)[0])
+            raise BadDataError(
+                f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})", way_out="calibrate again"
+            )
+        object.__setattr__(self, "gain_kpa_per_count", gain)
+        object.__setattr__(self, "offset_kpa", offset)
+
+    def to_kpa(self, counts: CountArray) -> FloatArray:
+        """Pressure in kPa of (n, rows, columns) counts; NaN where a reading is saturated (count or 34 kPa)."""
+        pressure = counts * self.gain_kpa_per_count + self.offset_kpa
+        pressure[(counts >= self.saturation_count) | (pressure >= PRESSURE_RANGE_KPA[1])] = np.nan
+        return pressure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PressureFrames:
+    """Raw frames of the array.
+
+    Parameters
+    ----------
+    time_s : (n,) array
+        Device time of each frame; never runs backwards.
+    counts : (n, rows, columns) uint16 array
+        Raw readings.
+    """
+
+    time_s: FloatArray
+    counts: CountArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "time_s", _check_times(self.time_s, name="frame_time_s"))
+        if self.counts.dtype != np.uint16 or self.counts.ndim != 3 or len(self.counts) != len(self.time_s):
+            raise BadDataError(
+                f"counts is {self.counts.dtype} of shape {self.counts.shape} for {len(self.time_s)} frame times",
+                way_out="it must be uint16 (n, rows, columns), one frame a time",
+            )
+        view = self.counts.view()
+        view.flags.writeable = False
+        object.__setattr__(self, "counts", view)
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackerPoses:
+    """Poses of the tracker's sensor in `base`.
+
+    Parameters
+    ----------
+    time_s : (m,) array
+        Device time on the frames' clock.
+    position_mm : (m, 3) array
+    quaternion_wxyz : (m, 4) array
+        Scalar first; ``p_base = position + R(q) p_tracker``. Signs are free.
+    """
+
+    time_s: FloatArray
+    position_mm: FloatArray
+    quaternion_wxyz: FloatArray
+
+    def __post_init__(self) -> None:
+        time = _check_times(self.time_s, name="pose_time_s")
+        position = _check_finite(self.position_mm, name="position_mm", shape=(len(time), 3))
+        quaternion = _check_finite(self.quaternion_wxyz, name="quaternion_wxyz", shape=(len(time), 4))
+        norm = np.linalg.norm(quaternion, axis=1)
+        off = np.flatnonzero(np.abs(norm - 1.0) > 1e-2)
+        if len(off):
+            i = int(off[0])
+            raise BadDataError(
+                f"quaternion_wxyz has norm {norm[i]:.4g} at index {i} ({len(off)} in all depart from 1 by over 1 %)",
+                way_out="give unit quaternions, scalar first",
+            )
+        for name, value in (("time_s", time), ("position_mm", position), ("quaternion_wxyz", quaternion)):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """Points touched just before the scan, in `base`, mm."""
+
+    sternal_notch_mm: FloatArray
+    xiphoid_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("sternal_notch_mm", "xiphoid_mm"):
+            object.__setattr__(self, name, _check_finite(getattr(self, name), name=name, shape=(3,)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """All of one scan, ready to be mapped.
+
+    Parameters
+    ----------
+    frames, poses, head, element_calibration
+        As recorded.
+    landmarks
+        None when they were not touched: the map then has no patient frame.
+    session
+        Plain text facts (device ids, side, posture...); no names.
+    """
+
+    frames: PressureFrames
+    poses: TrackerPoses
+    head: HeadGeometry
+    element_calibration: ElementCalibration
+    landmarks: Landmarks | None = None
+    session: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        taxels = self.frames.counts.shape[1:]
+        for name, shape in (
+            ("head.surface_mm", self.head.shape),
+            ("gain_kpa_per_count", self.element_calibration.gain_kpa_per_count.shape),
+        ):
+            if shape != taxels:
+                raise BadDataError(f"{name} is for {shape} taxels, counts have {taxels}", way_out="use one head's data")
+
+    def pressure_kpa(self, start: int = 0, stop: int | None = None) -> FloatArray:
+        """Calibrated frames `start` to `stop`: (n, rows, columns) kPa, NaN where saturated."""
+        return self.element_calibration.to_kpa(self.frames.counts[start:stop])
