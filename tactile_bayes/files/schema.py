@@ -57,7 +57,9 @@ def read_json(path: Path, schema_name: str) -> dict[str, Any]:
     except OSError as error:
         raise unreadable(path, error) from None
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise BadDataError(f"not a JSON file ({error})", way_out="give a file this program wrote", path=str(path)) from None
+        raise BadDataError(
+            f"not a JSON file ({error})", way_out="give a file this program wrote", path=str(path)
+        ) from None
     check_document(document, schema_name, path=path)
     assert isinstance(document, dict)
     return document
