@@ -1,0 +1,311 @@
+"""Comma-separated tables read under a Table Schema: a cell is what its schema says, or the reader says why not.
+
+Nothing is guessed or repaired. Each fault is one `BadDataError` naming the file, the line, the column, the value
+and what to do. Two properties of a field go beyond the Table Schema standard: ``"column": "required"`` (the column
+must be there although its cells may be blank) and ``ifZero`` (what to ask when a cell that must exceed 0 holds 0).
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import math
+import operator
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.schema import load_schema
+
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_INTEGER = re.compile(r"[+-]?[0-9]+")
+_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+")
+_NOT_FINITE = {"nan", "inf", "infinity"}
+_TO_MM = {"cm": "10", "m": "1000", "in": "25.4", "inch": "25.4", "um": "0.001"}
+_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
+_AS_UTF8 = "save it as CSV UTF-8"
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A checked table, column by column.
+
+    Attributes
+    ----------
+    path
+        Where it was read.
+    columns
+        A list for each column of the schema, in the schema's order and of the schema's type: str, float, int or
+        bool. A blank cell is None, and so is each cell of an optional column that the file leaves out.
+    line_numbers
+        The line of the file at which each row begins; the header is line 1.
+    """
+
+    path: Path
+    columns: dict[str, list[Any]]
+    line_numbers: list[int]
+
+    def __len__(self) -> int:
+        return len(self.line_numbers)
+
+    def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
+        """A fault found in one cell after reading, told as the reader tells its own.
+
+        Parameters
+        ----------
+        row
+            Index into the columns, from 0.
+        """
+        return _fault(self.path, self.line_numbers[row], column, what, way_out=way_out)
+
+
+def read_table(path: Path, schema_name: str) -> Table:
+    """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME`` (``trial.table.json``...).
+
+    Raises
+    ------
+    BadDataError
+        At the first fault: encoding, header, a cell against its type and constraints, or a repeated primary key.
+
+    Notes
+    -----
+    The file is UTF-8, with or without a byte order mark, with commas between cells and points in numbers. Blank
+    lines are skipped.
+    """
+    schema = load_schema(schema_name)
+    fields = {field["name"]: field for field in schema["fields"]}
+    rows = _split(path, _decode(path))
+    if not rows:
+        raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}", path=str(path))
+    (_, header), *body = rows
+    _check_header(path, header, fields)
+    if not body:
+        raise BadDataError("holds a header and no rows", way_out="add at least one row", path=str(path))
+    columns: dict[str, list[Any]] = {name: [] for name in fields}
+    for line, cells in body:
+        _check_length(path, line, cells, header)
+        row = dict(zip(header, cells, strict=True))
+        for name, field in fields.items():
+            columns[name].append(_parse_cell(path, line, row.get(name, ""), field=field))
+    table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
+    _check_primary_key(table, schema.get("primaryKey", []))
+    return table
+
+
+def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
+    """Check that each row points at a row that exists, as the schema's ``foreignKeys`` say.
+
+    Parameters
+    ----------
+    targets
+        The tables pointed at, by the name that the schema gives them (``excision``).
+
+    Raises
+    ------
+    BadDataError
+        Naming the first row whose key the other table does not hold.
+    """
+    for key in load_schema(schema_name).get("foreignKeys", []):
+        target = targets[key["reference"]["resource"]]
+        known = set(_keys(target, key["reference"]["fields"]))
+        for row, value in enumerate(_keys(table, key["fields"])):
+            if value not in known:
+                raise table.error(
+                    row,
+                    " + ".join(key["fields"]),
+                    f"{_shown_key(value)} has no row in {target.path}",
+                    way_out="add its row there, or correct the key",
+                )
+
+
+def _decode(path: Path) -> str:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error) from None
+    if data.startswith(_BYTE_ORDER_MARKS):
+        raise BadDataError("is UTF-16 text", way_out=_AS_UTF8, path=str(path))
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        what = f"line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text"
+        raise BadDataError(what, way_out=_AS_UTF8, path=str(path)) from None
+
+
+def _split(path: Path, text: str) -> list[tuple[int, list[str]]]:
+    """Rows that are not blank, each with the line it begins at."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows: list[tuple[int, list[str]]] = []
+    before = 0
+    try:
+        for cells in reader:
+            if cells:
+                rows.append((before + 1, cells))
+            before = reader.line_num
+    except csv.Error as error:
+        way_out = "check the quotes and line ends around it"
+        raise BadDataError(f"line {before + 1}: not CSV ({error})", way_out=way_out, path=str(path)) from None
+    return rows
+
+
+def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any]) -> None:
+    for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            way_out = "save it with commas between cells and points in numbers"
+            raise BadDataError(f"line 1: the cells are separated by {word}", way_out=way_out, path=str(path))
+    for name in header:
+        if name not in fields:
+            raise _fault(path, 1, name, "is not known here", way_out=_advice_on_column(name, header, fields))
+        if header.count(name) > 1:
+            raise _fault(path, 1, name, "appears more than once", way_out="keep one of them")
+    for name, field in fields.items():
+        if name not in header and (_is_required(field) or field.get("column") == "required"):
+            raise _fault(path, 1, name, "is missing", way_out=f"add it: {field['description']}")
+
+
+def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
+    stem, _, unit = name.strip().lower().rpartition("_")
+    if unit in _TO_MM and f"{stem}_mm" in fields:
+        return f"convert it to {stem}_mm (multiply by {_TO_MM[unit]})"
+    wanted = [field for field in fields if field not in header]
+    if f"{name.strip().lower()}_mm" in wanted:
+        return f"did you mean {name.strip().lower()}_mm, in millimetres?"
+    near = difflib.get_close_matches(name.strip().lower(), wanted, n=1, cutoff=0.7)
+    return f"did you mean {near[0]}?" if near else f"remove it; the columns are {_names(fields)}"
+
+
+def _check_length(path: Path, line: int, cells: Sequence[str], header: Sequence[str]) -> None:
+    if len(cells) == len(header):
+        return
+    way_out = "give every row a cell for each column"
+    if len(cells) > len(header):
+        way_out += " (a decimal comma? write 12.5, not 12,5)"
+    what = f"line {line}: {len(cells)} cells under {len(header)} columns"
+    raise BadDataError(what, way_out=way_out, path=str(path))
+
+
+def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any]) -> Any:
+    """The cell's value in the schema's type, or None where it is blank and may be."""
+    name = field["name"]
+    if text == "":
+        if _is_required(field):
+            raise _fault(path, line, name, "is blank", way_out=f"fill it in: {field['description']}")
+        return None
+    try:
+        if text != text.strip() or not text.isprintable():
+            raise _CellError(f"{_shown(text)} has blanks or unprintable characters around or in it", "remove them")
+        value = _PARSERS[field["type"]](text, field)
+        _check_constraints(value, text, field)
+    except _CellError as refusal:
+        raise _fault(path, line, name, refusal.what, way_out=refusal.way_out) from None
+    return value
+
+
+class _CellError(Exception):
+    """What is wrong with a cell, before it is known where the cell is."""
+
+    def __init__(self, what: str, way_out: str) -> None:
+        super().__init__(what)
+        self.what = what
+        self.way_out = way_out
+
+
+def _parse_string(text: str, field: Mapping[str, Any]) -> str:
+    del field
+    return text
+
+
+def _parse_number(text: str, field: Mapping[str, Any]) -> float:
+    if _NUMBER.fullmatch(text):
+        value = float(text)
+        if math.isfinite(value):
+            return value
+    if text.lstrip("+-").lower() in _NOT_FINITE or _NUMBER.fullmatch(text):
+        raise _CellError(f"{_shown(text)} is not a finite number", _blank_advice(field))
+    if _DECIMAL_COMMA.fullmatch(text):
+        raise _CellError(f"{_shown(text)} has a decimal comma", f"write {text.replace(',', '.')}")
+    unit = " in mm" if field["name"].endswith("_mm") else ""
+    raise _CellError(f"{_shown(text)} is not a number", f"write digits only{unit}; {_blank_advice(field)}")
+
+
+def _parse_integer(text: str, field: Mapping[str, Any]) -> int:
+    if not _INTEGER.fullmatch(text) or len(text) > 15:
+        raise _CellError(f"{_shown(text)} is not a whole number", f"write it as 1, 2, 3; {_blank_advice(field)}")
+    return int(text)
+
+
+def _parse_boolean(text: str, field: Mapping[str, Any]) -> bool:
+    for value, words in ((True, field["trueValues"]), (False, field["falseValues"])):
+        if text in words:
+            return value
+    raise _CellError(f"{_shown(text)} is neither true nor false", "write true or false")
+
+
+_PARSERS = {"string": _parse_string, "number": _parse_number, "integer": _parse_integer, "boolean": _parse_boolean}
+_LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
+    "minimum": (operator.ge, "at least"),
+    "exclusiveMinimum": (operator.gt, "above"),
+    "maximum": (operator.le, "at most"),
+    "exclusiveMaximum": (operator.lt, "below"),
+}
+
+
+def _check_constraints(value: Any, text: str, field: Mapping[str, Any]) -> None:
+    rules = field.get("constraints", {})
+    if value == 0 and "exclusiveMinimum" in rules and "ifZero" in field:
+        raise _CellError("is 0", field["ifZero"])
+    for rule, (holds, words) in _LIMITS.items():
+        if rule in rules and not holds(value, rules[rule]):
+            raise _CellError(f"{_shown(text)} is not {words} {rules[rule]}", f"correct it: {field['description']}")
+    if "enum" in rules and value not in rules["enum"]:
+        near = difflib.get_close_matches(text.lower(), rules["enum"], n=1)
+        guess = f"did you mean {near[0]}? " if near else ""
+        raise _CellError(f"{_shown(text)} is not known", f"{guess}it must be {' or '.join(rules['enum'])}")
+    if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
+        raise _CellError(f"{_shown(text)} does not match {rules['pattern']}", field["description"])
+
+
+def _check_primary_key(table: Table, fields: Sequence[str]) -> None:
+    if not fields:
+        return
+    first: dict[tuple[Any, ...], int] = {}
+    for row, key in enumerate(_keys(table, fields)):
+        if key in first:
+            what = f"{_shown_key(key)} stands on line {table.line_numbers[first[key]]} already"
+            raise table.error(row, " + ".join(fields), what, way_out="remove one row or correct its key")
+        first[key] = row
+
+
+def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:
+    return list(zip(*(table.columns[name] for name in fields), strict=True))
+
+
+def _is_required(field: Mapping[str, Any]) -> bool:
+    return bool(field.get("constraints", {}).get("required", False))
+
+
+def _blank_advice(field: Mapping[str, Any]) -> str:
+    return "correct it" if _is_required(field) else "leave the cell blank if there is none"
+
+
+def _names(fields: Mapping[str, Any]) -> str:
+    return ", ".join(name if _is_required(field) else f"[{name}]" for name, field in fields.items())
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def _shown_key(key: Sequence[Any]) -> str:
+    return " + ".join(_shown(str(part)) for part in key)
+
+
+def _fault(path: Path, line: int, column: str, what: str, *, way_out: str) -> BadDataError:
+    shown = column if re.fullmatch(r"\w+( \+ \w+)*", column) and len(column) <= 60 else _shown(column)
+    return BadDataError(f"line {line}, column {shown}: {what}", way_out=way_out, path=str(path))
