@@ -20,7 +20,7 @@ settings.register_profile(
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
-RunCli = Callable[..., "subprocess.CompletedProcess[str]"]
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="session")
@@ -33,8 +33,14 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def run_cli() -> RunCli:
-    """Run the program in a process of its own: ``run_cli("map", "scan.mcap", cwd=tmp_path)``.
+def child_environment() -> dict[str, str]:
+    """This process's variables, with the checkout importable and text wrapped at one width."""
+    return dict(os.environ) | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "PYTHONUTF8": "1"}
+
+
+@pytest.fixture(scope="session")
+def run_python(child_environment: dict[str, str]) -> Run:
+    """Run this Python in a process of its own: ``run_python("-c", code, cwd=tmp_path)``.
 
     Returns the `CompletedProcess` with text output, whatever the exit code; ``env`` adds variables.
     """
@@ -43,9 +49,9 @@ def run_cli() -> RunCli:
         *args: object, cwd: Path | None = None, env: dict[str, str] | None = None, timeout: float = 300.0
     ) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, "-m", "tactile_bayes", *map(str, args)],
+            [sys.executable, *map(str, args)],
             cwd=cwd,
-            env=child_environment() | (env or {}),
+            env=child_environment | (env or {}),
             capture_output=True,
             text=True,
             timeout=timeout,
@@ -55,6 +61,7 @@ def run_cli() -> RunCli:
     return run
 
 
-def child_environment() -> dict[str, str]:
-    """This process's variables, with the checkout importable and text wrapped at one width."""
-    return dict(os.environ) | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "PYTHONUTF8": "1"}
+@pytest.fixture(scope="session")
+def run_cli(run_python: Run) -> Run:
+    """Run the program in a process of its own: ``run_cli("map", "scan.mcap", cwd=tmp_path)``; see `run_python`."""
+    return lambda *args, **options: run_python("-m", "tactile_bayes", *args, **options)
