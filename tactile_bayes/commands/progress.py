@@ -1,0 +1,79 @@
+"""A progress bar on stderr, drawn only on a terminal and only for work that takes a while."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+# Work that ends sooner draws nothing.
+QUIET_S = 2.0
+# Between two drawings; a bar is for eyes.
+REDRAW_S = 0.1
+_WIDTH = 30
+
+Progress = Callable[[int, int], None]
+
+
+@contextmanager
+def progress_bar(
+    label: str, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+) -> Iterator[Progress]:
+    """A ``progress(done, total)`` callback for `batch.run_batch` and the samplers; the line goes when the block ends.
+
+    Parameters
+    ----------
+    label
+        What is being counted, in a word or two.
+    stream
+        Where to draw; stderr by default, so that output can be piped.
+    clock
+        Seconds from anywhere.
+    """
+    out = sys.stderr if stream is None else stream
+    if not out.isatty():
+        yield lambda _done, _total: None
+        return
+    bar = _Bar(label, out, clock)
+    try:
+        yield bar.update
+    finally:
+        bar.erase()
+
+
+class _Bar:
+    """One line that is drawn over itself."""
+
+    def __init__(self, label: str, out: TextIO, clock: Callable[[], float]) -> None:
+        self._label = label
+        self._out = out
+        self._clock = clock
+        self._begun = clock()
+        self._next = self._begun + QUIET_S
+        self._drawn = 0
+
+    def update(self, done: int, total: int) -> None:
+        """Draw the bar at `done` of `total`, if it is time."""
+        now = self._clock()
+        if now < self._next or total <= 0:
+            return
+        self._next = now + REDRAW_S
+        filled = _WIDTH * done // total
+        line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{self._left(now, done, total)}"
+        self._out.write("\r" + line.ljust(self._drawn))
+        self._out.flush()
+        self._drawn = len(line)
+
+    def _left(self, now: float, done: int, total: int) -> str:
+        if not 0 < done < total:
+            return ""
+        seconds = round((now - self._begun) * (total - done) / done)
+        return f" {seconds // 60}:{seconds % 60:02d} left"
+
+    def erase(self) -> None:
+        """Leave the line empty for what comes next."""
+        if self._drawn:
+            self._out.write("\r" + " " * self._drawn + "\r")
+            self._out.flush()

@@ -1,0 +1,90 @@
+"""The progress bar keeps out of pipes and out of short work."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+
+from tactile_bayes.batch import run_batch
+from tactile_bayes.commands.progress import QUIET_S, progress_bar
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_nothing_is_drawn_into_a_pipe():
+    stream, clock = io.StringIO(), Clock()
+    with progress_bar("cases", stream=stream, clock=clock) as progress:
+        clock.now += 60
+        progress(1, 2)
+    assert stream.getvalue() == ""
+
+
+def test_short_work_draws_nothing():
+    stream, clock = Terminal(), Clock()
+    with progress_bar("cases", stream=stream, clock=clock) as progress:
+        for done in range(3):
+            progress(done, 3)
+            clock.now += QUIET_S / 4
+    assert stream.getvalue() == ""
+
+
+def test_long_work_is_counted_with_the_time_left_and_the_line_is_cleared():
+    stream, clock = Terminal(), Clock()
+    with progress_bar("cases", stream=stream, clock=clock) as progress:
+        clock.now += 50.0
+        progress(1, 3)
+        drawn = stream.getvalue()
+        progress(2, 3)  # too soon to draw again
+        assert stream.getvalue() == drawn
+    assert drawn == "\rcases [##########--------------------] 1/3 1:40 left"
+    assert stream.getvalue().endswith("\r" + " " * (len(drawn) - 1) + "\r")
+
+
+def test_a_shorter_line_covers_a_longer_one():
+    stream, clock = Terminal(), Clock()
+    with progress_bar("cases", stream=stream, clock=clock) as progress:
+        clock.now += 50.0
+        progress(1, 3)
+        first = len(stream.getvalue())
+        clock.now += 50.0
+        progress(3, 3)
+        second = stream.getvalue()[first:]
+    assert len(second) == first
+    assert second.rstrip() == "\rcases [##############################] 3/3"
+
+
+def test_the_line_is_cleared_when_the_work_fails():
+    stream, clock = Terminal(), Clock()
+    with pytest.raises(KeyboardInterrupt), progress_bar("cases", stream=stream, clock=clock) as progress:
+        clock.now += 50.0
+        progress(1, 3)
+        raise KeyboardInterrupt
+    assert stream.getvalue().endswith("\r")
+
+
+def test_it_fits_a_batch():
+    stream, clock = Terminal(), Clock()
+    with progress_bar("items", stream=stream, clock=clock) as progress:
+        clock.now += 50.0
+        run_batch(str, [1, 2], key=str, progress=progress)
+    assert "items [" in stream.getvalue()
+
+
+def test_work_without_items_draws_nothing():
+    stream, clock = Terminal(), Clock()
+    with progress_bar("items", stream=stream, clock=clock) as progress:
+        clock.now += 50.0
+        progress(0, 0)
+    assert stream.getvalue() == ""
