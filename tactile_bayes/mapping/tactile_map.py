@@ -61,6 +61,8 @@ class TactileMap:
         Frames that went in. Cells share frames, so a map has fewer independent errors than readings.
     quality
         Counts and figures for the report (frames dropped low/high, tilt, rms...).
+    masked_taxels
+        Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
     """
 
     mean: FloatArray
@@ -74,6 +76,7 @@ class TactileMap:
     background: float | None = 1.0
     frame_count: int = 0
     quality: Mapping[str, float] = field(default_factory=dict)
+    masked_taxels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))

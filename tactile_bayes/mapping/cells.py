@@ -1,0 +1,164 @@
+"""Sums of readings in square cells that come out the same, bit for bit, in whatever order and parts they are added."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+
+IntArray = NDArray[np.int64]
+
+# Values are counted in steps of 2^-12 and clipped to +-64, so 2^17 squares of a call sum exactly in float64 (2^53).
+VALUE_STEP = 2.0**-12
+VALUE_LIMIT = 64.0
+READINGS_PER_CALL = 2**17
+MAX_CELLS = 2**22
+_GROWTH = 16
+
+
+def _no_cells() -> IntArray:
+    return np.zeros((0, 0), dtype=np.int64)
+
+
+def cell_index(position_mm: FloatArray, cell_mm: float) -> IntArray:
+    """Index of the nearest cell; cell k is centred on k x cell_mm, so maps of one cell size share a lattice."""
+    index: IntArray = np.floor(position_mm / cell_mm + 0.5).astype(np.int64)
+    return index
+
+
+@dataclass(slots=True, eq=False)
+class CellSums:
+    """Count, sum and sum of squares of the readings in each cell, in whole steps.
+
+    Parameters
+    ----------
+    cell_mm
+        Side of a cell.
+    first : (2,) tuple
+        Row (y) and column (x) index of ``count[0, 0]`` on the lattice.
+    count, total, square : (ny, nx) int64 arrays
+        Readings, their sum in `VALUE_STEP` and the sum of their squares in `VALUE_STEP` squared.
+    clipped
+        Readings beyond `VALUE_LIMIT` that were added at the limit.
+    """
+
+    cell_mm: float
+    first: tuple[int, int] = (0, 0)
+    count: IntArray = field(default_factory=_no_cells)
+    total: IntArray = field(default_factory=_no_cells)
+    square: IntArray = field(default_factory=_no_cells)
+    clipped: int = 0
+
+    def add(self, x_mm: FloatArray, y_mm: FloatArray, value: FloatArray) -> None:
+        """Add readings at positions on the plane; arrays of one shape, all finite, of at most `READINGS_PER_CALL`.
+
+        Raises
+        ------
+        BadDataError
+            When the readings lie so far apart that the map would have over `MAX_CELLS` cells.
+        """
+        if value.size > READINGS_PER_CALL:
+            raise ValueError(f"{value.size} readings in one call; sums are exact up to {READINGS_PER_CALL}")
+        if value.size:
+            self.add_cells(cell_index(y_mm, self.cell_mm), cell_index(x_mm, self.cell_mm), value)
+
+    def add_cells(self, row: IntArray, column: IntArray, value: FloatArray) -> None:
+        """Add readings whose cells are known already."""
+        first = (int(row.min()), int(column.min()))
+        shape = (int(row.max()) - first[0] + 1, int(column.max()) - first[1] + 1)
+        self._make_room(first, shape)
+        steps = np.rint(value * (1.0 / VALUE_STEP))
+        limit = VALUE_LIMIT / VALUE_STEP
+        if float(np.abs(steps).max()) > limit:
+            self.clipped += int((np.abs(steps) > limit).sum())
+            steps = np.clip(steps, -limit, limit)
+        flat = ((row - first[0]) * shape[1] + (column - first[1])).ravel()
+        window = self._window(first, shape)
+        for sums, weights in ((self.count, None), (self.total, steps.ravel()), (self.square, (steps * steps).ravel())):
+            part = np.bincount(flat, weights, shape[0] * shape[1])
+            sums[window] += part.astype(np.int64).reshape(shape)
+
+    def merge(self, other: CellSums) -> None:
+        """Add all of another's sums."""
+        if other.cell_mm != self.cell_mm:
+            raise ValueError(f"cells of {other.cell_mm} mm cannot be merged into cells of {self.cell_mm} mm")
+        self.clipped += other.clipped
+        if not other.count.size:
+            return
+        self._make_room(other.first, _shape(other.count))
+        window = self._window(other.first, _shape(other.count))
+        self.count[window] += other.count
+        self.total[window] += other.total
+        self.square[window] += other.square
+
+    def trimmed(self) -> CellSums:
+        """A copy without the empty rows and columns around the data."""
+        rows, columns = np.flatnonzero(self.count.any(axis=1)), np.flatnonzero(self.count.any(axis=0))
+        if not len(rows):
+            return CellSums(self.cell_mm, clipped=self.clipped)
+        window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        first = (self.first[0] + int(rows[0]), self.first[1] + int(columns[0]))
+        parts = (self.count[window].copy(), self.total[window].copy(), self.square[window].copy())
+        return CellSums(self.cell_mm, first, *parts, clipped=self.clipped)
+
+    def mean(self) -> FloatArray:
+        """(ny, nx) mean of each cell; NaN without readings."""
+        return self._per_reading(self.total) * VALUE_STEP
+
+    def variance(self) -> FloatArray:
+        """(ny, nx) variance of the readings about their cell's mean (divided by n); NaN without readings."""
+        spread = self._per_reading(self.square) - self._per_reading(self.total) ** 2
+        return np.clip(spread, 0.0, None) * VALUE_STEP**2
+
+    def x_mm(self) -> FloatArray:
+        """Centres of the columns."""
+        return (self.first[1] + np.arange(self.count.shape[1])) * self.cell_mm
+
+    def y_mm(self) -> FloatArray:
+        """Centres of the rows."""
+        return (self.first[0] + np.arange(self.count.shape[0])) * self.cell_mm
+
+    def _per_reading(self, sums: IntArray) -> FloatArray:
+        ratio = np.full(sums.shape, np.nan)
+        np.divide(sums, self.count, out=ratio, where=self.count > 0)
+        return ratio
+
+    def _window(self, first: tuple[int, int], shape: tuple[int, int]) -> tuple[slice, slice]:
+        top, left = first[0] - self.first[0], first[1] - self.first[1]
+        return slice(top, top + shape[0]), slice(left, left + shape[1])
+
+    def _make_room(self, first: tuple[int, int], shape: tuple[int, int]) -> None:
+        """Grow the arrays, with a margin, so that the given block of the lattice is inside."""
+        top, left, bottom, right = first[0], first[1], first[0] + shape[0], first[1] + shape[1]
+        if self.count.size:
+            held_bottom, held_right = self.first[0] + self.count.shape[0], self.first[1] + self.count.shape[1]
+            if top >= self.first[0] and left >= self.first[1] and bottom <= held_bottom and right <= held_right:
+                return
+            top, left = min(top, self.first[0]), min(left, self.first[1])
+            bottom, right = max(bottom, held_bottom), max(right, held_right)
+        _refuse_vast(bottom - top, right - left, self.cell_mm)
+        roomy = CellSums(self.cell_mm, (top - _GROWTH, left - _GROWTH))
+        new_shape = (bottom - top + 2 * _GROWTH, right - left + 2 * _GROWTH)
+        window = roomy._window(self.first, _shape(self.count))
+        for name in ("count", "total", "square"):
+            array = np.zeros(new_shape, dtype=np.int64)
+            if self.count.size:
+                array[window] = getattr(self, name)
+            setattr(self, name, array)
+        self.first = roomy.first
+
+
+def _shape(array: IntArray) -> tuple[int, int]:
+    return (array.shape[0], array.shape[1])
+
+
+def _refuse_vast(rows: int, columns: int, cell_mm: float) -> None:
+    if rows * columns > MAX_CELLS:
+        raise BadDataError(
+            f"the map would have {rows} x {columns} cells of {cell_mm:g} mm ({rows * columns} in all)",
+            way_out=f"use larger cells (at most {MAX_CELLS} fit) or cut out poses far from the breast",
+        )
