@@ -43,6 +43,7 @@ def test_short_work_draws_nothing():
 def test_long_work_is_counted_with_the_time_left_and_the_line_is_cleared():
     stream, clock = Terminal(), Clock()
     with progress_bar("cases", stream=stream, clock=clock) as progress:
+        progress(0, 3)
         clock.now += 50.0
         progress(1, 3)
         drawn = stream.getvalue()
@@ -52,9 +53,19 @@ def test_long_work_is_counted_with_the_time_left_and_the_line_is_cleared():
     assert stream.getvalue().endswith("\r" + " " * (len(drawn) - 1) + "\r")
 
 
+def test_what_an_earlier_run_did_is_not_counted_as_speed():
+    stream, clock = Terminal(), Clock()
+    with progress_bar("cases", stream=stream, clock=clock) as progress:
+        progress(90, 100)
+        clock.now += 10.0
+        progress(91, 100)
+        assert stream.getvalue().endswith("91/100 1:30 left")
+
+
 def test_a_shorter_line_covers_a_longer_one():
     stream, clock = Terminal(), Clock()
     with progress_bar("cases", stream=stream, clock=clock) as progress:
+        progress(0, 3)
         clock.now += 50.0
         progress(1, 3)
         first = len(stream.getvalue())
@@ -67,10 +78,15 @@ def test_a_shorter_line_covers_a_longer_one():
 
 def test_the_line_is_cleared_when_the_work_fails():
     stream, clock = Terminal(), Clock()
-    with pytest.raises(KeyboardInterrupt), progress_bar("cases", stream=stream, clock=clock) as progress:
-        clock.now += 50.0
-        progress(1, 3)
-        raise KeyboardInterrupt
+
+    def interrupted() -> None:
+        with progress_bar("cases", stream=stream, clock=clock) as progress:
+            clock.now += 50.0
+            progress(1, 3)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert stream.getvalue().endswith("\r")
 
 

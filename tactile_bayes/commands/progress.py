@@ -53,10 +53,12 @@ class _Bar:
         self._begun = clock()
         self._next = self._begun + QUIET_S
         self._drawn = 0
+        self._first: int | None = None  # what a resumed run had before it began
 
     def update(self, done: int, total: int) -> None:
         """Draw the bar at `done` of `total`, if it is time."""
         now = self._clock()
+        self._first = done if self._first is None else self._first
         if now < self._next or total <= 0:
             return
         self._next = now + REDRAW_S
@@ -67,9 +69,10 @@ class _Bar:
         self._drawn = len(line)
 
     def _left(self, now: float, done: int, total: int) -> str:
-        if not 0 < done < total:
+        new = done - (self._first or 0)
+        if new <= 0 or done >= total:
             return ""
-        seconds = round((now - self._begun) * (total - done) / done)
+        seconds = round((now - self._begun) * (total - done) / new)
         return f" {seconds // 60}:{seconds % 60:02d} left"
 
     def erase(self) -> None:
