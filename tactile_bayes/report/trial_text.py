@@ -1,0 +1,117 @@
+"""A trial report as text for people: one table with units, then what the table leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.trial.figures import Figure
+from tactile_bayes.trial.summary import ModalityReport, TrialReport
+
+_HEADINGS = ("", "found", "MAPE %", "MAPE % found", "MAE mm", "bias % found", "slope", "r2", "r2 found")
+
+
+def trial_text(report: TrialReport) -> str:
+    """The whole report; the research-use line comes last."""
+    lines = [
+        f"Sizes against excision: {_plural(report.masses, 'mass')} of {_plural(report.patients, 'patient')}, "
+        f"{_plural(report.readings, 'reading')}{_synthetic(report)}",
+        "",
+        *_aligned([_HEADINGS, *(_row(one) for one in report.modalities.values())]),
+        "",
+        *_notes(report),
+        RESEARCH_USE,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _row(report: ModalityReport) -> tuple[str, ...]:
+    figures = report.figures
+    return (
+        report.name,
+        _found(report),
+        _shown(figures["mape_percent"], ".1f"),
+        _shown(figures["mape_detected_percent"], ".1f"),
+        _shown(figures["mae_mm"], ".3g"),
+        _shown(figures["bias_percent"], "+.1f"),
+        _shown(figures["slope_through_origin"], ".2f"),
+        _shown(figures["r2_centred"], ".2f"),
+        _shown(figures["r2_centred_detected"], ".2f"),
+    )
+
+
+def _notes(report: TrialReport) -> Iterator[str]:
+    percent = f"{100 * report.confidence:g} %"
+    for one in report.modalities.values():
+        yield from _modality_notes(one, percent=percent)
+    for name, ratios in report.ratios.items():
+        ratio, found = _shown(ratios["ratio"], ".2f"), _shown(ratios["ratio_detected"], ".2f")
+        yield f"{name}: MAPE {ratio} times the tactile one's; over masses found, {found} times"
+    if report.masses_without_any_reading:
+        yield f"{_plural(report.masses_without_any_reading, 'excised mass')} without any reading, left out"
+    yield f"In brackets: {percent} intervals. MAPE: mean absolute error in percent of the ex-vivo size."
+    yield "A mass not found counts as size 0 (100 % error), except in columns that say 'found'."
+    yield "slope: line through 0 of sizes on ex-vivo sizes. r2: centred, 1 - SSE0/SST, below 0 where it fails."
+
+
+def _modality_notes(report: ModalityReport, *, percent: str) -> Iterator[str]:
+    name, figures = report.name, report.figures
+    if report.masses_not_done or report.masses_without_reading:
+        left_out = f"{report.masses_not_done} not done, {report.masses_without_reading} without a row"
+        yield f"{name}: masses left out: {left_out}"
+    if figures["within_mass_sd_mm"].value is not None:
+        sd, cv = _shown(figures["within_mass_sd_mm"], ".2g"), _shown(figures["within_mass_cv_percent"], ".1f")
+        rms = _shown(figures["within_mass_cv_rms_percent"], ".1f")
+        yield f"{name}: within one mass, mean SD {sd} mm, {cv} % (root mean square {rms} %)"
+    for one in report.coverage:
+        low, high = one.interval
+        yield (
+            f"{name}: {100 * one.probability:g} % intervals cover {one.covered} of {one.n} "
+            f"({one.fraction:.0%}, {percent} interval {low:.0%} to {high:.0%}) on {_plural(one.masses, 'mass')}"
+        )
+    yield from _reasons(name, figures)
+
+
+def _reasons(name: str, figures: Mapping[str, Figure]) -> Iterator[str]:
+    """Why figures and intervals are not there; replicates are not owed, so their absence is left to the JSON."""
+    owed = {key: one for key, one in figures.items() if not key.startswith("within_mass")}
+    for reason in dict.fromkeys(one.reason for one in owed.values() if one.reason):
+        affected = ", ".join(key for key, one in owed.items() if one.reason == reason)
+        yield f"{name}: no {affected}: {reason}"
+    for reason in dict.fromkeys(one.interval_reason for one in owed.values() if one.value is not None):
+        if reason:
+            yield f"{name}: no interval of some figures: {reason}"
+
+
+def _found(report: ModalityReport) -> str:
+    share = f"{report.detected}/{report.n}"
+    if report.detected_interval is None:
+        return share
+    low, high = report.detected_interval
+    return f"{share} [{100 * low:.0f}, {100 * high:.0f} %]"
+
+
+def _shown(figure: Figure, spec: str) -> str:
+    if figure.value is None:
+        return "-"
+    if figure.interval is None:
+        return f"{figure.value:{spec}}"
+    low, high = figure.interval
+    return f"{figure.value:{spec}} [{low:{spec}}, {high:{spec}}]"
+
+
+def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _synthetic(report: TrialReport) -> str:
+    if not report.synthetic_readings:
+        return ""
+    share = "all" if report.synthetic_readings == report.readings else f"{report.synthetic_readings} of them"
+    return f" ({share} synthetic: made by a generator, not measured)"
+
+
+def _plural(count: int, noun: str) -> str:
+    plural = f"{noun}es" if noun.endswith("s") else f"{noun}s"
+    return f"{count} {noun if count == 1 else plural}"

@@ -1,0 +1,232 @@
+"""Readings of masses by several modalities, checked against one another and gathered a mass at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from tactile_bayes.errors import BadDataError
+
+FloatArray = npt.NDArray[np.float64]
+MassKey = tuple[str, str]  # patient, mass
+
+
+class CellFault(Protocol):
+    """Makes the error for one cell; whoever read the columns knows the file and the line of each row."""
+
+    def __call__(self, row: int, column: str, what: str, /, *, way_out: str) -> BadDataError: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A credible interval of a size, in mm, with its nominal probability."""
+
+    low_mm: float
+    high_mm: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One reading of one mass: a size in mm when detected, nothing otherwise."""
+
+    key: MassKey
+    modality: str
+    replicate: int
+    status: str
+    size_mm: float | None = None
+    interval: Interval | None = None
+    synthetic: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalReading:
+    """A stated interval beside the size found after excision."""
+
+    key: MassKey
+    interval: Interval
+    ex_vivo_mm: float
+
+    @property
+    def covered(self) -> bool:
+        """Whether the ex-vivo size lies in the interval, ends included."""
+        return self.interval.low_mm <= self.ex_vivo_mm <= self.interval.high_mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModalitySizes:
+    """What one modality says of n masses, in the order of patient and mass, whatever the order of the rows.
+
+    Attributes
+    ----------
+    patient
+        (n,) array, the patient of each mass by number.
+    ex_vivo_mm
+        (n,) array, above 0.
+    size_mm
+        (n,) array: mean over the detected replicates; 0 where none was detected.
+    replicates_mm
+        n arrays: the detected replicates of each mass.
+    intervals
+        The credible intervals that the readings state.
+    masses_not_done, masses_without_reading
+        Excised masses left out: looked for in no replicate, or not in the table.
+    """
+
+    name: str
+    patient: npt.NDArray[np.int64]
+    ex_vivo_mm: FloatArray
+    size_mm: FloatArray
+    replicates_mm: tuple[FloatArray, ...]
+    intervals: tuple[IntervalReading, ...] = ()
+    readings: int = 0
+    masses_not_done: int = 0
+    masses_without_reading: int = 0
+
+    def __post_init__(self) -> None:
+        n = len(self.ex_vivo_mm)
+        if not (
+            self.patient.shape == self.ex_vivo_mm.shape == self.size_mm.shape == (n,) == (len(self.replicates_mm),)
+        ):
+            raise ValueError(f"{self.name}: patient, ex_vivo_mm, size_mm and replicates_mm must be of one length ({n})")
+        if not (np.all(self.ex_vivo_mm > 0) and np.all(self.size_mm >= 0)):
+            raise ValueError(f"{self.name}: ex_vivo_mm must be above 0 and size_mm must not be below it")
+
+    @property
+    def detected(self) -> npt.NDArray[np.bool_]:
+        """(n,) array: the mass was found in at least one replicate."""
+        return self.size_mm > 0
+
+    @property
+    def patients(self) -> npt.NDArray[np.int64]:
+        """The distinct patients, in order."""
+        return np.unique(self.patient)
+
+    def only(self, keep: npt.NDArray[np.bool_]) -> ModalitySizes:
+        """The same modality on the masses where `keep` is true; counts of readings and of masses left out go to 0."""
+        return ModalitySizes(
+            name=self.name,
+            patient=self.patient[keep],
+            ex_vivo_mm=self.ex_vivo_mm[keep],
+            size_mm=self.size_mm[keep],
+            replicates_mm=tuple(sizes for sizes, kept in zip(self.replicates_mm, keep, strict=True) if kept),
+        )
+
+    def only_detected(self) -> ModalitySizes:
+        """The masses that this modality found."""
+        return self.only(self.detected)
+
+    def only_replicated(self) -> ModalitySizes:
+        """The masses with two or more detected replicates."""
+        return self.only(np.array([len(sizes) > 1 for sizes in self.replicates_mm], dtype=bool))
+
+    def without(self, patient: int) -> ModalitySizes:
+        """All masses but those of one patient."""
+        return self.only(self.patient != patient)
+
+
+def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFault) -> list[Reading]:
+    """Readings from the columns of a trial table, with the rules that tie one cell of a row to another.
+
+    Parameters
+    ----------
+    columns
+        As ``data_schema/trial.table.json`` names and types them.
+    fault
+        Makes the error for a cell, from the row's index, its column and what is wrong.
+
+    Raises
+    ------
+    BadDataError
+        A size without detection or detection without a size; an interval that is incomplete, upside down or
+        stated for a mass that was not found.
+    """
+    names = ("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability")
+    readings = []
+    for row, cells in enumerate(zip(*(columns[name] for name in (*names, "synthetic")), strict=True)):
+        patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, synthetic = cells
+        _check_status(row, status, size_mm, fault=fault)
+        interval = _interval(row, status, (low_mm, high_mm, probability), fault=fault)
+        reading = Reading((patient, mass), modality, replicate, status, size_mm, interval, bool(synthetic))
+        readings.append(reading)
+    return readings
+
+
+def _check_status(row: int, status: str, size_mm: float | None, *, fault: CellFault) -> None:
+    if status == "detected" and size_mm is None:
+        way_out = "give the size, or status not_detected or not_done"
+        raise fault(row, "size_mm", "is blank while status is detected", way_out=way_out)
+    if status != "detected" and size_mm is not None:
+        way_out = "leave size_mm blank, or give status detected"
+        raise fault(row, "size_mm", f"is {size_mm:g} while status is {status}", way_out=way_out)
+
+
+def _interval(
+    row: int, status: str, cells: tuple[float | None, float | None, float | None], *, fault: CellFault
+) -> Interval | None:
+    low_mm, high_mm, probability = cells
+    if low_mm is None and high_mm is None and probability is None:
+        return None
+    for name, cell in zip(("low_mm", "high_mm", "probability"), cells, strict=True):
+        if cell is None:
+            way_out = "an interval needs low_mm, high_mm and probability, or all three blank"
+            raise fault(row, name, "is blank while the interval's other cells are not", way_out=way_out)
+    assert low_mm is not None
+    assert high_mm is not None
+    assert probability is not None
+    if status != "detected":
+        way_out = "leave the interval blank, or give status detected"
+        raise fault(row, "low_mm", f"is {low_mm:g} while status is {status}", way_out=way_out)
+    if low_mm > high_mm:
+        raise fault(row, "low_mm", f"is {low_mm:g}, above high_mm {high_mm:g}", way_out="exchange or correct them")
+    return Interval(low_mm, high_mm, probability)
+
+
+def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> dict[str, ModalitySizes]:
+    """Each modality's sizes, masses averaged over their detected replicates first; tactile leads, then by name.
+
+    Parameters
+    ----------
+    readings
+        In any order; each mass must be in `ex_vivo_mm`.
+    ex_vivo_mm
+        Size after excision in mm, by patient and mass.
+    """
+    with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
+        return _gather(readings, ex_vivo_mm)
+
+
+def _gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> dict[str, ModalitySizes]:
+    ordered = sorted(readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
+    number = {patient: index for index, patient in enumerate(sorted({patient for patient, _ in ex_vivo_mm}))}
+    return {
+        name: _gather_modality(name, list(group), ex_vivo_mm=ex_vivo_mm, number=number)
+        for name, group in groupby(ordered, key=lambda r: r.modality)
+    }
+
+
+def _gather_modality(
+    name: str, readings: Sequence[Reading], *, ex_vivo_mm: Mapping[MassKey, float], number: Mapping[str, int]
+) -> ModalitySizes:
+    seen = {reading.key for reading in readings}
+    done = [reading for reading in readings if reading.status != "not_done"]
+    by_mass = {key: list(group) for key, group in groupby(done, key=lambda r: r.key)}
+    replicates = tuple(
+        np.array([r.size_mm for r in group if r.size_mm is not None], dtype=np.float64) for group in by_mass.values()
+    )
+    return ModalitySizes(
+        name=name,
+        patient=np.array([number[patient] for patient, _ in by_mass], dtype=np.int64),
+        ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
+        size_mm=np.array([sizes.mean() if len(sizes) else 0.0 for sizes in replicates], dtype=np.float64),
+        replicates_mm=replicates,
+        intervals=tuple(IntervalReading(r.key, r.interval, ex_vivo_mm[r.key]) for r in done if r.interval),
+        readings=len(done),
+        masses_not_done=len(seen) - len(by_mass),
+        masses_without_reading=len(ex_vivo_mm) - len(seen),
+    )
