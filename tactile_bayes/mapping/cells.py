@@ -107,24 +107,26 @@ class CellSums:
 
     def mean(self) -> FloatArray:
         """(ny, nx) mean of each cell; NaN without readings."""
-        return self._per_reading(self.total) * VALUE_STEP
+        return self._per_reading(self.total, VALUE_STEP)
 
     def variance(self) -> FloatArray:
         """(ny, nx) variance of the readings about their cell's mean (divided by n); NaN without readings."""
-        spread = self._per_reading(self.square) - self._per_reading(self.total) ** 2
-        return np.clip(spread, 0.0, None) * VALUE_STEP**2
+        spread = self._per_reading(self.square, VALUE_STEP**2)
+        spread -= self.mean() ** 2
+        return np.maximum(spread, 0.0)
 
     def x_mm(self) -> FloatArray:
         """Centres of the columns."""
-        return (self.first[1] + np.arange(self.count.shape[1])) * self.cell_mm
+        return np.asarray((self.first[1] + np.arange(self.count.shape[1])) * self.cell_mm, dtype=np.float64)
 
     def y_mm(self) -> FloatArray:
         """Centres of the rows."""
-        return (self.first[0] + np.arange(self.count.shape[0])) * self.cell_mm
+        return np.asarray((self.first[0] + np.arange(self.count.shape[0])) * self.cell_mm, dtype=np.float64)
 
-    def _per_reading(self, sums: IntArray) -> FloatArray:
+    def _per_reading(self, sums: IntArray, step: float) -> FloatArray:
         ratio = np.full(sums.shape, np.nan)
         np.divide(sums, self.count, out=ratio, where=self.count > 0)
+        ratio *= step
         return ratio
 
     def _window(self, first: tuple[int, int], shape: tuple[int, int]) -> tuple[slice, slice]:
