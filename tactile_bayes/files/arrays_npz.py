@@ -1,0 +1,227 @@
+"""Other people's arrays: one .npz with raw counts, poses and calibration becomes a scan.
+
+Arrays (mm, kPa, s; read without pickle):
+
+| array | shape | meaning |
+|---|---|---|
+| counts | (n, rows, columns) integer | raw readings, 0 to 65535; axis 1 across the head (x), axis 2 along it (y) |
+| frame_time_s | (n,) | time of each frame |
+| position_mm | (m, 3) | tracker sensor in the tracker's base frame |
+| quaternion_wxyz | (m, 4) | its rotation, scalar first: p_base = position + R(q) p_tracker |
+| pose_time_s | (m,) | time stamps of the poses, on the frames' clock |
+| gain_kpa_per_count, offset_kpa | (rows, columns) | pressure = gain x counts + offset |
+| pitch_mm | scalar | distance between neighbouring elements |
+| array_from_tracker | (4, 4) | lever arm: p_scanhead = array_from_tracker p_tracker |
+| head_surface_mm | (rows, columns, 3) | element centres in `scanhead`: origin at the face's apex, z into the tissue |
+| landmarks_mm | (2, 3), may be left out | sternal notch and xiphoid in the base frame |
+| saturation_count | scalar, may be left out (4095) | readings at or above it carry no pressure |
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.geometry import check_rigid
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+
+Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
+
+# Letters are lengths that must agree between arrays.
+_SHAPES: Final[Mapping[str, tuple[str | int, ...]]] = {
+    "counts": ("n", "rows", "columns"),
+    "frame_time_s": ("n",),
+    "position_mm": ("m", 3),
+    "quaternion_wxyz": ("m", 4),
+    "pose_time_s": ("m",),
+    "gain_kpa_per_count": ("rows", "columns"),
+    "offset_kpa": ("rows", "columns"),
+    "pitch_mm": (),
+    "array_from_tracker": (4, 4),
+    "head_surface_mm": ("rows", "columns", 3),
+    "landmarks_mm": (2, 3),
+    "saturation_count": (),
+}
+_OPTIONAL: Final = ("landmarks_mm", "saturation_count")
+
+
+def read_arrays(path: Path) -> Scan:
+    """Read a scan from an .npz file of the layout above.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the array, its value and the way out.
+    """
+    try:
+        arrays = load_npz(path, required=[name for name in _SHAPES if name not in _OPTIONAL], optional=_OPTIONAL)
+        _check_shapes(arrays)
+        _check_numbers(arrays)
+        _check_units(arrays)
+        return _scan(arrays)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def load_npz(path: Path, *, required: list[str], optional: tuple[str, ...]) -> Arrays:
+    """The named arrays of an .npz file, never unpickling anything.
+
+    Raises
+    ------
+    BadDataError
+        When the file is no .npz, is cut off, lacks a required array, or holds one that only pickle could read.
+    """
+    _check_zip(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in required if name not in archive.files]
+            if missing:
+                raise _missing(missing, found=archive.files)
+            return {name: _member(archive, name) for name in (*required, *optional) if name in archive.files}
+    except (zipfile.BadZipFile, EOFError, OSError) as error:
+        raise BadDataError(f"is not a whole .npz file ({error})", way_out="copy it again") from None
+
+
+def _check_zip(path: Path) -> None:
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(6)
+            whole = zipfile.is_zipfile(stream)
+    except OSError as error:
+        raise unreadable(path, error) from None
+    if whole:
+        return
+    if start.startswith(b"PK"):
+        raise BadDataError("is a zip archive that is cut off (no directory at its end)", way_out="copy it again")
+    if start == b"\x93NUMPY":
+        raise BadDataError("is a single .npy array", way_out="save all arrays in one file with numpy.savez_compressed")
+    raise BadDataError(f"is not an .npz file (it starts with {start!r})", way_out="save it with numpy.savez_compressed")
+
+
+def _missing(missing: list[str], *, found: list[str]) -> BadDataError:
+    has = ", ".join(sorted(found)[:12]) or "nothing"
+    grid = " (for a grid of values give --as map)" if "mean" in found else ""
+    return BadDataError(f"lacks {', '.join(missing)} (it has {has})", way_out=f"add the missing arrays{grid}")
+
+
+def _member(archive: Any, name: str) -> np.ndarray[Any, np.dtype[Any]]:
+    try:
+        array: np.ndarray[Any, np.dtype[Any]] = np.asarray(archive[name])
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise BadDataError(f"{name} is damaged ({error})", way_out="copy the file again") from None
+    except ValueError:
+        raise BadDataError(
+            f"{name} holds Python objects, which are never unpickled", way_out="save it as an array of plain numbers"
+        ) from None
+    return array
+
+
+def _check_shapes(arrays: Arrays) -> None:
+    lengths: dict[str, tuple[int, str]] = {}  # letter -> length, and the array that set it
+    for name, array in arrays.items():
+        want = _SHAPES[name]
+        fits = array.ndim == len(want)
+        for letter, have in zip(want, array.shape, strict=False):
+            length = letter if isinstance(letter, int) else lengths.setdefault(letter, (have, name))[0]
+            fits = fits and length == have
+        if not fits:
+            raise BadDataError(f"{name} has shape {array.shape}", way_out=f"it must be {_spoken(want, lengths)}")
+        if 0 in array.shape:
+            raise BadDataError(f"{name} is empty (shape {array.shape})", way_out="give at least one frame and one pose")
+
+
+def _spoken(want: tuple[str | int, ...], lengths: Mapping[str, tuple[int, str]]) -> str:
+    letters = [item for item in want if isinstance(item, str) and item in lengths]
+    known = [f"{letter} = {lengths[letter][0]} as in {lengths[letter][1]}" for letter in letters]
+    shape = "(" + ", ".join(map(str, want)) + ("," if len(want) == 1 else "") + ")"
+    return shape + (f" with {', '.join(known)}" if known else "")
+
+
+def _check_numbers(arrays: Arrays) -> None:
+    counts = arrays["counts"]
+    if counts.dtype.kind not in "iu":
+        raise BadDataError(f"counts is {counts.dtype}", way_out="give raw integer readings, not pressures")
+    low, high = int(counts.min()), int(counts.max())
+    if low < 0 or high > 65535:
+        raise BadDataError(f"counts holds {low if low < 0 else high}", way_out="raw readings lie in 0 to 65535")
+    for name, array in arrays.items():
+        if array.dtype.kind not in "iuf":
+            raise BadDataError(f"{name} is {array.dtype}", way_out="give real numbers")
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            index = tuple(int(i) for i in bad[0])
+            where = f" (first at {index})" if index else ""
+            raise BadDataError(
+                f"{name} holds {len(bad)} values that are not finite{where}", way_out="repair or leave them out"
+            )
+
+
+def _check_units(arrays: Arrays) -> None:
+    """Refuse what is surely in other units: numbers off by 25 or 1000 go through every later check unseen."""
+    surface, position = arrays["head_surface_mm"], arrays["position_mm"]
+    metres = "looks like metres or inches, give mm"
+    extent = float(np.ptp(surface.reshape(-1, 3), axis=0).max())
+    if extent < 5.0 and surface.shape[0] * surface.shape[1] > 1:
+        raise BadDataError(f"head_surface_mm spans only {extent:.4g}", way_out=metres)
+    travel, reach = float(np.ptp(position, axis=0).max()), float(np.abs(position).max())
+    if travel < 1.0 and reach < 5.0 and len(position) > 1:
+        raise BadDataError(f"position_mm spans only {travel:.4g}, none beyond {reach:.4g}", way_out=metres)
+    if "landmarks_mm" in arrays:
+        apart = float(np.linalg.norm(arrays["landmarks_mm"][0] - arrays["landmarks_mm"][1]))
+        if apart < 10.0:
+            raise BadDataError(f"the points of landmarks_mm are {apart:.4g} apart", way_out=metres)
+    full_scale = float(np.median(arrays["gain_kpa_per_count"])) * 4095
+    if full_scale > 1000.0 or 0 < full_scale < 0.5:
+        raise BadDataError(
+            f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts", way_out="looks like Pa or MPa, give kPa"
+        )
+    _check_clock(arrays["frame_time_s"], arrays["pose_time_s"])
+    _check_pitch(surface, float(arrays["pitch_mm"]))
+
+
+def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any, Any]) -> None:
+    for name, times in (("frame_time_s", frame_time_s), ("pose_time_s", pose_time_s)):
+        step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        if step > 0.5:
+            raise BadDataError(f"{name} steps by {step:.4g}", way_out="looks like milliseconds, give s")
+    (a, b), (c, d) = ((float(times.min()), float(times.max())) for times in (frame_time_s, pose_time_s))
+    if b < c or d < a:
+        raise BadDataError(
+            f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap",
+            way_out="give both on one clock",
+        )
+
+
+def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
+    for axis, along in ((0, "axis 0"), (1, "axis 1")):
+        if surface.shape[axis] < 2:
+            continue
+        spacing = float(np.median(np.linalg.norm(np.diff(surface, axis=axis), axis=-1)))
+        if not 0.8 * pitch_mm <= spacing <= 1.25 * pitch_mm:
+            raise BadDataError(
+                f"head_surface_mm has elements {spacing:.4g} mm apart along {along}, pitch_mm is {pitch_mm:.4g}",
+                way_out="give both in mm, for the same head",
+            )
+
+
+def _scan(arrays: Arrays) -> Scan:
+    values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
+    check_rigid(values["array_from_tracker"], name="array_from_tracker")
+    landmarks = values.get("landmarks_mm")
+    return Scan(
+        frames=PressureFrames(values["frame_time_s"], arrays["counts"].astype(np.uint16)),
+        poses=TrackerPoses(values["pose_time_s"], values["position_mm"], values["quaternion_wxyz"]),
+        head=HeadGeometry(values["head_surface_mm"], float(values["pitch_mm"]), values["array_from_tracker"]),
+        element_calibration=ElementCalibration(
+            values["gain_kpa_per_count"], values["offset_kpa"], int(values.get("saturation_count", 4095))
+        ),
+        landmarks=None if landmarks is None else Landmarks(landmarks[0], landmarks[1]),
+        session={"source": "imported"},
+    )

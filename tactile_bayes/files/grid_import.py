@@ -1,0 +1,217 @@
+"""A grid or an image straight to a map: for other people's maps and for pictures of a Gaussian.
+
+Orientation: arrays keep their order. Column 0 is the lowest x and row 0 the lowest y, also for an image, whose row 0 is
+its top: an image is therefore seen upside down when y is drawn upwards, and a lump's angle has the other sign. Cell
+centres are placed about the centre of the grid, so x and y run from -(n-1)/2 to (n-1)/2 cells.
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.arrays_npz import load_npz
+from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+
+IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
+TABLE_SUFFIXES: Final = (".csv", ".txt")
+# A map divided by its level has a median near 1; farther off than this, it was not divided.
+_NORMALISED_MEDIAN: Final = (0.2, 5.0)
+
+
+def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "none") -> TactileMap:
+    """Read a grid of values as a map.
+
+    Parameters
+    ----------
+    path
+        ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` and ``spacing_mm``; a ``.csv`` of
+        numbers, an empty field for a cell without data; or a grey ``.tif``, ``.pgm`` or ``.png`` image.
+    spacing_mm
+        Side of the square cells; may be left out when the ``.npz`` holds it.
+    normalise
+        What was done to the values already: ``"mean"`` or ``"gain"`` when 1 is the level far from a lump, ``"none"``
+        when the level is not known. Nothing is divided here.
+
+    Raises
+    ------
+    BadDataError, UsageError
+        Naming the file, the array or row, its value and the way out.
+    """
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".npz":
+            arrays = load_npz(path, required=["mean"], optional=("count", "variance", "spacing_mm"))
+            return _map(arrays, spacing_mm=_spacing(arrays.get("spacing_mm"), given=spacing_mm), normalise=normalise)
+        if suffix in IMAGE_SUFFIXES:
+            mean = _image(path)
+        elif suffix in TABLE_SUFFIXES:
+            mean = _table(path)
+        else:
+            known = ", ".join((".npz", *TABLE_SUFFIXES, *IMAGE_SUFFIXES))
+            raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=f"grids are read from {known}")
+        return _map({"mean": mean}, spacing_mm=_spacing(None, given=spacing_mm), normalise=normalise)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def _spacing(held: np.ndarray[Any, Any] | None, *, given: float | None) -> float:
+    if held is None:
+        if given is None:
+            raise UsageError("a grid needs --spacing-mm, the side of its square cells in mm")
+        value = float(given)
+    else:
+        values = np.atleast_1d(held)
+        if values.dtype.kind not in "iuf" or values.ndim != 1 or len(values) not in (1, 2):
+            raise BadDataError(f"spacing_mm is {values.dtype} of shape {values.shape}", way_out="it must be one number")
+        if len(values) == 2 and values[0] != values[1]:
+            raise BadDataError(
+                f"spacing_mm is {values[0]:g} by {values[1]:g}", way_out="resample to square cells first"
+            )
+        value = float(values[0])
+        if given is not None and not np.isclose(given, value, rtol=1e-9, atol=0.0):
+            raise UsageError(
+                f"--spacing-mm is {given:g}, but the file says spacing_mm = {value:g}; leave the option out"
+            )
+    if not 0 < value < 1000:
+        raise BadDataError(f"the spacing is {value:g} mm", way_out="it must be positive, in mm")
+    return value
+
+
+def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: str) -> TactileMap:
+    mean = _numbers(arrays["mean"], name="mean")
+    if mean.ndim != 2 or 0 in mean.shape:
+        raise BadDataError(f"mean has shape {mean.shape}", way_out="it must be (ny, nx)")
+    count = _count(arrays.get("count"), mean)
+    variance = _variance(arrays.get("variance"), count)
+    _check_level(mean[count > 0], normalise=normalise)
+    return TactileMap(
+        mean=np.where(count > 0, mean, np.nan),
+        variance=variance,
+        count=count,
+        x_mm=_centres(mean.shape[1], spacing_mm),
+        y_mm=_centres(mean.shape[0], spacing_mm),
+        recipe=MapRecipe(source="grid", normalise=normalise, cell_mm=spacing_mm),
+        background=None if normalise == "none" else 1.0,
+        frame_count=0,
+    )
+
+
+def _centres(n: int, spacing_mm: float) -> FloatArray:
+    centres: FloatArray = (np.arange(n) - (n - 1) / 2) * spacing_mm
+    return centres
+
+
+def _numbers(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
+    if array.dtype.kind not in "iuf":
+        raise BadDataError(f"{name} is {array.dtype}", way_out="give real numbers")
+    values: FloatArray = np.asarray(array, dtype=np.float64)
+    if np.isinf(values).any():
+        index = tuple(int(i) for i in np.argwhere(np.isinf(values))[0])
+        raise BadDataError(f"{name} is infinite at {index}", way_out="mark cells without data by NaN")
+    return values
+
+
+def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    """Readings a cell: 1 where there is a value, unless the file says."""
+    if held is None:
+        count = np.isfinite(mean).astype(np.int64)
+    else:
+        values = _numbers(held, name="count")
+        _check_same_shape(values, mean, name="count")
+        bad = np.argwhere((values < 0) | (values != np.floor(values)) | np.isnan(values))
+        if len(bad):
+            index = tuple(int(i) for i in bad[0])
+            raise BadDataError(f"count is {values[index]:g} at {index}", way_out="give whole numbers from 0 up")
+        count = values.astype(np.int64)
+        gap = np.argwhere((count > 0) & np.isnan(mean))
+        if len(gap):
+            index = tuple(int(i) for i in gap[0])
+            raise BadDataError(f"mean is NaN at {index}, where count is {count[index]}", way_out="set count to 0 there")
+    if not count.any():
+        raise BadDataError("no cell holds data", way_out="give at least one finite value")
+    return count
+
+
+def _variance(held: np.ndarray[Any, Any] | None, count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> FloatArray:
+    """Variance within a cell: 0 where it is not known, NaN where there is no data."""
+    if held is None:
+        return np.where(count > 0, 0.0, np.nan)
+    variance = _numbers(held, name="variance")
+    _check_same_shape(variance, count, name="variance")
+    bad = np.argwhere((count > 0) & ~(variance >= 0))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise BadDataError(f"variance is {variance[index]:g} at {index}", way_out="it must not be negative or NaN")
+    return np.where(count > 0, variance, np.nan)
+
+
+def _check_same_shape(array: FloatArray, mean: np.ndarray[Any, Any], *, name: str) -> None:
+    if array.shape != mean.shape:
+        raise BadDataError(f"{name} has shape {array.shape}", way_out=f"it must be {mean.shape}, as mean")
+
+
+def _check_level(values: FloatArray, *, normalise: str) -> None:
+    """Refuse values that cannot have been divided by their level, when the caller says they were."""
+    median = float(np.median(values))
+    low, high = _NORMALISED_MEDIAN
+    if normalise != "none" and not low <= median <= high:
+        raise BadDataError(
+            f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says",
+            way_out="divide by the level first, or give --normalise none",
+        )
+
+
+def _table(path: Path) -> FloatArray:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if any(field.strip() for field in row)]
+    except OSError as error:
+        raise unreadable(path, error) from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BadDataError(f"is not a table of text ({error})", way_out="give comma-separated numbers") from None
+    if not rows:
+        raise BadDataError("is empty", way_out="give comma-separated numbers")
+    for number, row in enumerate(rows, start=1):
+        if len(row) != len(rows[0]):
+            raise BadDataError(
+                f"row {number} has {len(row)} fields, row 1 has {len(rows[0])}", way_out="give every row one length"
+            )
+    return np.array([[_field(text, i, j) for j, text in enumerate(row, 1)] for i, row in enumerate(rows, 1)])
+
+
+def _field(text: str, row: int, column: int) -> float:
+    try:
+        return float(text) if text.strip() else np.nan
+    except ValueError:
+        raise BadDataError(
+            f"row {row}, column {column} holds {text.strip()[:30]!r}", way_out="give numbers only, without a header"
+        ) from None
+
+
+def _image(path: Path) -> FloatArray:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            pages, mode = getattr(image, "n_frames", 1), image.mode
+            pixels = np.asarray(image)
+    except UnidentifiedImageError:
+        raise BadDataError("is not an image", way_out="give a grey TIFF, PGM or PNG") from None
+    except FileNotFoundError as error:
+        raise unreadable(path, error) from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise BadDataError(f"cannot be decoded ({error})", way_out="save it again as TIFF, PGM or PNG") from None
+    if pages > 1:
+        raise BadDataError(f"holds {pages} images", way_out="give one")
+    if pixels.ndim == 3 and (pixels[..., :3] == pixels[..., :1]).all():
+        pixels = pixels[..., 0]  # grey, saved as colour
+    if pixels.ndim != 2 or mode in ("P", "1"):
+        raise BadDataError(f"is a colour image (mode {mode})", way_out="save one channel of intensities")
+    return pixels.astype(np.float64)

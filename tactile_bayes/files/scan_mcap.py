@@ -1,0 +1,392 @@
+"""Scan files: MCAP that Foxglove opens as it is, and that a killed recording leaves readable.
+
+Layout (schema id ``tactile-bayes/scan/1``)
+    Metadata and attachments come first, so that even an unfinished file says what it is:
+    ``tactile-bayes`` (schema id, units), ``session`` (plain text facts), ``provenance``, and ``truth`` for a simulated
+    scan; attachments ``head.json`` and ``element_calibration.json``. Then messages, zstd, chunks of at most 64 KiB:
+
+    - ``/pressure``, foxglove.Grid: raw counts, one uint16 field; the grid's columns run along x of `scanhead` and its
+      rows along y, so that a viewer draws the head the right way round;
+    - ``/pose``, foxglove.PoseInFrame in `base`: the tracker's sensor;
+    - ``/landmark``, foxglove.PoseInFrame in `base`: one channel a landmark, its name in the channel's metadata.
+
+Units
+    Lengths are in mm, not in the metres that Foxglove assumes: mm / 1000 * 1000 is not always the number it was, and
+    a scan must come back as it went in. Viewers draw a head of 24 x 39 "metres"; each channel's metadata says ``mm``.
+
+Times
+    ``publish_time`` and the message's timestamp are the device's, ``log_time`` is the host's; all in ns.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+from numpy.typing import NDArray
+
+from tactile_bayes import __version__
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import atomic_path, refuse_existing
+from tactile_bayes.files.mcap_records import McapRecords, read_records
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_parts import (
+    ScanFile,
+    calibration_document,
+    calibration_from_document,
+    head_document,
+    head_from_document,
+    ns_from_s,
+    s_from_ns,
+)
+from tactile_bayes.files.schema import check_document
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.scan import (
+    CountArray,
+    ElementCalibration,
+    HeadGeometry,
+    Landmarks,
+    PressureFrames,
+    Scan,
+    TrackerPoses,
+)
+
+SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
+CHUNK_BYTES: Final = 64 * 1024
+LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
+_SESSION_SCHEMA: Final = "scan_session.schema.json"
+_NS: Final = 1_000_000_000
+
+
+class ScanWriter:
+    """Append one scan to a stream: what describes it first, then messages as they come.
+
+    Parameters
+    ----------
+    stream
+        Binary, opened for writing; it stays open.
+    head, element_calibration, session, provenance
+        Written before the first message.
+    truth
+        What a simulated scan was made from; `read_truth` returns it, `read_scan` does not.
+    """
+
+    def __init__(
+        self,
+        stream: IO[bytes],
+        *,
+        head: HeadGeometry,
+        element_calibration: ElementCalibration,
+        session: Mapping[str, str],
+        provenance: Provenance,
+        truth: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._shape = head.shape
+        self._sequence: dict[int, int] = {}
+        message_bytes = 2 * head.shape[0] * head.shape[1] + 512
+        self._writer = Writer(
+            stream,
+            chunk_size=max(1, CHUNK_BYTES - message_bytes),  # a chunk closes after the message that fills it
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,
+        )
+        self._writer.start(profile="", library=f"tactile-bayes/{__version__}")
+        self._describe(session, provenance, truth)
+        self._attach("head.json", head_document(head))
+        self._attach("element_calibration.json", calibration_document(element_calibration))
+        self._register()
+        self._grid = _empty_grid(head)
+
+    def _describe(self, session: Mapping[str, str], provenance: Provenance, truth: Mapping[str, Any] | None) -> None:
+        units = {"length_unit": "mm", "time_unit": "ns", "pressure": "raw counts"}
+        self._writer.add_metadata("tactile-bayes", {"schema": SCAN_SCHEMA, **units})
+        self._writer.add_metadata("session", dict(sorted(session.items())))
+        self._writer.add_metadata("provenance", {"json": _compact(provenance.as_dict())})
+        if truth is not None:
+            self._writer.add_metadata("truth", {"json": _compact(truth)})
+
+    def _attach(self, name: str, document: object) -> None:
+        data = _compact(document).encode()
+        self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type="application/json", data=data)
+
+    def _register(self) -> None:
+        schema_of = {
+            kind: self._writer.register_schema(
+                name=kind.DESCRIPTOR.full_name,
+                encoding="protobuf",
+                data=build_file_descriptor_set(kind).SerializeToString(deterministic=True),
+            )
+            for kind in (Grid, PoseInFrame)
+        }
+
+        def channel(topic: str, kind: Any, **metadata: str) -> int:
+            number: int = self._writer.register_channel(
+                topic=topic,
+                message_encoding="protobuf",
+                schema_id=schema_of[kind],
+                metadata={"length_unit": "mm", **metadata},
+            )
+            return number
+
+        self._frame_channel = channel("/pressure", Grid)
+        self._pose_channel = channel("/pose", PoseInFrame)
+        self._landmark_channel = {name: channel("/landmark", PoseInFrame, name=name) for name in LANDMARK_NAMES}
+
+    def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None:
+        """One (rows, columns) frame of raw counts."""
+        if counts.shape != self._shape:
+            raise BadDataError(f"a frame has shape {counts.shape}", way_out=f"this head has {self._shape} taxels")
+        self._grid.data = counts.T.astype("<u2").tobytes()
+        self._send(self._frame_channel, self._grid, device_ns=device_ns, host_ns=host_ns)
+
+    def add_pose(self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int) -> None:
+        """One (3,) position and (4,) quaternion, scalar first, of the tracker's sensor in `base`."""
+        message = _pose_message(position_mm, quaternion_wxyz)
+        self._send(self._pose_channel, message, device_ns=device_ns, host_ns=host_ns)
+
+    def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None:
+        """One (3,) point of `LANDMARK_NAMES` in `base`."""
+        message = _pose_message(position_mm, np.array([1.0, 0.0, 0.0, 0.0]))
+        self._send(self._landmark_channel[name], message, device_ns=device_ns, host_ns=host_ns)
+
+    def _send(self, channel: int, message: Any, *, device_ns: int, host_ns: int) -> None:
+        message.timestamp.seconds, message.timestamp.nanos = divmod(device_ns, _NS)
+        sequence = self._sequence.get(channel, 0)
+        self._sequence[channel] = sequence + 1
+        self._writer.add_message(
+            channel_id=channel,
+            log_time=host_ns,
+            publish_time=device_ns,
+            data=message.SerializeToString(),
+            sequence=sequence,
+        )
+
+    def finish(self) -> None:
+        """Write the last chunk, the index and the footer."""
+        self._writer.finish()
+
+
+def _compact(document: object) -> str:
+    return json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+
+
+def _empty_grid(head: HeadGeometry) -> Any:
+    rows, columns = head.shape
+    pitch = head.pitch_mm
+    grid = Grid(frame_id="scanhead", column_count=rows, row_stride=2 * rows, cell_stride=2)
+    grid.cell_size.x = grid.cell_size.y = pitch
+    grid.pose.position.x, grid.pose.position.y = -rows * pitch / 2, -columns * pitch / 2
+    grid.pose.orientation.w = 1.0
+    grid.fields.add(name="counts", offset=0, type=PackedElementField.UINT16)
+    return grid
+
+
+def _pose_message(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> Any:
+    message = PoseInFrame(frame_id="base")
+    place, turn = message.pose.position, message.pose.orientation
+    place.x, place.y, place.z = (float(value) for value in position_mm)
+    turn.w, turn.x, turn.y, turn.z = (float(value) for value in quaternion_wxyz)
+    return message
+
+
+def write_scan(
+    path: Path,
+    scan: Scan,
+    *,
+    provenance: Provenance,
+    truth: Mapping[str, Any] | None = None,
+    force: bool = False,
+) -> None:
+    """Write a scan; equal scans give equal bytes.
+
+    A `Scan` knows no host times: ``log_time`` is then the device time. Landmarks, which have no time, carry the first.
+
+    Raises
+    ------
+    UsageError
+        When `path` exists and `force` is false.
+    BadDataError
+        When the session holds what a scan file must not.
+    """
+    refuse_existing(path, force=force)
+    check_document(dict(scan.session), _SESSION_SCHEMA, path=path)
+    with atomic_path(path, force=force) as partial, partial.open("wb") as stream:
+        writer = ScanWriter(
+            stream,
+            head=scan.head,
+            element_calibration=scan.element_calibration,
+            session=scan.session,
+            provenance=provenance,
+            truth=truth,
+        )
+        _write_messages(writer, scan)
+        writer.finish()
+
+
+def _write_messages(writer: ScanWriter, scan: Scan) -> None:
+    frame_ns = ns_from_s(scan.frames.time_s)
+    all_ns = np.concatenate([frame_ns, ns_from_s(scan.poses.time_s)])
+    if scan.landmarks is not None:
+        start = int(all_ns.min()) if len(all_ns) else 0
+        for name in LANDMARK_NAMES:
+            point = getattr(scan.landmarks, f"{name}_mm")
+            writer.add_landmark(name, point, device_ns=start, host_ns=start)
+    for i in np.argsort(all_ns, kind="stable").tolist():
+        time = int(all_ns[i])
+        if i < len(frame_ns):
+            writer.add_frame(scan.frames.counts[i], device_ns=time, host_ns=time)
+        else:
+            j = i - len(frame_ns)
+            writer.add_pose(scan.poses.position_mm[j], scan.poses.quaternion_wxyz[j], device_ns=time, host_ns=time)
+
+
+def read_scan(path: Path) -> Scan:
+    """Read a scan; of an unfinished file, everything up to the last complete chunk.
+
+    Raises
+    ------
+    BadDataError
+        When the file is no scan, or holds damaged chunks: a scan with a hole must not pass for a whole one.
+        `read_scan_report` reads around the damage.
+    """
+    file = read_scan_report(path)
+    if file.damaged:
+        raise BadDataError(
+            f"is damaged ({file.lost[0]})",
+            way_out="copy it again, or keep what is intact with `tactile-bayes import`",
+            path=str(path),
+        )
+    return file.scan
+
+
+def read_scan_report(path: Path) -> ScanFile:
+    """Read a scan with the account of what the file held and what was lost.
+
+    Raises
+    ------
+    BadDataError
+        When the file cannot be read, is no scan, or was cut off before its first complete chunk.
+    """
+    records = _scan_records(path)
+    try:
+        return _assemble(records, path=path)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def read_truth(path: Path) -> dict[str, Any] | None:
+    """What a simulated scan was made from; None for a scan that holds no truth."""
+    truth = _scan_records(path).metadata.get("truth")
+    return None if truth is None else _json_object(truth.get("json", ""), name="truth")
+
+
+def _scan_records(path: Path) -> McapRecords:
+    """All records, after the file was found to be a scan of a version this program knows."""
+    records = read_records(path)
+    schema = records.metadata.get("tactile-bayes", {}).get("schema")
+    if schema is None:
+        what = "is cut off in its header" if records.lost else "is an MCAP file, but not a scan of this program"
+        raise BadDataError(what, way_out="give a scan from `record`, `import` or `simulate`", path=str(path))
+    if schema != SCAN_SCHEMA:
+        raise BadDataError(
+            f"is a scan of schema {schema!r}",
+            way_out=f"this version reads {SCAN_SCHEMA}; use the program that wrote it",
+            path=str(path),
+        )
+    return records
+
+
+def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
+    head = head_from_document(_attachment(records, "head.json"))
+    calibration = calibration_from_document(_attachment(records, "element_calibration.json"))
+    session = records.metadata.get("session", {})
+    check_document(session, _SESSION_SCHEMA, path=path)
+    frames = _frames(records, head)
+    if not len(frames) and not records.finished:
+        raise BadDataError("was cut off before its first complete chunk", way_out="nothing can be kept; scan again")
+    scan = Scan(frames, _poses(records), head, calibration, landmarks=_landmarks(records), session=session)
+    provenance = _json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
+    return ScanFile(
+        scan=scan,
+        complete=records.finished and not records.lost,
+        damaged=records.damaged,
+        lost=tuple(records.lost),
+        topics=records.topic_counts(),
+        provenance=provenance,
+        schema=SCAN_SCHEMA,
+    )
+
+
+def _attachment(records: McapRecords, name: str) -> dict[str, Any]:
+    if name not in records.attachments:
+        raise BadDataError(f"holds no {name}", way_out="the recording was cut off in its header; scan again")
+    return _json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
+
+
+def _json_object(text: str, *, name: str) -> dict[str, Any]:
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise BadDataError(f"{name} is not JSON ({error})", way_out="copy the file again") from None
+    if not isinstance(document, dict):
+        raise BadDataError(f"{name} is a {type(document).__name__}", way_out="it must be a JSON object")
+    return document
+
+
+def _times(messages: list[tuple[int, bytes]]) -> FloatArray:
+    return s_from_ns(np.array([time for time, _ in messages], dtype=np.int64))
+
+
+def _frames(records: McapRecords, head: HeadGeometry) -> PressureFrames:
+    messages = records.messages("/pressure", schema="foxglove.Grid")
+    rows, columns = head.shape
+    data = [_decode(Grid, body).data for _, body in messages]
+    for i, body in enumerate(data):
+        if len(body) != 2 * rows * columns:
+            raise BadDataError(
+                f"/pressure message {i} holds {len(body)} bytes", way_out=f"{rows} x {columns} uint16 counts are needed"
+            )
+    counts: NDArray[np.uint16] = np.frombuffer(b"".join(data), dtype="<u2").reshape(-1, columns, rows)
+    return PressureFrames(_times(messages), np.ascontiguousarray(counts.transpose(0, 2, 1), dtype=np.uint16))
+
+
+def _poses(records: McapRecords) -> TrackerPoses:
+    messages = records.messages("/pose", schema="foxglove.PoseInFrame")
+    values = np.array([_pose_values(body) for _, body in messages], dtype=np.float64).reshape(-1, 7)
+    return TrackerPoses(_times(messages), values[:, :3], values[:, 3:])
+
+
+def _pose_values(body: bytes) -> tuple[float, ...]:
+    pose = _decode(PoseInFrame, body).pose
+    place, turn = pose.position, pose.orientation
+    return (place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z)
+
+
+def _landmarks(records: McapRecords) -> Landmarks | None:
+    """The last touch of each landmark; None unless all were touched."""
+    points = {}
+    for name in LANDMARK_NAMES:
+        touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
+        if not touches:
+            return None
+        points[f"{name}_mm"] = np.array(_pose_values(touches[-1][1])[:3])
+    return Landmarks(**points)
+
+
+def _decode(kind: Any, body: bytes) -> Any:
+    from google.protobuf.message import DecodeError
+
+    try:
+        return kind.FromString(body)
+    except DecodeError:
+        raise BadDataError(
+            f"a message is not a {kind.DESCRIPTOR.full_name}", way_out="the file was written by another program"
+        ) from None
