@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from tactile_bayes.errors import UsageError
+
+if TYPE_CHECKING:
+    from tactile_bayes.trial.summary import TrialReport
 
 SCHEMA = "tactile-bayes/validate/1"
 _FILE = click.Path(path_type=Path)
@@ -43,7 +46,7 @@ def command(trial: Path, excision: Path, as_json: bool, output: Path | None, for
     click.echo(dump_json(document) if as_json else trial_text(report), nl=False)
 
 
-def _compare(trial: Path, excision: Path) -> tuple[Any, dict[str, Any]]:
+def _compare(trial: Path, excision: Path) -> tuple[TrialReport, dict[str, Any]]:
     """The report and its JSON document."""
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.tables import check_references, read_table

@@ -10,6 +10,7 @@ from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
 CONVENTIONS: dict[str, str] = {
     "masses": "sizes are averaged over the detected replicates of a mass first; a mass counts once",
+    "detected": "a mass found in at least one replicate",
     "not_detected": "counted as size 0 (100 % error) in figures without '_detected', as in Wellman & Howe (1999)",
     "not_done": "left out and counted",
     "bias_percent": "100 (geometric mean of size / ex vivo - 1), over detected masses only",

@@ -1,0 +1,152 @@
+"""The command `validate`: what it prints and writes, and the line and exit code of each refusal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import pytest
+from click.testing import CliRunner, Result
+
+import tactile_bayes
+from tactile_bayes.commands.validate import command
+from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError, UsageError
+from tactile_bayes.files.schema import check_document, read_json
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.trial.synthetic import excision_csv, trial_csv
+
+DEMO = Path(tactile_bayes.__file__).parent / "demo"
+TRIAL, EXCISION = DEMO / "trial.csv", DEMO / "excision.csv"
+
+
+def validate(*args: object) -> Result:
+    return CliRunner().invoke(command, [str(arg) for arg in args])
+
+
+def test_shipped_trial_is_what_its_generator_makes() -> None:
+    assert TRIAL.read_bytes() == trial_csv().encode()
+    assert EXCISION.read_bytes() == excision_csv().encode()
+
+
+def test_shipped_trial_has_the_papers_shape() -> None:
+    document = json.loads(validate(TRIAL, "--excision", EXCISION, "--json").stdout)
+    counts = document["counts"]
+    assert (counts["patients"], counts["masses"]) == (24, 25)
+    assert counts["synthetic_readings"] == counts["readings"]
+    modalities = document["modalities"]
+    assert {name: (one["n"], one["detected"]) for name, one in modalities.items()} == {
+        "tactile": (25, 25),
+        "ultrasound": (25, 24),
+        "cbe": (25, 24),
+    }
+    assert 3 * 25 <= modalities["tactile"]["readings"] <= 5 * 25
+
+
+def test_json_printed_and_written_are_the_same_bytes_every_time(tmp_path: Path) -> None:
+    printed = validate(TRIAL, "--excision", EXCISION, "--json", "-o", tmp_path / "a.json")
+    again = validate(TRIAL, "--excision", EXCISION, "-o", tmp_path / "b.json")
+    assert (printed.exit_code, again.exit_code) == (0, 0)
+    assert printed.stdout_bytes == (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    document = read_json(tmp_path / "a.json", "validate.schema.json")
+    assert document["schema"] == "tactile-bayes/validate/1"
+    assert document["research_use"] == RESEARCH_USE
+    assert [one["role"] for one in document["provenance"]["inputs"]] == ["trial", "excision"]
+    assert "S01" not in printed.stdout  # no patient, however coded
+    assert str(DEMO) not in printed.stdout
+
+
+def test_text_names_units_ratios_and_ends_with_the_research_line() -> None:
+    lines = validate(TRIAL, "--excision", EXCISION).stdout.splitlines()
+    text = "\n".join(lines)
+    assert "25 masses of 24 patients" in lines[0]
+    assert "synthetic" in lines[0]
+    for words in ("MAPE %", "MAE mm", "times the tactile one's", "intervals cover", "r2: centred"):
+        assert words in text
+    assert lines[-1] == RESEARCH_USE
+    assert max(map(len, lines)) < 160
+
+
+def small(folder: Path, rows: str, excision: str = "P1,1,10\nP2,1,20\n") -> tuple[Path, Path]:
+    trial, ex = folder / "trial.csv", folder / "ex.csv"
+    trial.write_text("patient,mass,modality,replicate,size_mm,status\n" + rows)
+    ex.write_text("patient,mass,ex_vivo_mm\n" + excision)
+    return trial, ex
+
+
+def test_few_patients_get_no_interval_and_are_told_why(tmp_path: Path) -> None:
+    trial, ex = small(tmp_path, "P1,1,cbe,1,12,detected\nP2,1,cbe,1,,not_detected\n")
+    text = validate(trial, "--excision", ex).stdout
+    assert "an interval needs at least 8 patients (found 2)" in text
+    assert "synthetic" not in text
+    one = json.loads(validate(trial, "--excision", ex, "--json").stdout)["modalities"]["cbe"]
+    assert one["mape_percent"] == pytest.approx(60)
+    assert one["mape_percent_interval"] is None
+    assert "8 patients" in one["reasons"]["mape_percent_interval"]
+    assert one["r2_centred_detected"] is None
+
+
+def test_masses_without_readings_are_counted_not_refused(tmp_path: Path) -> None:
+    trial, ex = small(tmp_path, "P1,1,cbe,1,12,detected\nP2,1,cbe,1,,not_done\n", "P1,1,10\nP2,1,20\nP3,1,9\n")
+    text = validate(trial, "--excision", ex).stdout
+    assert "1 excised mass without any reading" in text
+    assert "1 not done, 1 without a row" in text
+
+
+def refusal(*args: object) -> Exception:
+    result = validate(*args)
+    assert isinstance(result.exception, Exception)
+    assert "\n" not in str(result.exception)
+    return result.exception
+
+
+def test_faults_between_tables_name_file_line_and_way_out(tmp_path: Path) -> None:
+    trial, ex = small(tmp_path, "P1,1,cbe,1,12,detected\nP9,1,cbe,1,12,detected\n")
+    error = refusal(trial, "--excision", ex)
+    assert isinstance(error, BadDataError)
+    assert str(error).startswith(f"{trial}: line 3, column patient + mass: 'P9' + '1' has no row in {ex}")
+    trial, ex = small(tmp_path, "P1,1,cbe,1,,detected\n")
+    assert "line 2, column size_mm: is blank while status is detected" in str(refusal(trial, "--excision", ex))
+
+
+def test_an_existing_output_is_kept_without_force(tmp_path: Path) -> None:
+    output = tmp_path / "report.json"
+    output.write_text("mine")
+    assert isinstance(refusal(TRIAL, "--excision", EXCISION, "-o", output), UsageError)
+    assert output.read_text() == "mine"
+    assert validate(TRIAL, "--excision", EXCISION, "-o", output, "--force").exit_code == 0
+    check_document(json.loads(output.read_text()), "validate.schema.json", path=output)
+
+
+def test_an_input_is_never_overwritten(tmp_path: Path) -> None:
+    trial, ex = small(tmp_path, "P1,1,cbe,1,12,detected\n")
+    before = ex.read_bytes()
+    for output in (trial, ex):
+        assert "is an input" in str(refusal(trial, "--excision", ex, "-o", output, "--force"))
+    assert ex.read_bytes() == before
+
+
+Run = Callable[..., CompletedProcess[str]]
+
+
+def test_exit_codes_and_single_lines_of_the_program(tmp_path: Path, run_cli: Run) -> None:
+    trial, ex = small(tmp_path, "P1,1,cbe,1,0,detected\n")
+    bad = run_cli("validate", trial, "--excision", ex)
+    assert (bad.returncode, bad.stdout) == (EXIT_BAD_DATA, "")
+    assert bad.stderr.count("\n") == 1
+    assert "does 0 mean that the mass was not found?" in bad.stderr
+    assert run_cli("validate", trial).returncode == EXIT_USAGE
+    good = run_cli("validate", TRIAL, "--excision", EXCISION)
+    assert (good.returncode, good.stderr) == (0, "")
+
+
+def test_validate_needs_no_slow_library(run_python: Run) -> None:
+    code = (
+        "import sys\nfrom tactile_bayes.commands.validate import command\n"
+        "assert 'numpy' not in sys.modules\n"
+        f"command(['{TRIAL}', '--excision', '{EXCISION}', '--json'], standalone_mode=False)\n"
+        "print({'scipy.stats', 'scipy.optimize', 'pandas', 'matplotlib'} & set(sys.modules), file=sys.stderr)"
+    )
+    done = run_python("-c", code)
+    assert (done.returncode, done.stderr) == (0, "set()\n")
