@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_base
-from tactile_bayes.mapping.accumulate import Accumulated, accumulate
+from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
@@ -22,6 +22,9 @@ COVERED_READINGS = 10
 # Landmarks of one examination further apart than this (mm) mean that the patient or the tracker was moved.
 MAX_LANDMARK_SHIFT_MM = 20.0
 
+# Scans that differ in one of these session facts are not of one examination.
+_SHARED_FACTS = ("subject", "side", "posture")
+
 
 def build_map(
     scans: Scan | Sequence[Scan],
@@ -31,6 +34,7 @@ def build_map(
     normalise: str = "mean",
     latency_ms: float = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
+    progress: Progress = no_progress,
 ) -> TactileMap:
     """Build the tactile map of one scan, or of several scans of one examination on a common plane.
 
@@ -48,6 +52,8 @@ def build_map(
         By how much a pose's stamp is late against the frames.
     max_pose_gap_ms
         Frames between two distinct poses further apart than this are left out.
+    progress
+        Called with frames done and frames in all, anew in each pass over the scans.
 
     Raises
     ------
@@ -61,7 +67,8 @@ def build_map(
     not change a bit of the map.
     """
     parts = [scans] if isinstance(scans, Scan) else list(scans)
-    _check_options(parts, cell_mm, pressure_window_kpa, normalise, latency_ms)
+    _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms)
+    _check_same_examination(parts)
     selections = [
         select_frames(
             scan, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms, max_pose_gap_ms=max_pose_gap_ms
@@ -73,7 +80,9 @@ def build_map(
     for part in selections:
         moments = moments + head_moments(part.scan.head, part.used_poses)
     plane = moments.plane()
-    done = accumulate(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm, normalise=normalise)
+    done = accumulate(
+        selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm, normalise=normalise, progress=progress
+    )
     recipe = MapRecipe("scan", normalise, float(cell_mm), _window(pressure_window_kpa), float(latency_ms))
     return _as_map(done, selections, plane, recipe)
 
@@ -82,11 +91,18 @@ def _window(window: tuple[float, float]) -> tuple[float, float]:
     return (float(window[0]), float(window[1]))
 
 
-def _check_options(
-    scans: list[Scan], cell_mm: float, window: tuple[float, float], normalise: str, latency_ms: float
-) -> None:
+def _check_same_examination(scans: list[Scan]) -> None:
     if not scans:
         raise BadDataError("no scan was given", way_out="give at least one")
+    for name in _SHARED_FACTS:
+        values = sorted({scan.session[name] for scan in scans if name in scan.session})
+        if len(values) > 1:
+            raise BadDataError(
+                f"the scans differ in {name} ({', '.join(values)})", way_out="make one map an examination"
+            )
+
+
+def _check_options(cell_mm: float, window: tuple[float, float], normalise: str, latency_ms: float) -> None:
     if not (np.isfinite(cell_mm) and cell_mm > 0):
         raise BadDataError(f"cell_mm is {cell_mm}", way_out="it must be positive, in mm")
     if not (np.isfinite(window).all() and 0 <= window[0] < window[1]):
@@ -109,6 +125,7 @@ def _as_map(done: Accumulated, selections: list[SelectedFrames], plane: Plane, r
         "clipped_values": float(sums.clipped),
         "gain_passes": float(done.passes),
         "gain_last_change": done.last_change,
+        "gain_unsettled": float(not done.settled),
     }
     return TactileMap(
         mean=sums.mean() / done.scale,

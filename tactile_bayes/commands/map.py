@@ -1,0 +1,145 @@
+"""`map`: from scans to a tactile map."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.presets import CELL_MM, NORMALISE, PRESSURE_WINDOW_KPA
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.scan import Scan
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.command("map")
+@click.argument("scans", metavar="SCAN.mcap...", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--output", required=True, metavar="MAP.nc", type=_FILE, help="Where to write the map.")
+@click.option("--cell-mm", type=float, default=CELL_MM, show_default=True, help="Side of the square cells, mm.")
+@click.option(
+    "--pressure-window-kpa",
+    type=(float, float),
+    metavar="LOW HIGH",
+    default=PRESSURE_WINDOW_KPA,
+    show_default=True,
+    help="Leave out frames whose mean pressure lies outside.",
+)
+@click.option(
+    "--normalise",
+    type=click.Choice(NORMALISE),
+    default="mean",
+    show_default=True,
+    help="mean: divide a frame by its mean (the paper); gain: solve for one gain a frame; none: keep kPa.",
+)
+@click.option(
+    "--latency-ms", type=float, default=0.0, show_default=True, help="By how much the tracker's time stamps are late."
+)
+@click.option("--figure", metavar="FIG.png", type=_FILE, help="Draw the map and its coverage.")
+@click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+@click.option("-v", "--verbose", is_flag=True, help="Say on stderr how long each step took.")
+def command(
+    scans: tuple[Path, ...],
+    output: Path,
+    cell_mm: float,
+    pressure_window_kpa: tuple[float, float],
+    normalise: str,
+    latency_ms: float,
+    figure: Path | None,
+    force: bool,
+    verbose: bool,
+) -> None:
+    """Build a tactile map from one scan, or one common map from several scans of the same examination.
+
+    The plane of the motion is fitted, frames outside the pressure window are left out, the rest are normalised,
+    projected on the plane and averaged in cells. What was left out is printed with its reason.
+
+    Example: tactile-bayes map scan.mcap -o map.nc --figure map.png
+    """
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.files.map_nc import write_map
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.mapping import build_map
+    from tactile_bayes.report.map_text import map_text
+
+    _check_paths(scans, output, figure, force=force)
+    settings = {
+        "cell_mm": cell_mm,
+        "pressure_window_kpa": list(pressure_window_kpa),
+        "normalise": normalise,
+        "latency_ms": latency_ms,
+    }
+    clock = _Clock(verbose)
+    loaded, lost = _read(scans)
+    clock.tell("read")
+    with progress_bar("frames") as progress:
+        tactile_map = build_map(
+            loaded,
+            cell_mm=cell_mm,
+            pressure_window_kpa=pressure_window_kpa,
+            normalise=normalise,
+            latency_ms=latency_ms,
+            progress=progress,
+        )
+    clock.tell("map")
+    inputs = hash_inputs(**{f"scan_{number}": path for number, path in enumerate(scans, start=1)})
+    write_map(output, tactile_map, provenance=Provenance("map", settings, inputs), force=force)
+    if figure:
+        _draw(tactile_map, figure, force=force)
+    clock.tell("write")
+    click.echo(map_text(tactile_map, lost=lost), nl=False)
+
+
+def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:
+    """Stop before any work is done if an output cannot be written or would destroy an input."""
+    from tactile_bayes.files.atomic import refuse_existing
+
+    outputs = [output, *([figure] if figure else [])]
+    if len({path.absolute() for path in outputs}) < len(outputs):
+        raise UsageError(f"{output} is given for the map and for the figure; choose another name for one")
+    if len({path.absolute() for path in scans}) < len(scans):
+        raise UsageError("a scan is given twice; its frames would count twice")
+    for path in outputs:
+        if any(path.exists() and scan.exists() and path.samefile(scan) for scan in scans):
+            raise UsageError(f"{path} is an input of this command; choose another name for the output")
+        refuse_existing(path, force=force)
+
+
+def _read(paths: tuple[Path, ...]) -> tuple[list[Scan], list[str]]:
+    """The scans, and what unfinished files had lost."""
+    from tactile_bayes.files.scan_mcap import read_scan_report
+
+    scans, lost = [], []
+    for number, path in enumerate(paths, start=1):
+        file = read_scan_report(path)
+        if file.damaged:
+            raise BadDataError(f"is damaged ({file.lost[0]})", way_out="copy it again", path=str(path))
+        scans.append(file.scan)
+        lost += [f"scan {number}: {line}" for line in file.lost]
+    return scans, lost
+
+
+def _draw(tactile_map: TactileMap, path: Path, *, force: bool) -> None:
+    from tactile_bayes.report.figures import map_figure
+
+    map_figure(tactile_map, path, force=force)
+
+
+class _Clock:
+    """Says how long each step took, if asked to."""
+
+    def __init__(self, verbose: bool) -> None:
+        self._verbose = verbose
+        self._last = time.perf_counter()
+
+    def tell(self, step: str) -> None:
+        now = time.perf_counter()
+        if self._verbose:
+            print(f"{step}: {now - self._last:.3f} s", file=sys.stderr)
+        self._last = now
