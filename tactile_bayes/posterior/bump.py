@@ -1,0 +1,117 @@
+"""The scene model of the paper: one Gaussian bump on a level background (Eq 7), with the priors on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.cells import FitCells
+
+
+@dataclass(frozen=True, slots=True)
+class BumpPrior:
+    """Proper, weak priors; every one is printed with the estimate.
+
+    Parameters
+    ----------
+    amplitude_sd
+        Normal, centred on 0 and signed: a depression must be able to show itself. In units of the map's scale.
+    width_median_mm, log_width_sd
+        Log-normal on the geometric mean of the two widths.
+    log_ratio_sd
+        Normal on q and r, half the log of the axis ratio (and its direction).
+    """
+
+    amplitude_sd: float = 2.0
+    width_median_mm: float = 5.0
+    log_width_sd: float = 1.0
+    log_ratio_sd: float = 0.5
+
+    def as_dict(self) -> dict[str, float]:
+        """The numbers, for the report."""
+        return {
+            "amplitude_sd": self.amplitude_sd,
+            "width_median_mm": self.width_median_mm,
+            "log_width_sd": self.log_width_sd,
+            "log_ratio_sd": self.log_ratio_sd,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Bump:
+    """Which parameters the model spends: rotation and a free background only where they are asked for.
+
+    The parameter vector is ``(amplitude, x, y, p, q[, r][, background])``: mm for the centre, p and q the log widths
+    of `covariance_from_log_widths`.
+
+    Parameters
+    ----------
+    rotated
+        Whether the axes of the ellipse may turn (adds r).
+    background
+        Fixed level (1 in Eq 7), or None to fit it.
+    scale
+        Unit of amplitude for priors and steps, see `cells.value_scale`.
+    """
+
+    rotated: bool = False
+    background: float | None = 1.0
+    scale: float = 1.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        rotation = ("r",) if self.rotated else ()
+        level = ("background",) if self.background is None else ()
+        return ("amplitude", "x_mm", "y_mm", "p", "q", *rotation, *level)
+
+    @property
+    def step_scale(self) -> FloatArray:
+        """(p,) size over which the model bends in each parameter; steps of the fit are limited in these units."""
+        sizes = {"amplitude": self.scale, "background": self.scale, "x_mm": 2.0, "y_mm": 2.0}
+        return np.array([sizes.get(name, 0.3) for name in self.names])
+
+    def shape_parameters(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """p, q, r of (..., p) parameter vectors; r is 0 when the model has none."""
+        r = theta[..., 5] if self.rotated else np.zeros(theta.shape[:-1])
+        return theta[..., 3], theta[..., 4], r
+
+    def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """sigma_x_mm, sigma_y_mm and angle_rad of (..., p) parameter vectors."""
+        return principal_widths(*self.shape_parameters(theta))
+
+    def level(self, theta: FloatArray) -> FloatArray:
+        """Background of (..., p) parameter vectors."""
+        if self.background is None:
+            return np.asarray(theta[..., -1])
+        return np.full(theta.shape[:-1], self.background)
+
+    def unit_bump(self, theta: FloatArray, cells: FitCells) -> FloatArray:
+        """(m, k) bump of unit amplitude, averaged over each cell, for (m, p) parameter vectors."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return cell_mean_gaussian(
+                cells.x_mm - theta[:, 1, None],
+                cells.y_mm - theta[:, 2, None],
+                covariance_mm2=covariance_from_log_widths(*self.shape_parameters(theta)),
+                cell_mm=cells.cell_mm,
+            )
+
+    def predict(self, theta: FloatArray, cells: FitCells) -> FloatArray:
+        """(m, k) map values of (m, p) parameter vectors: Eq 7 averaged over the cells."""
+        return self.level(theta)[:, None] + theta[:, 0, None] * self.unit_bump(theta, cells)
+
+    def log_prior(self, theta: FloatArray, prior: BumpPrior) -> FloatArray:
+        """(m,) log density of the priors; flat in the background; the centre's is the window's."""
+        p, q, r = self.shape_parameters(theta)
+        z = [
+            (theta[..., 0] / self.scale / prior.amplitude_sd, prior.amplitude_sd * self.scale),
+            ((p - np.log(prior.width_median_mm)) / prior.log_width_sd, prior.log_width_sd),
+            (q / prior.log_ratio_sd, prior.log_ratio_sd),
+        ]
+        if self.rotated:
+            z.append((r / prior.log_ratio_sd, prior.log_ratio_sd))
+        total = sum(-0.5 * value**2 - np.log(sd * np.sqrt(2 * np.pi)) for value, sd in z)
+        return np.asarray(total)

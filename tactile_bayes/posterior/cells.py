@@ -1,0 +1,151 @@
+"""Which cells of a map are fitted: candidates for a lump, and the window about one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.tactile_map import TactileMap
+
+SMOOTHING_MM = 3.0
+"""Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""
+
+
+FEW_READINGS = 0.1
+"""A cell with a smaller share of the median count is left out of the fit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitCells:
+    """The cells of one window, flattened.
+
+    Parameters
+    ----------
+    x_mm, y_mm : (k,) arrays
+        Cell centres in `plane`.
+    value, variance, count : (k,) arrays
+        Mean, within-cell variance and number of readings.
+    row, column : (k,) int arrays
+        Where the cells lie in the map's grid.
+    cell_mm
+        Side of a cell.
+    """
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    value: FloatArray
+    variance: FloatArray
+    count: FloatArray
+    row: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    cell_mm: float
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+
+def trusted(tactile_map: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """(ny, nx) True for covered cells with at least a tenth of the median count.
+
+    At the rim of a map a handful of readings from one side of the head decide a cell, and they are off together.
+    """
+    covered = tactile_map.covered
+    if not covered.any():
+        return covered
+    return covered & (tactile_map.count >= FEW_READINGS * np.median(tactile_map.count[covered]))
+
+
+def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> FitCells:
+    """The trusted cells whose centres lie within `radius_mm` of `centre_mm`."""
+    dx = tactile_map.x_mm[None, :] - centre_mm[0]
+    dy = tactile_map.y_mm[:, None] - centre_mm[1]
+    inside = trusted(tactile_map) & (dx**2 + dy**2 <= radius_mm**2)
+    row, column = np.nonzero(inside)
+    variance = tactile_map.variance[inside]
+    return FitCells(
+        x_mm=tactile_map.x_mm[column],
+        y_mm=tactile_map.y_mm[row],
+        value=tactile_map.mean[inside].astype(np.float64),
+        variance=np.where(np.isfinite(variance), variance, 0.0),
+        count=tactile_map.count[inside].astype(np.float64),
+        row=row,
+        column=column,
+        cell_mm=tactile_map.recipe.cell_mm,
+    )
+
+
+def covered_share(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> float:
+    """Share of the disc about `centre_mm` that the map covers, counting what lies beyond its edge as not covered."""
+    cell = tactile_map.recipe.cell_mm
+    disc = np.pi * max(radius_mm, 0.75 * cell) ** 2 / cell**2
+    return min(1.0, len(window_cells(tactile_map, centre_mm, radius_mm=max(radius_mm, 0.75 * cell))) / disc)
+
+
+def typical_level(tactile_map: TactileMap) -> float:
+    """Level away from the lump: the background that normalising defines, else the median of the covered cells."""
+    if tactile_map.background is not None:
+        return tactile_map.background
+    return float(np.median(tactile_map.mean[trusted(tactile_map)]))
+
+
+def value_scale(tactile_map: TactileMap) -> float:
+    """The size of an amplitude of order one: 1 for a normalised map, else the largest departure from its level."""
+    if tactile_map.background is not None:
+        return 1.0
+    covered = tactile_map.mean[tactile_map.covered]
+    scale = float(np.abs(covered - np.median(covered)).max())
+    return scale if scale > 0 else 1.0
+
+
+def candidate_centres(tactile_map: TactileMap, *, limit: int = 8) -> list[tuple[float, float]]:
+    """Local maxima of the smoothed map, highest first: where a lump could be.
+
+    Parameters
+    ----------
+    limit
+        At most this many.
+
+    Returns
+    -------
+    list of (x_mm, y_mm)
+        Empty where no covered cell rises above the background.
+    """
+    excess = smoothed_excess(tactile_map)
+    padded = np.pad(excess, 1, constant_values=-np.inf)
+    ny, nx = excess.shape
+    neighbours = [
+        padded[1 + i : 1 + i + ny, 1 + j : 1 + j + nx] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
+    ]
+    peak = np.isfinite(excess) & (excess > 0) & np.logical_and.reduce([excess >= other for other in neighbours])
+    rows, columns = np.nonzero(peak)
+    order = np.argsort(-excess[rows, columns], kind="stable")
+    found: list[tuple[float, float]] = []
+    for i in order:
+        centre = (float(tactile_map.x_mm[columns[i]]), float(tactile_map.y_mm[rows[i]]))
+        if all(np.hypot(centre[0] - x, centre[1] - y) > 2 * SMOOTHING_MM for x, y in found):
+            found.append(centre)
+        if len(found) == limit:
+            break
+    return found
+
+
+def smoothed_excess(tactile_map: TactileMap, *, width_mm: float = SMOOTHING_MM) -> FloatArray:
+    """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data."""
+    covered = trusted(tactile_map)
+    excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
+    weight = np.where(covered, np.sqrt(tactile_map.count.astype(np.float64)), 0.0)
+    cell = tactile_map.recipe.cell_mm
+    top = _smooth(excess * weight, width_mm / cell)
+    bottom = _smooth(weight, width_mm / cell)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(covered & (bottom > 0), top / bottom, -np.inf)
+
+
+def _smooth(array: FloatArray, width_cells: float) -> FloatArray:
+    """Separable Gaussian smoothing with zeros beyond the edge."""
+    half = max(1, int(np.ceil(4 * width_cells)))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / max(width_cells, 0.3)) ** 2)
+    rows = np.apply_along_axis(lambda line: np.convolve(line, kernel, mode="full")[half:-half], 0, array)
+    return np.apply_along_axis(lambda line: np.convolve(line, kernel, mode="full")[half:-half], 1, rows)

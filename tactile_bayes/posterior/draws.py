@@ -1,0 +1,61 @@
+"""What every method returns: draws of the model's parameters, with how they were obtained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+
+INDEPENDENT_DRAWS = 4000
+"""Draws of the methods that draw independently: end-point Monte-Carlo error of a 95 % interval about 0.04 SD."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParameterDraws:
+    """Draws of a parameter vector.
+
+    Parameters
+    ----------
+    theta : (chain, draw, p) array
+    method
+        ``"optimise"``, ``"laplace"`` or ``"ensemble"``.
+    diagnostics
+        Figures of the method (R-hat, effective draws, evaluations...), for the report.
+    """
+
+    theta: FloatArray
+    method: str
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def flat(self) -> FloatArray:
+        """(chain * draw, p) all draws."""
+        return self.theta.reshape(-1, self.theta.shape[-1])
+
+    @property
+    def effective_draws(self) -> float:
+        """Draws this set is worth for an end point: the smallest tail ESS, or all when they are independent."""
+        return float(self.diagnostics.get("ess_tail", len(self.flat)))
+
+
+def student_draws(
+    centre: FloatArray, scale: FloatArray, *, dof: float, number: int, rng: np.random.Generator
+) -> FloatArray:
+    """(number, p) draws of a multivariate t: normal draws whose noise scale is itself uncertain.
+
+    Parameters
+    ----------
+    centre, scale : (p,), (p, p) arrays
+        Location and scale matrix, which may be near-singular.
+    dof
+        Degrees of freedom of the noise estimate; ``inf`` gives normal draws.
+    """
+    values, vectors = np.linalg.eigh(scale)
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    normal = rng.standard_normal((number, len(centre))) @ root.T
+    if np.isinf(dof):
+        return np.asarray(centre + normal)
+    return np.asarray(centre + normal * np.sqrt(dof / rng.chisquare(dof, size=number))[:, None])

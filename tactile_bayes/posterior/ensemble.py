@@ -1,0 +1,161 @@
+"""Markov chain Monte Carlo by independent emcee ensembles that must agree with each other before they stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import emcee
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.draws import ParameterDraws, student_draws
+from tactile_bayes.posterior.inference_data import chain_diagnostics
+from tactile_bayes.posterior.laplace import LogDensity
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class EnsembleOptions:
+    """When to stop.
+
+    Parameters
+    ----------
+    ensembles
+        Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles.
+    walkers_per_parameter
+        Walkers of each ensemble, a parameter.
+    block
+        Steps between two looks at the diagnostics.
+    max_steps
+        Give up after this many.
+    least_ess, most_rhat
+        Bulk and tail effective draws, and R-hat, that every parameter must reach.
+    keep
+        Draws kept, thinned evenly over all ensembles.
+    """
+
+    ensembles: int = 4
+    walkers_per_parameter: int = 4
+    block: int = 150
+    max_steps: int = 6000
+    least_ess: float = 800.0
+    most_rhat: float = 1.01
+    keep: int = 8000
+
+
+def ensemble(
+    log_density: LogDensity,
+    centre: FloatArray,
+    covariance: FloatArray,
+    *,
+    rng: np.random.Generator,
+    options: EnsembleOptions | None = None,
+    progress: Progress | None = None,
+) -> ParameterDraws:
+    """Draw from a log density, starting from overdispersed normal draws about its mode.
+
+    Parameters
+    ----------
+    log_density
+        Vectorised: (m, p) to (m,).
+    centre, covariance : (p,), (p, p) arrays
+        Mode and approximate covariance.
+
+    Raises
+    ------
+    NotConvergedError
+        When the diagnostics are not reached in ``max_steps``; says about how many steps would do.
+
+    Notes
+    -----
+    Differential-evolution moves (ter Braak 2006) in emcee (Foreman-Mackey et al. 2013). The first third of each
+    ensemble's steps is dropped. Diagnostics are rank-normalised (Vehtari et al. 2021).
+    """
+    options = options or EnsembleOptions()
+    samplers = [_Ensemble(log_density, centre, covariance, rng=rng, options=options) for _ in range(options.ensembles)]
+    figures: dict[str, float] = {}
+    for steps in range(options.block, options.max_steps + 1, options.block):
+        for sampler in samplers:
+            sampler.advance(options.block)
+        if progress is not None:
+            progress(steps, options.max_steps)
+        chains = np.stack([sampler.chain() for sampler in samplers])
+        figures = chain_diagnostics(chains)
+        reached = min(figures["ess_bulk"], figures["ess_tail"]) >= options.least_ess
+        if reached and figures["rhat"] <= options.most_rhat:
+            figures |= {"steps": float(steps), "walkers": float(samplers[0].walkers), "ensembles": len(samplers)}
+            figures |= {"evaluations": float(steps * samplers[0].walkers * len(samplers))}
+            figures |= {"acceptance": float(np.mean([sampler.acceptance() for sampler in samplers]))}
+            return ParameterDraws(_thin(chains, options.keep), "ensemble", figures)
+    raise NotConvergedError(_advice(figures, options), diagnostics=figures)
+
+
+class _Ensemble:
+    """One emcee ensemble with a random stream of its own."""
+
+    def __init__(
+        self,
+        log_density: LogDensity,
+        centre: FloatArray,
+        covariance: FloatArray,
+        *,
+        rng: np.random.Generator,
+        options: EnsembleOptions,
+    ) -> None:
+        p = len(centre)
+        self._centre, self._scale = centre, np.sqrt(np.diag(covariance))
+        self.walkers = max(2 * ((options.walkers_per_parameter * p + 1) // 2), 2 * p + 2)
+        self._sampler = emcee.EnsembleSampler(
+            self.walkers, p, self._standardised(log_density), vectorize=True, moves=[(emcee.moves.DEMove(), 1.0)]
+        )
+        start = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
+        # emcee takes neither an integer nor a Generator: it must be handed the state of a RandomState
+        random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
+        self._state = emcee.State((start - self._centre) / self._scale, random_state=random_state)
+
+    def _standardised(self, log_density: LogDensity) -> LogDensity:
+        """The density of ``(theta - centre) / scale``: emcee judges the walkers' independence by their numbers."""
+        return lambda z: log_density(self._centre + self._scale * z)
+
+    def advance(self, steps: int) -> None:
+        self._state = self._sampler.run_mcmc(self._state, steps)
+
+    def chain(self) -> FloatArray:
+        """(draw, p): the last two thirds, walker after walker: neighbours in the array are neighbours in time."""
+        steps = self._centre + self._scale * self._sampler.get_chain()
+        kept = steps[len(steps) // 3 :]
+        return np.asarray(np.swapaxes(kept, 0, 1).reshape(-1, kept.shape[-1]))
+
+    def acceptance(self) -> float:
+        return float(np.mean(self._sampler.acceptance_fraction))
+
+
+def _finite_start(
+    log_density: LogDensity, centre: FloatArray, covariance: FloatArray, *, number: int, rng: np.random.Generator
+) -> FloatArray:
+    """Overdispersed draws with finite density; wild ones are pulled towards the centre."""
+    draws = student_draws(centre, 1.5 * covariance, dof=np.inf, number=number, rng=rng)
+    for _ in range(60):
+        bad = ~np.isfinite(log_density(draws))
+        if not bad.any():
+            return draws
+        draws[bad] = centre + 0.7 * (draws[bad] - centre)
+    raise NotConvergedError("the posterior is not finite near its mode; check the map")
+
+
+def _thin(chains: FloatArray, keep: int) -> FloatArray:
+    stride = max(1, (chains.shape[0] * chains.shape[1]) // keep)
+    return np.ascontiguousarray(chains[:, ::stride])
+
+
+def _advice(figures: dict[str, float], options: EnsembleOptions) -> str:
+    least = max(min(figures["ess_bulk"], figures["ess_tail"]), 1.0)
+    factor = max(options.least_ess / least, 2.0 if figures["rhat"] > options.most_rhat else 1.0)
+    return (
+        f"not converged after {options.max_steps} steps: R-hat {figures['rhat']:.3f} (wanted {options.most_rhat}), "
+        f"effective draws {least:.0f} (wanted {options.least_ess:.0f}); "
+        f"run about {factor:.1f} times as long (--max-steps {int(np.ceil(factor * options.max_steps / 100)) * 100})"
+    )

@@ -1,0 +1,284 @@
+"""From a tactile map to a size posterior, or to a reason why there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.detection import Detection, detect
+from tactile_bayes.posterior.draws import ParameterDraws
+from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, find_bump, rotation_odds
+from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
+from tactile_bayes.posterior.noise import level_offset
+from tactile_bayes.posterior.optimise import optimise
+from tactile_bayes.posterior.size import SizePosterior, push_sizes
+from tactile_bayes.posterior.size_calibration import SizeCalibration
+
+Status = Literal["estimate", "no_estimate"]
+ROTATION_ODDS = 3.0
+"""A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
+DETECTED = 0.95
+MOST_INVALID = 0.05
+COARSE_CELL = 0.75
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateOptions:
+    """Settings of an estimate.
+
+    Parameters
+    ----------
+    method
+        ``"optimise"``, ``"laplace"`` or ``"ensemble"``.
+    fit
+        Background, window, rotation, centre.
+    prior
+        On the bump.
+    least_probability
+        Below this probability of a lump there is no estimate.
+    max_steps
+        Of the ensemble; None for its default.
+    """
+
+    method: str = "ensemble"
+    fit: FitOptions = field(default_factory=FitOptions)
+    prior: BumpPrior = field(default_factory=BumpPrior)
+    least_probability: float = DETECTED
+    max_steps: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPosterior:
+    """Joint draws of what Eq 7 describes, each (chain, draw)."""
+
+    amplitude: FloatArray
+    sigma_x_mm: FloatArray
+    sigma_y_mm: FloatArray
+    x_mm: FloatArray
+    y_mm: FloatArray
+    angle_rad: FloatArray
+    background: FloatArray
+    noise_sd: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The answer for one map.
+
+    Parameters
+    ----------
+    status, reason
+        ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is missing from it, if
+        anything.
+    detection
+        None when no bump could be tested.
+    fit, draws, map_posterior, size
+        None without an estimate; `size` is None also without a size calibration.
+    candidates
+        Every place that was looked at.
+    diagnostics
+        Figures and flags for the report.
+    left_out
+        What the estimate does not contain, in words.
+    """
+
+    status: Status
+    reason: str
+    detection: Detection | None = None
+    fit: BumpFit | None = None
+    draws: ParameterDraws | None = None
+    map_posterior: MapPosterior | None = None
+    size: SizePosterior | None = None
+    candidates: tuple[Candidate, ...] = ()
+    diagnostics: Mapping[str, object] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+
+
+def estimate_map(
+    tactile_map: TactileMap,
+    *,
+    calibration: SizeCalibration | None,
+    options: EstimateOptions,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] | None = None,
+) -> Estimate:
+    """Estimate the lump's size from one map.
+
+    Parameters
+    ----------
+    calibration
+        Eq 6; without it the estimate stops at widths and amplitude.
+
+    Raises
+    ------
+    BadDataError
+        When the map or the fit options differ from the calibration's recipe.
+    NotConvergedError
+        When the method does not converge.
+    """
+    if calibration is not None:
+        check_recipe(tactile_map, calibration, options.fit)
+    if not tactile_map.covered.any():
+        return Estimate("no_estimate", "the map has no covered cell")
+    candidates = tuple(find_bump(tactile_map, options.fit))
+    if not candidates:
+        return Estimate("no_estimate", "nothing rises above the background")
+    chosen = candidates[-1]
+    if chosen.fault or chosen.fit is None:
+        return Estimate("no_estimate", _fault_reason(candidates), candidates=candidates)
+    fit = chosen.fit
+    detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
+    if detection.probability < options.least_probability:
+        reason = f"no lump detected (probability {detection.probability:.2g}, needed {options.least_probability:g})"
+        return Estimate("no_estimate", reason, detection=detection, candidates=candidates)
+    fit, odds = _choose_rotation(tactile_map, fit, options)
+    draws = _draw(fit, options, rng=rng, progress=progress)
+    posterior = _map_posterior(fit, draws, options, rng=rng)
+    size = _size(posterior, calibration, rng=rng)
+    diagnostics = _diagnostics(tactile_map, fit, draws, calibration, odds=odds)
+    if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
+        reason = f"Eq 6 gives no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
+        return Estimate("no_estimate", reason, detection=detection, candidates=candidates, diagnostics=diagnostics)
+    reason = "" if calibration is not None else "no size calibration was given: widths only"
+    return Estimate(
+        "estimate",
+        reason,
+        detection=detection,
+        fit=fit,
+        draws=draws,
+        map_posterior=posterior,
+        size=size,
+        candidates=candidates,
+        diagnostics=diagnostics,
+        left_out=_left_out(fit, options, calibration, odds),
+    )
+
+
+def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration, fit: FitOptions) -> None:
+    """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
+    differs = calibration.recipe.differences(
+        normalise=tactile_map.recipe.normalise, background=fit.background, radius_mm=fit.radius_mm
+    )
+    if differs:
+        raise BadDataError(
+            f"the size calibration was learned by another recipe: {'; '.join(differs)}",
+            way_out="build and fit the map as the calibration's maps were, or learn a calibration for this recipe",
+        )
+
+
+def _fault_reason(candidates: tuple[Candidate, ...]) -> str:
+    first = candidates[0]
+    where = f"near ({first.centre_mm[0]:.1f}, {first.centre_mm[1]:.1f}) mm"
+    more = f" ({len(candidates) - 1} lower bumps fail too)" if len(candidates) > 1 else ""
+    return f"no bump can be measured: the highest, {where}, is {first.fault}{more}"
+
+
+def _choose_rotation(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tuple[BumpFit, float | None]:
+    if options.fit.rotation != "auto":
+        return fit, None
+    odds, turned = rotation_odds(tactile_map, fit, options=options.fit, prior=options.prior)
+    return (turned, odds) if turned is not None and odds > ROTATION_ODDS else (fit, odds)
+
+
+def _draw(
+    fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Callable[[int, int], None] | None
+) -> ParameterDraws:
+    if options.method == "optimise":
+        return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
+    target = fit.target(options.prior)
+    scale = np.sqrt(np.diag(fit.covariance))
+    if options.method == "laplace":
+        return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
+    if options.method == "ensemble":
+        from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
+
+        mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=scale)
+        settings = EnsembleOptions()
+        if options.max_steps is not None:
+            settings = replace(settings, max_steps=options.max_steps)
+        return ensemble(target, mode, covariance, rng=rng, options=settings, progress=progress)
+    raise ValueError(f"unknown method {options.method!r}")
+
+
+def _map_posterior(
+    fit: BumpFit, draws: ParameterDraws, options: EstimateOptions, *, rng: np.random.Generator
+) -> MapPosterior:
+    theta = draws.theta
+    sigma_x, sigma_y, angle = fit.bump.widths(theta)
+    prior = None if options.method == "optimise" else options.prior
+    noise = fit.target(prior).draw_noise_sd(draws.flat, rng).reshape(theta.shape[:2])
+    return MapPosterior(
+        amplitude=theta[..., 0],
+        sigma_x_mm=sigma_x,
+        sigma_y_mm=sigma_y,
+        x_mm=theta[..., 1],
+        y_mm=theta[..., 2],
+        angle_rad=angle,
+        background=fit.bump.level(theta),
+        noise_sd=noise,
+    )
+
+
+def _size(
+    posterior: MapPosterior, calibration: SizeCalibration | None, *, rng: np.random.Generator
+) -> SizePosterior | None:
+    if calibration is None:
+        return None
+    return push_sizes(
+        posterior.amplitude,
+        posterior.sigma_x_mm,
+        posterior.sigma_y_mm,
+        posterior.angle_rad,
+        calibration=calibration,
+        rng=rng,
+    )
+
+
+def _diagnostics(
+    tactile_map: TactileMap,
+    fit: BumpFit,
+    draws: ParameterDraws,
+    calibration: SizeCalibration | None,
+    *,
+    odds: float | None,
+) -> dict[str, object]:
+    sigma_x, sigma_y, _ = fit.widths()
+    outside: list[str] = []
+    if calibration is not None:
+        amplitude = float(fit.theta[0])
+        outside += [f"x: {text}" for text in calibration.x.outside(sigma_x, amplitude)]
+        outside += [f"y: {text}" for text in calibration.y.outside(sigma_y, amplitude)]
+    return {
+        "method": draws.method,
+        **draws.diagnostics,
+        "cells": len(fit.cells),
+        "noise_inflation": fit.errors.inflation,
+        "noise_dof": fit.errors.dof,
+        "covered_share": fit.covered_share,
+        "level_offset": level_offset(fit.fit.residual, weight=fit.weight),
+        "rotation_odds": odds,
+        "rotated": fit.bump.rotated,
+        "coarse_cells": tactile_map.recipe.cell_mm > COARSE_CELL * min(sigma_x, sigma_y),
+        "outside_calibration": outside,
+    }
+
+
+def _left_out(
+    fit: BumpFit, options: EstimateOptions, calibration: SizeCalibration | None, odds: float | None
+) -> tuple[str, ...]:
+    notes = []
+    if odds is not None and not fit.bump.rotated:
+        notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
+    if options.fit.background == "fixed":
+        notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")
+    notes.append("spread between maps of one mass (15 % in the paper): this is one map")
+    if calibration is not None and calibration.axes == ("both",):
+        notes.append("a difference between the head's axes: the calibration has one width")
+    return tuple(notes)

@@ -1,0 +1,44 @@
+"""The one door to arviz: chain diagnostics and InferenceData."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", FutureWarning)  # its notice of the next major version, which is pinned away
+    import arviz
+
+
+def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
+    """Worst rank-normalised R-hat and smallest bulk and tail effective draws over the parameters.
+
+    Parameters
+    ----------
+    chains : (chain, draw, p) array
+
+    References
+    ----------
+    Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Analysis 16:667.
+    """
+    columns = [np.ascontiguousarray(chains[:, :, i]) for i in range(chains.shape[2])]
+    return {
+        "rhat": float(max(arviz.rhat(column, method="rank") for column in columns)),
+        "ess_bulk": float(min(arviz.ess(column, method="bulk") for column in columns)),
+        "ess_tail": float(min(arviz.ess(column, method="tail") for column in columns)),
+    }
+
+
+def to_inference_data(posterior: Mapping[str, FloatArray], *, attributes: Mapping[str, str]) -> Any:
+    """InferenceData with one posterior group of (chain, draw) variables and no clock time in it."""
+    data = arviz.from_dict(posterior={name: np.asarray(values) for name, values in posterior.items()})
+    for group in data.groups():
+        data[group].attrs.pop("created_at", None)
+    data.posterior.attrs.update(attributes)
+    data.attrs.pop("created_at", None)
+    return data

@@ -1,0 +1,185 @@
+r"""Bayesian regression of Eq 6 from a table of known lumps: m, b, e, f and the residual scatter, jointly.
+
+On the log scale, with :math:`a_0, \sigma_0` the table's geometric means,
+
+.. math::
+    \ln d_i &= \ln\!\left[M\,(\sigma_i/\sigma_0)\,(a_i/a_0)^{-f} + b\right] + \epsilon_i,
+        \quad \epsilon_i \sim N(0,\, s\,(a_i/a_0)^{-g}) \\
+    \ln(\sigma_i / \sigma_i^{(1)}) &= \ln e + f \ln a_i + \eta_i, \quad \eta_i \sim N(0, t)
+
+where :math:`\sigma_i^{(1)}` is the width of the same lump at one diameter depth (Delta sigma is a ratio), and
+:math:`m = M\,e\,a_0^{f}/\sigma_0`. Without depths in the table the second line is missing and only m/e is determined:
+e is then 1 by convention.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
+from tactile_bayes.posterior.laplace import mode_and_covariance
+from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
+
+DRAWS_KEPT = 1000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SizeTable:
+    """A study or a set of phantoms: one row a lump.
+
+    Parameters
+    ----------
+    d_mm, amplitude, sigma_x_mm : (n,) arrays
+        True diameter, and the fit of its map.
+    sigma_y_mm : (n,) array or None
+    width_change_x, width_change_y : (n,) arrays or None
+        Width over the width of the same lump at one diameter depth; NaN where the table has no such row.
+    """
+
+    d_mm: FloatArray
+    amplitude: FloatArray
+    sigma_x_mm: FloatArray
+    sigma_y_mm: FloatArray | None
+    width_change_x: FloatArray | None = None
+    width_change_y: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _AxisData:
+    d_mm: FloatArray
+    amplitude: FloatArray
+    sigma_mm: FloatArray
+    width_change: FloatArray | None
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Geometric means of amplitude and width."""
+        return float(np.exp(np.log(self.amplitude).mean())), float(np.exp(np.log(self.sigma_mm).mean()))
+
+
+def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: list[tuple[object, ...]]) -> FloatArray:
+    """Delta sigma: each width over that of the same group's row at one diameter depth; NaN without such a row."""
+    reference = {key: s for key, s, h in zip(group, sigma_mm, depth_ratio, strict=True) if abs(h - 1.0) < 1e-9}
+    return np.array([s / reference.get(key, np.nan) for key, s in zip(group, sigma_mm, strict=True)])
+
+
+def learn_size_calibration(table: SizeTable, *, recipe: Recipe, rng: np.random.Generator) -> SizeCalibration:
+    """Learn Eq 6 from a table.
+
+    Parameters
+    ----------
+    table
+        At least eight rows with positive amplitude.
+    recipe
+        How the table's maps were made.
+
+    Raises
+    ------
+    BadDataError
+        When rows are too few, or do not vary.
+    NotConvergedError
+        When the sampler does not converge.
+    """
+    rising = table.amplitude > 0
+    if rising.sum() < 8:
+        raise BadDataError(
+            f"{int(rising.sum())} rows with a positive amplitude", way_out="Eq 6 has 4 coefficients: give at least 8"
+        )
+    if np.ptp(table.d_mm[rising]) <= 0:
+        raise BadDataError("all rows have one diameter", way_out="a calibration needs lumps of several sizes")
+
+    def axis(sigma: FloatArray, change: FloatArray | None) -> _AxisData:
+        kept = None if change is None else change[rising]
+        return _AxisData(table.d_mm[rising], table.amplitude[rising], sigma[rising], kept)
+
+    x_data = axis(table.sigma_x_mm, table.width_change_x)
+    x = _learn_axis(x_data, rng=rng)
+    if table.sigma_y_mm is None:
+        return SizeCalibration(x, x, 1.0, recipe, axes=("both",))
+    y_data = axis(table.sigma_y_mm, table.width_change_y)
+    y = _learn_axis(y_data, rng=rng)
+    correlation = np.corrcoef(_standard_residuals(x, x_data), _standard_residuals(y, y_data))[0, 1]
+    return SizeCalibration(x, y, float(np.clip(correlation, -1, 1)), recipe)
+
+
+def _standard_residuals(axis: AxisCalibration, data: _AxisData) -> FloatArray:
+    predicted = axis.size_mm(data.sigma_mm, data.amplitude)
+    return np.asarray((np.log(data.d_mm) - np.log(predicted)) / axis.scatter(data.amplitude))
+
+
+def _learn_axis(data: _AxisData, *, rng: np.random.Generator) -> AxisCalibration:
+    scale = np.array([0.05, 0.5, 0.03, 0.1, 0.1, 0.05, 0.1])
+    start = _start(data)
+    if data.width_change is None or np.isfinite(data.width_change).sum() < 4:
+        data = _AxisData(data.d_mm, data.amplitude, data.sigma_mm, None)
+        scale, start = scale[:5], start[:5]
+
+    def log_density(theta: FloatArray) -> FloatArray:
+        return _log_density(theta, data)
+
+    mode, covariance, _ = mode_and_covariance(log_density, start, scale=scale)
+    options = EnsembleOptions(keep=DRAWS_KEPT, max_steps=20_000, block=300)
+    draws = ensemble(log_density, mode, covariance, rng=rng, options=options)
+    coefficients = _coefficients(draws.flat, data)
+    axis = AxisCalibration(coefficients, data.centre[0], _domain(data))
+    predicted = axis.size_mm(data.sigma_mm, data.amplitude)
+    log_error = np.log(data.d_mm) - np.log(predicted)
+    figures = {
+        "rows": float(len(data.d_mm)),
+        "r2": float(1.0 - np.sum(log_error**2) / np.sum((np.log(data.d_mm) - np.log(data.d_mm).mean()) ** 2)),
+        "mae_percent": float(100 * np.mean(np.abs(predicted / data.d_mm - 1.0))),
+        "e_identified": float(data.width_change is not None),
+        "rhat": draws.diagnostics["rhat"],
+        "ess_tail": draws.diagnostics["ess_tail"],
+    }
+    return AxisCalibration(coefficients, data.centre[0], _domain(data), figures)
+
+
+def _start(data: _AxisData) -> FloatArray:
+    """ln M, b, f, ln s, g, ln e, ln t where the search for the mode begins."""
+    a0, s0 = data.centre
+    ratio = np.log(data.d_mm) - np.log(data.sigma_mm / s0)
+    f = -float(np.polyfit(np.log(data.amplitude / a0), ratio, 1)[0]) if np.ptp(data.amplitude) > 0 else 0.0
+    return np.array([np.log(np.median(data.d_mm)), 0.0, np.clip(f, -1.0, 1.0), np.log(0.25), 0.0, -0.2, np.log(0.3)])
+
+
+def _log_density(theta: FloatArray, data: _AxisData) -> FloatArray:
+    """(m,) log posterior of (m, 5 or 7) vectors ``(ln M, b, f, ln s, g[, ln e, ln t])``.
+
+    Priors: ln M ~ N(ln 15 mm, 1.5), b ~ N(0, 20 mm), f ~ N(-0.3, 0.5), ln s ~ N(ln 0.2, 1), g ~ N(0, 0.5),
+    ln e ~ N(0, 1), ln t ~ N(ln 0.2, 1): wide beside what a dozen rows determine.
+    """
+    a0, s0 = data.centre
+    log_a = np.log(data.amplitude / a0)
+    size = np.exp(theta[:, :1] + np.log(data.sigma_mm / s0) - theta[:, 2:3] * log_a) + theta[:, 1:2]
+    log_scatter = theta[:, 3:4] - theta[:, 4:5] * log_a
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = (np.log(data.d_mm) - np.log(np.where(size > 0, size, np.nan))) / np.exp(log_scatter)
+    total = np.sum(-0.5 * error**2 - log_scatter, axis=1)
+    centres, widths = [np.log(15.0), 0.0, -0.3, np.log(0.2), 0.0], [1.5, 20.0, 0.5, 1.0, 0.5]
+    if data.width_change is not None:
+        known = np.isfinite(data.width_change)
+        log_change = theta[:, 5:6] + theta[:, 2:3] * np.log(data.amplitude[known])
+        eta = (np.log(data.width_change[known]) - log_change) / np.exp(theta[:, 6:7])
+        total = total + np.sum(-0.5 * eta**2 - theta[:, 6:7], axis=1)
+        centres, widths = [*centres, 0.0, np.log(0.2)], [*widths, 1.0, 1.0]
+    total = total - 0.5 * np.sum(((theta - centres) / widths) ** 2, axis=1)
+    return np.where(np.isfinite(total), total, -np.inf)
+
+
+def _coefficients(theta: FloatArray, data: _AxisData) -> FloatArray:
+    """(n, 6) m, b, e, f, scatter, slope from draws of the regression's own parameters."""
+    a0, s0 = data.centre
+    e = np.exp(theta[:, 5]) if theta.shape[1] > 5 else np.ones(len(theta))
+    f = theta[:, 2]
+    m = np.exp(theta[:, 0]) * e * a0**f / s0
+    return np.stack([m, theta[:, 1], e, f, np.exp(theta[:, 3]), theta[:, 4]], axis=1)
+
+
+def _domain(data: _AxisData) -> dict[str, tuple[float, float]]:
+    pairs = (("amplitude", data.amplitude), ("sigma_mm", data.sigma_mm), ("d_mm", data.d_mm))
+    return {name: (float(values.min()), float(values.max())) for name, values in pairs}

@@ -1,0 +1,94 @@
+"""The log density every method works on: a least-squares model with its noise scale integrated out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.least_squares import ModelFunction
+from tactile_bayes.posterior.noise import ErrorModel
+
+LogPrior = Callable[[FloatArray], FloatArray]
+
+
+def flat_prior(theta: FloatArray) -> FloatArray:
+    """(m,) zeros: the improper flat prior of certified regression data sets."""
+    return np.zeros(theta.shape[:-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    r"""Posterior density of a model's parameters, up to a constant.
+
+    Parameters
+    ----------
+    predict
+        (m, p) parameter vectors to (m, k) predictions.
+    data, weight : (k,) arrays
+        Weights are inverse variances up to a common factor.
+    log_prior
+        (m, p) to (m,).
+    errors
+        Size, correlation and degrees of freedom of the noise.
+    sse_min
+        Weighted sum of squares at the least-squares estimate.
+
+    Notes
+    -----
+    With independent errors and the Jeffreys prior on their scale the noise integrates out to
+    :math:`\mathrm{SSE}(\theta)^{-k/2}`. Correlated errors divide the log-likelihood by the inflation c and leave
+    :math:`\nu` effective degrees of freedom:
+    :math:`[1 + \Delta\mathrm{SSE} / (c\,\nu s^2)]^{-(\nu + p)/2}`, which is the former for c = 1 and nu = k - p.
+    """
+
+    predict: ModelFunction
+    data: FloatArray
+    weight: FloatArray
+    log_prior: LogPrior
+    errors: ErrorModel
+    sse_min: float
+    dimension: int
+
+    def excess(self, theta: FloatArray) -> FloatArray:
+        """(m,) rise of the weighted sum of squares above its minimum, divided by the inflation."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            sse = (self.data - self.predict(theta)) ** 2 @ self.weight
+        rise = np.clip(sse - self.sse_min, 0.0, None) / self.errors.inflation
+        return np.where(np.isfinite(rise), rise, np.inf)
+
+    def __call__(self, theta: FloatArray) -> FloatArray:
+        """(m,) log density of (m, p) parameter vectors; -inf where the model overflows."""
+        variance = self.errors.dof * self.errors.noise_sd**2
+        exponent = 0.5 * (self.errors.dof + self.dimension)
+        likelihood = -exponent * np.log1p(self.excess(theta) / variance)
+        total = likelihood + self.log_prior(theta)
+        return np.where(np.isfinite(total), total, -np.inf)
+
+    def draw_noise_sd(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """(m,) noise scale given the parameters: a scaled inverse chi, exact under this model."""
+        chi2 = rng.chisquare(self.errors.dof + self.dimension, size=len(theta))
+        return np.sqrt((self.errors.dof * self.errors.noise_sd**2 + self.excess(theta)) / chi2)
+
+
+def numerical_gradient_and_hessian(
+    function: Callable[[FloatArray], FloatArray], theta: FloatArray, *, step: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Central differences of a vectorised scalar function: (p,) gradient and (p, p) Hessian, one call."""
+    p = len(theta)
+    shifts = np.diag(step)
+    pairs = [(i, j) for i in range(p) for j in range(i)]
+    points = [theta[None], theta + shifts, theta - shifts]
+    for i, j in pairs:
+        points.append(
+            theta
+            + np.array([shifts[i] + shifts[j], shifts[i] - shifts[j], shifts[j] - shifts[i], -shifts[i] - shifts[j]])
+        )
+    values = function(np.concatenate(points))
+    here, up, down = values[0], values[1 : p + 1], values[p + 1 : 2 * p + 1]
+    hessian = np.diag((up - 2 * here + down) / step**2)
+    for (i, j), quad in zip(pairs, values[2 * p + 1 :].reshape(-1, 4), strict=True):
+        hessian[i, j] = hessian[j, i] = (quad[0] - quad[1] - quad[2] + quad[3]) / (4 * step[i] * step[j])
+    return (up - down) / (2 * step), hessian
