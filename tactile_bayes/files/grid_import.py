@@ -104,8 +104,7 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
 
 
 def _centres(n: int, spacing_mm: float) -> FloatArray:
-    centres: FloatArray = (np.arange(n) - (n - 1) / 2) * spacing_mm
-    return centres
+    return np.asarray((np.arange(n) - (n - 1) / 2) * spacing_mm, dtype=np.float64)
 
 
 def _numbers(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:

@@ -1,0 +1,138 @@
+"""`import`: other people's arrays as a scan, grids and images as a map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tactile_bayes.presets import NORMALISE, RESEARCH_USE
+
+if TYPE_CHECKING:
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.scan import Scan
+
+
+@click.command("import")
+@click.argument("source", metavar="SRC", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .mcap or .nc.")
+@click.option(
+    "--as",
+    "kind",
+    type=click.Choice(["scan", "map"]),
+    help="What SRC holds; by default a scan in .npz and .mcap files, a map in tables and images.",
+)
+@click.option("--spacing-mm", type=float, metavar="H", help="Map: side of the square cells, in mm.")
+@click.option(
+    "--normalise",
+    type=click.Choice(NORMALISE),
+    help="Map: how the values were divided already; none (the default) if they were not.",
+)
+@click.option("--force", is_flag=True, help="Overwrite the output.")
+def command(
+    *, source: Path, output: Path, kind: str | None, spacing_mm: float | None, normalise: str | None, force: bool
+) -> None:
+    """Bring other people's data in.
+
+    SRC is an .npz of raw counts and poses (a scan), a scan file to repair (what is intact is kept), or a grid of
+    values (a map): .npz with `mean`, .csv, or a grey .tif, .pgm or .png image. Row 0 of a grid is its lowest y.
+    """
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.atomic import refuse_existing
+
+    refuse_existing(output, force=force)
+    kind = kind or ("scan" if source.suffix.lower() in (".npz", ".mcap") else "map")
+    if kind == "scan" and (spacing_mm is not None or normalise is not None):
+        raise UsageError("--spacing-mm and --normalise are for maps; leave them out or give --as map")
+    if kind == "scan":
+        lines = _import_scan(source, output, force=force)
+    else:
+        lines = _import_map(source, output, spacing_mm=spacing_mm, normalise=normalise or "none", force=force)
+    for line in (f"{output}: {kind}", *lines, RESEARCH_USE):
+        click.echo(line)
+
+
+def _import_scan(source: Path, output: Path, *, force: bool) -> list[str]:
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+
+    lost: tuple[str, ...] = ()
+    truth = None
+    if source.suffix.lower() == ".mcap":
+        file = read_scan_report(source)
+        scan, lost, truth = file.scan, file.lost, read_truth(source)
+    else:
+        from tactile_bayes.files.arrays_npz import read_arrays
+
+        scan = read_arrays(source)
+    provenance = Provenance("import", {"as": "scan", "lost": list(lost)}, inputs=hash_inputs(source=source))
+    write_scan(output, scan, provenance=provenance, truth=truth, force=force)
+    return [*describe_scan(scan), *(f"lost: {line}" for line in lost)]
+
+
+def _import_map(source: Path, output: Path, *, spacing_mm: float | None, normalise: str, force: bool) -> list[str]:
+    from tactile_bayes.files.grid_import import read_grid
+    from tactile_bayes.files.map_nc import write_map
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+
+    tactile_map = read_grid(source, spacing_mm=spacing_mm, normalise=normalise)
+    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise}
+    provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
+    write_map(output, tactile_map, provenance=provenance, force=force)
+    return _describe_map(tactile_map)
+
+
+def _describe_map(tactile_map: TactileMap) -> list[str]:
+    import numpy as np
+
+    ny, nx = tactile_map.mean.shape
+    covered = int(tactile_map.covered.sum())
+    low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
+    level = "unknown" if tactile_map.background is None else f"{tactile_map.background:g}"
+    return [
+        f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
+        f"values {low:.4g} to {high:.4g}, background level {level} (normalise {tactile_map.recipe.normalise})",
+    ]
+
+
+def describe_scan(scan: Scan) -> list[str]:
+    """A few lines on what a scan holds, for people."""
+    times, poses = scan.frames.time_s, scan.poses
+    span = float(times[-1] - times[0]) if len(times) else 0.0
+    calibration = scan.element_calibration
+    saturated = int((scan.frames.counts >= calibration.saturation_count).sum())
+    missing = "not touched" if scan.landmarks is None else "sternal notch and xiphoid"
+    return [
+        f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
+        f"{len(poses)} poses, {_rate(poses.time_s)}",
+        f"dropped frames {_dropped(times)}, dropped poses {_dropped(poses.time_s)}, "
+        f"duplicate pose stamps {_duplicates(poses.time_s)}, saturated readings {saturated}",
+        f"landmarks: {missing}",
+    ]
+
+
+def _rate(times: FloatArray) -> str:
+    import numpy as np
+
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    return f"{1 / np.median(steps):.1f} Hz" if len(steps) else "no rate"
+
+
+def _dropped(times: FloatArray) -> int:
+    """Periods that passed without a record, by the median period."""
+    import numpy as np
+
+    steps = np.diff(times)
+    if not (steps > 0).any():
+        return 0
+    periods = np.rint(steps / np.median(steps[steps > 0]))
+    return int(np.clip(periods - 1, 0, None).sum())
+
+
+def _duplicates(times: FloatArray) -> int:
+    import numpy as np
+
+    return int((np.diff(times) == 0).sum())

@@ -1,0 +1,174 @@
+"""Scenes as TOML: units in the keys, defaults and ranges in one schema, one line for every mistake."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.forward.scene import (
+    Background,
+    Head,
+    Lump,
+    Noise,
+    Scene,
+    SceneLandmarks,
+    Strokes,
+    Taxels,
+    Tracker,
+)
+
+_SCHEMA: Final = "scene.schema.json"
+_TYPES: Final = {
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+    "array": "a list",
+    "object": "a table",
+}
+
+
+def read_scene(path: Path) -> Scene:
+    """Read a scene; whatever is left out takes the default of ``scene.schema.json``.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the key, its value and what is allowed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise unreadable(path, error) from None
+    except UnicodeDecodeError as error:
+        raise BadDataError(f"is not text ({error})", way_out="give a scene as TOML", path=str(path)) from None
+    try:
+        return scene_from_toml(text)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def scene_from_toml(text: str) -> Scene:
+    """The scene a TOML text describes; see `read_scene` for the errors."""
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BadDataError(f"is not TOML ({error})", way_out="see the scene in the documentation") from None
+    _check_finite(document, where="")
+    _check(document)
+    return _scene(document)
+
+
+def _check_finite(value: object, *, where: str) -> None:
+    """TOML can write nan and inf, which pass every range."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_finite(item, where=f"{where}.{key}" if where else key)
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            _check_finite(item, where=f"{where}[{i}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise BadDataError(f"{where} is {value}", way_out="give a finite number")
+
+
+def _check(document: dict[str, Any]) -> None:
+    import fastjsonschema
+
+    try:
+        _validator()(document)
+    except fastjsonschema.JsonSchemaValueException as error:
+        raise _told(error) from None
+
+
+@cache
+def _validator() -> Any:
+    import fastjsonschema
+
+    return fastjsonschema.compile(load_schema(_SCHEMA), use_default=False)
+
+
+def _told(error: Any) -> BadDataError:
+    """The one line for a rule of the schema that was broken."""
+    where, value, rule = _where(error.path[1:]), error.value, error.definition
+    if error.rule == "additionalProperties":
+        return _unknown_key(where, value, rule)
+    if error.rule == "type":
+        kind = _TYPES.get(rule["type"], rule["type"])
+        return BadDataError(f"{where} is {_short(value)}", way_out=f"it must be {kind}{_range(rule)}")
+    if error.rule in ("minItems", "maxItems"):
+        low, high = rule.get("minItems", 0), rule.get("maxItems")
+        wanted = f"{low}" if low == high else f"{low} to {high}"
+        return BadDataError(f"{where} has {len(value)} entries", way_out=f"it must have {wanted}")
+    return BadDataError(f"{where} is {_short(value)}", way_out=f"it must be {_TYPES[rule['type']]}{_range(rule)}")
+
+
+def _where(path: list[Any]) -> str:
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _range(rule: Mapping[str, Any]) -> str:
+    """The allowed range in words: " above 0, at most 600"."""
+    words = []
+    for key, word in (
+        ("minimum", "at least"),
+        ("exclusiveMinimum", "above"),
+        ("maximum", "at most"),
+        ("exclusiveMaximum", "below"),
+    ):
+        if key in rule:
+            words.append(f"{word} {rule[key]:g}")
+    return " " + ", ".join(words) if words else ""
+
+
+def _unknown_key(where: str, table: Mapping[str, Any], rule: Mapping[str, Any]) -> BadDataError:
+    known = list(rule["properties"])
+    key = next(name for name in table if name not in known)
+    full = f"{where}.{key}" if where else key
+    stem = _stem(key)
+    other_unit = [name for name in known if _stem(name) == stem]
+    if other_unit:
+        return BadDataError(f"{full} is not known", way_out=f"give {other_unit[0]}, in the unit it names")
+    close = difflib.get_close_matches(key, known, n=1) or [name for name in known if name.startswith(key)][:1]
+    hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+    return BadDataError(f"{full} is not known", way_out=hint)
+
+
+def _stem(key: str) -> str:
+    """The key without its unit: ``x_cm`` and ``x_mm`` are one quantity."""
+    stem, _, unit = key.rpartition("_")
+    units = {"mm", "cm", "m", "um", "in", "kpa", "pa", "mpa", "psi", "s", "ms", "us", "min", "hz", "khz", "deg", "rad"}
+    return stem if stem and unit.lower() in units else key
+
+
+def _scene(document: Mapping[str, Any]) -> Scene:
+    taxels = document.get("taxels", {})
+    return Scene(
+        **document.get("scene", {}),
+        background=Background(**document.get("background", {})),
+        lumps=tuple(Lump(**lump) for lump in document.get("lump", [])),
+        strokes=Strokes(**document.get("strokes", {})),
+        head=Head(**document.get("head", {})),
+        noise=Noise(**document.get("noise", {})),
+        tracker=Tracker(**_tuples(document.get("tracker", {}))),
+        taxels=Taxels(**{kind: tuple((row, column) for row, column in pairs) for kind, pairs in taxels.items()}),
+        landmarks=SceneLandmarks(**_tuples(document.get("landmarks", {}))),
+    )
+
+
+def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
