@@ -24,6 +24,13 @@ _DPI = 150
 _SCALE_BAR_MM = 10.0
 # Cells with fewer readings do not set the range of the colours: one noisy edge cell would wash out the lump.
 _COLOUR_READINGS = 10
+# The colours span at least this share of the level below and above it, so that noise alone does not look like a lump.
+_LEAST_COLOURS = (0.9, 1.3)
+_VALUE_LABELS = {
+    "mean": "pressure / mean of its frame",
+    "gain": "pressure / level beside a lump",
+    "none": "mean pressure (kPa)",
+}
 _MAX_COLOUR, _MIN_COLOUR = "#1f3b73", "#c8641e"  # tell apart in greyscale too
 
 
@@ -81,7 +88,7 @@ def map_figure(
     """
     if not tactile_map.covered.any():
         raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")
-    with _figure(path, size_in=(10.0, 4.9), force=force) as figure:
+    with _figure(path, size_in=(10.0, 4.5), force=force) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.55, 1.0))
         _draw_values(left, tactile_map)
         _draw_coverage(right, tactile_map)
@@ -158,20 +165,25 @@ def _extent(tactile_map: TactileMap) -> tuple[float, float, float, float]:
 
 def _draw_values(axes: Axes, tactile_map: TactileMap) -> None:
     """The heat map; cells without data stay grey."""
-    well = tactile_map.covered & (tactile_map.count >= _COLOUR_READINGS)
-    values = tactile_map.mean[well if well.any() else tactile_map.covered]
+    low, high = _colour_range(tactile_map)
     axes.set_facecolor("0.85")
     image = axes.imshow(
         np.ma.masked_where(~tactile_map.covered, tactile_map.mean),
         origin="lower",
         extent=_extent(tactile_map),
         cmap="viridis",
-        vmin=float(values.min()),
-        vmax=float(values.max()),
+        vmin=low,
+        vmax=high,
         interpolation="nearest",
     )
-    label = "mean pressure, kPa" if tactile_map.background is None else "pressure / level beside a lump"
-    _colour_bar(axes, image, label)
+    _colour_bar(axes, image, _VALUE_LABELS[tactile_map.recipe.normalise])
+
+
+def _colour_range(tactile_map: TactileMap) -> tuple[float, float]:
+    well = tactile_map.covered & (tactile_map.count >= _COLOUR_READINGS)
+    values = tactile_map.mean[well if well.any() else tactile_map.covered]
+    level = float(np.median(values))
+    return min(float(values.min()), _LEAST_COLOURS[0] * level), max(float(values.max()), _LEAST_COLOURS[1] * level)
 
 
 def _draw_coverage(axes: Axes, tactile_map: TactileMap) -> None:
@@ -186,7 +198,7 @@ def _draw_coverage(axes: Axes, tactile_map: TactileMap) -> None:
 
 
 def _colour_bar(axes: Axes, image: Any, label: str) -> None:
-    bar = axes.figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02)
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.75, pad=0.02)
     bar.set_label(label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
 

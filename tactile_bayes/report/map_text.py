@@ -12,6 +12,11 @@ _LOW_COVERAGE = 0.5
 _HIGH_TILT_DEG = 10.0
 _HIGH_YAW_DEG = 15.0
 _LISTED_TAXELS = 8
+_UNITS = {
+    "mean": "times the mean of their frames (normalise mean)",
+    "gain": "times the level beside a lump (normalise gain)",
+    "none": "kPa (normalise none)",
+}
 _DROPPED = (
     ("dropped_low", "mean pressure below the window"),
     ("dropped_high", "mean pressure above the window"),
@@ -41,8 +46,7 @@ def _what(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     yield "map", f"{columns * cell:g} x {rows * cell:g} mm (across x along the head), cells of {cell:g} mm"
     values = tactile_map.mean[tactile_map.covered]
     if values.size:
-        unit = " kPa" if tactile_map.recipe.normalise == "none" else " of the level beside a lump"
-        yield "values", f"{values.min():.3g} to {values.max():.3g}{unit} (normalise {tactile_map.recipe.normalise})"
+        yield "values", f"{values.min():.3g} to {values.max():.3g} {_UNITS[tactile_map.recipe.normalise]}"
 
 
 def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
