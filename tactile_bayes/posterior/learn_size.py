@@ -14,6 +14,7 @@ e is then 1 by convention.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +62,7 @@ class _AxisData:
         return float(np.exp(np.log(self.amplitude).mean())), float(np.exp(np.log(self.sigma_mm).mean()))
 
 
-def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: list[tuple[object, ...]]) -> FloatArray:
+def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: Sequence[tuple[object, ...]]) -> FloatArray:
     """Delta sigma: each width over that of the same group's row at one diameter depth; NaN without such a row."""
     reference = {key: s for key, s, h in zip(group, sigma_mm, depth_ratio, strict=True) if abs(h - 1.0) < 1e-9}
     return np.array([s / reference.get(key, np.nan) for key, s in zip(group, sigma_mm, strict=True)])

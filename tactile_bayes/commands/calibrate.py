@@ -1,0 +1,108 @@
+"""`calibrate`: learn a calibration from known objects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tactile_bayes.presets import FIT_RADIUS_MM, NORMALISE
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.tables import Table
+    from tactile_bayes.posterior.learn_size import SizeTable
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.group("calibrate")
+def command() -> None:
+    """Learn a calibration from known objects."""
+
+
+@command.command("size")
+@click.argument("table", metavar="TABLE.csv", type=_FILE)
+@click.option("-o", "--output", required=True, metavar="SIZE.json", type=_FILE, help="Where to write the calibration.")
+@click.option(
+    "--normalise",
+    type=click.Choice(NORMALISE),
+    default="mean",
+    show_default=True,
+    help="How the table's maps were normalised (declared).",
+)
+@click.option(
+    "--background",
+    type=click.Choice(["fixed", "free"]),
+    default="fixed",
+    show_default=True,
+    help="How the table's maps were fitted (declared).",
+)
+@click.option(
+    "--fit-radius-mm",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=FIT_RADIUS_MM,
+    show_default=True,
+    help="Radius about the lump within which they were fitted (declared).",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
+@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+def size(
+    table: Path, output: Path, normalise: str, background: str, fit_radius_mm: float, seed: int, force: bool
+) -> None:
+    """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms.
+
+    TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
+    stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The three
+    declared options say how the table's maps were made; `estimate` refuses a map made otherwise.
+
+    Example: tactile-bayes calibrate size phantoms.csv -o size.json
+    """
+    import numpy as np
+
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.size_json import write_size_calibration
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.posterior.learn_size import learn_size_calibration
+    from tactile_bayes.posterior.size_calibration import Recipe
+    from tactile_bayes.report.calibration_text import calibration_text
+
+    refuse_existing(output, force=force)
+    rows = read_table(table, "size_table.table.json")
+    recipe = Recipe(normalise, background, fit_radius_mm, declared=True)
+    calibration = learn_size_calibration(size_table(rows), recipe=recipe, rng=np.random.default_rng(seed))
+    settings = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm}
+    provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
+    write_size_calibration(output, calibration, provenance=provenance, force=force)
+    click.echo(calibration_text(calibration), nl=False)
+
+
+def size_table(table: Table) -> SizeTable:
+    """The columns of a table as arrays, with Delta sigma where the table has depths."""
+    import numpy as np
+
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.posterior.learn_size import SizeTable, width_changes
+
+    columns = table.columns
+
+    def array(name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+        values = columns[name]
+        if all(value is None for value in values):
+            return None
+        if any(value is None for value in values):
+            row = values.index(None)
+            raise table.error(row, name, "is blank in some rows only", way_out="fill the column or leave it out")
+        return np.asarray(values, dtype=np.float64)
+
+    d_mm, amplitude, sigma_x, sigma_y = (array(n) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))
+    depth = array("depth_ratio")
+    if d_mm is None or amplitude is None or sigma_x is None:
+        raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
+    if depth is None:
+        return SizeTable(d_mm, amplitude, sigma_x, sigma_y)
+    group = list(zip(columns["seat"], columns["d_mm"], columns["stiffness_ratio"], strict=True))
+    change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
+    change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)
+    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y)

@@ -1,0 +1,56 @@
+"""`show`: say what a file is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tactile_bayes.presets import RESEARCH_USE
+
+
+@click.command("show")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def command(file: Path, as_json: bool) -> None:
+    """Say what any of our files is: schema, shape, units, quality, provenance.
+
+    Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms.
+
+    Example: tactile-bayes show map.nc
+    """
+    from tactile_bayes.files.identify import describe
+    from tactile_bayes.files.schema import dump_json
+
+    found = describe(file)
+    if as_json:
+        click.echo(dump_json(found), nl=False)
+        return
+    for line in _lines(found):
+        click.echo(line)
+    click.echo(RESEARCH_USE)
+
+
+def _lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
+    """Nested facts, one a line."""
+    width = max((len(name) for name in found), default=0)
+    for name, value in found.items():
+        if isinstance(value, dict) and value:
+            yield f"{indent}{name}"
+            yield from _lines(value, indent + "  ")
+        else:
+            yield f"{indent}{name.ljust(width)}  {_plain(value)}"
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(_plain(item) for item in value) if value else "none"
+    if isinstance(value, dict):
+        return "none" if not value else "; ".join(f"{k} {_plain(v)}" for k, v in value.items())
+    return "none" if value is None else str(value)

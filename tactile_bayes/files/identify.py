@@ -1,0 +1,190 @@
+"""Tell which of our files a path is, from its bytes, and describe it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import unreadable
+
+_MCAP = b"\x89MCAP0\r\n"
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_TABLES = ("trial.table.json", "excision.table.json", "size_table.table.json")
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What a file is: schema, shape, units, quality and provenance.
+
+    Returns
+    -------
+    dict
+        With ``schema``, ``kind`` and whatever the kind has to say.
+
+    Raises
+    ------
+    BadDataError
+        When it is none of our files.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise unreadable(path, error) from None
+    if head.startswith(_MCAP):
+        return _scan(path)
+    if head.startswith(_HDF5):
+        return _netcdf(path)
+    if head.lstrip().startswith((b"{", b"[")):
+        return _json(path)
+    return _table(path, head)
+
+
+def _scan(path: Path) -> dict[str, Any]:
+    from tactile_bayes.files.scan_mcap import read_scan_report
+
+    file = read_scan_report(path)
+    scan = file.scan
+    time = scan.frames.time_s
+    return {
+        "schema": "tactile-bayes/scan/1",
+        "kind": "scan",
+        "complete": file.complete,
+        "lost": list(file.lost),
+        "frames": len(scan.frames),
+        "taxels": list(scan.head.shape),
+        "poses": len(scan.poses),
+        "duration_s": float(time[-1] - time[0]) if len(time) else 0.0,
+        "frame_rate_hz": float((len(time) - 1) / (time[-1] - time[0]))
+        if len(time) > 1 and time[-1] > time[0]
+        else None,
+        "landmarks": scan.landmarks is not None,
+        "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
+        "session": dict(scan.session),
+        "provenance": dict(file.provenance),
+    }
+
+
+def _netcdf(path: Path) -> dict[str, Any]:
+    import netCDF4
+
+    try:
+        with netCDF4.Dataset(path) as dataset:
+            group = dataset.groups.get("posterior")
+            if group is not None and "schema" in group.ncattrs():
+                return _posterior(group)
+    except OSError:
+        raise BadDataError(
+            "cannot be read as netCDF", way_out="it may be cut short; make it again", path=str(path)
+        ) from None
+    return _map(path)
+
+
+def _posterior(group: Any) -> dict[str, Any]:
+    attributes = {name: group.getncattr(name) for name in group.ncattrs()}
+    return {
+        "schema": str(attributes["schema"]),
+        "kind": "posterior",
+        "method": str(attributes.get("method", "")),
+        "chains": len(group.dimensions["chain"]),
+        "draws": len(group.dimensions["draw"]),
+        "variables": sorted(name for name in group.variables if name not in ("chain", "draw")),
+        "units": {"_mm": "mm", "_rad": "rad", "others": "as the map: 1 is the background"},
+        "diagnostics": json.loads(attributes.get("diagnostics", "{}")),
+        "provenance": json.loads(attributes.get("provenance", "{}")),
+    }
+
+
+def _map(path: Path) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from tactile_bayes.files.map_nc import SCHEMA, read_map, read_map_header
+
+    header = read_map_header(path)
+    tactile_map = read_map(path)
+    ny, nx = tactile_map.mean.shape
+    return {
+        "schema": SCHEMA,
+        "kind": "map",
+        "shape": {"ny": ny, "nx": nx},
+        "extent_mm": {"x": nx * tactile_map.recipe.cell_mm, "y": ny * tactile_map.recipe.cell_mm},
+        "units": {"x": "mm", "y": "mm", "mean": "kPa" if tactile_map.background is None else "1 is the background"},
+        "covered_cells": int(tactile_map.covered.sum()),
+        "background": tactile_map.background,
+        "frames": tactile_map.frame_count,
+        "patient_frame": tactile_map.patient_from_plane is not None,
+        "recipe": asdict(tactile_map.recipe),
+        "quality": dict(tactile_map.quality),
+        "masked_taxels": list(tactile_map.masked_taxels),
+        "provenance": header.get("provenance", {}),
+    }
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise BadDataError(
+            f"not a JSON file ({error})", way_out="give one of this program's files", path=str(path)
+        ) from None
+    if isinstance(document, list) and document and isinstance(document[0], dict):
+        return {"schema": document[0].get("schema"), "kind": "list", "length": len(document)}
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if not isinstance(schema, str) or not schema.startswith("tactile-bayes/"):
+        raise _foreign(path)
+    if schema.startswith("tactile-bayes/size-calibration/"):
+        return _size_calibration(path, document)
+    kept = {name: value for name, value in document.items() if name not in ("schema", "modalities")}
+    return {"schema": schema, "kind": schema.split("/")[1], **kept}
+
+
+def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
+    from tactile_bayes.files.size_json import read_size_calibration
+
+    calibration = read_size_calibration(path)
+    return {
+        "schema": document["schema"],
+        "kind": "size calibration",
+        "form": document["form"],
+        "axes": document["axes"],
+        "recipe": document["recipe"],
+        "draws": len(calibration.x.draws),
+        "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
+        "residual_correlation": document["residual_correlation"],
+        **{
+            axis: {name: document[axis][name] for name in ("mean", "domain", "fit", "reference_amplitude")}
+            for axis in ("x", "y")
+        },
+        "provenance": document["provenance"],
+    }
+
+
+def _table(path: Path, head: bytes) -> dict[str, Any]:
+    """A CSV table whose header fits one of the schemas."""
+    from tactile_bayes.files.schema import load_schema
+    from tactile_bayes.files.tables import read_table
+
+    try:
+        header = next(csv.reader(io.StringIO(head.decode("utf-8-sig"))), [])
+    except (UnicodeDecodeError, csv.Error):
+        raise _foreign(path) from None
+    for name in _TABLES:
+        schema = load_schema(name)
+        required = {f["name"] for f in schema["fields"] if f.get("constraints", {}).get("required")}
+        if header and required <= set(header):
+            table = read_table(path, name)
+            filled = [n for n, values in table.columns.items() if any(v is not None for v in values)]
+            kind = name.split(".")[0].replace("_", " ")
+            return {"schema": schema.get("$id", name), "kind": f"table: {kind}", "rows": len(table), "columns": filled}
+    raise _foreign(path)
+
+
+def _foreign(path: Path) -> BadDataError:
+    return BadDataError(
+        "is none of this program's files",
+        way_out="bring arrays, grids and images in with `tactile-bayes import`",
+        path=str(path),
+    )

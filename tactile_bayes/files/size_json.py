@@ -1,0 +1,89 @@
+"""Size calibrations as JSON: draws of Eq 6's coefficients with their covariance, recipe and domain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.schema import check_document, dump_json, read_json
+from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.presets import RESEARCH_USE
+
+SCHEMA = "tactile-bayes/size-calibration/1"
+SCHEMA_FILE = "size_calibration.schema.json"
+
+
+def write_size_calibration(
+    path: Path, calibration: SizeCalibration, *, provenance: Provenance, force: bool = False
+) -> None:
+    """Write a size calibration atomically; numbers keep nine significant digits."""
+    document = {
+        "schema": SCHEMA,
+        "research_use": RESEARCH_USE,
+        "form": "eq6",
+        "recipe": {
+            "normalise": calibration.recipe.normalise,
+            "background": calibration.recipe.background,
+            "radius_mm": calibration.recipe.radius_mm,
+            "declared": calibration.recipe.declared,
+        },
+        "axes": list(calibration.axes),
+        "residual_correlation": _number(calibration.residual_correlation),
+        "x": _axis_document(calibration.x),
+        "y": _axis_document(calibration.y),
+        "provenance": provenance.as_dict(),
+    }
+    check_document(document, SCHEMA_FILE, path=path)
+    write_text(path, dump_json(document), force=force)
+
+
+def read_size_calibration(path: Path) -> SizeCalibration:
+    """Read a size calibration.
+
+    Raises
+    ------
+    BadDataError
+        When the file is not one, or a field breaks the schema.
+    """
+    document = read_json(path, SCHEMA_FILE)
+    try:
+        return SizeCalibration(
+            x=_axis(document["x"]),
+            y=_axis(document["y"]),
+            residual_correlation=float(document["residual_correlation"]),
+            recipe=Recipe(**document["recipe"]),
+            axes=tuple(document["axes"]),
+        )
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def _number(value: float) -> float:
+    return float(f"{value:.9g}")
+
+
+def _axis_document(axis: AxisCalibration) -> dict[str, Any]:
+    covariance = np.cov(axis.draws.T) if len(axis.draws) > 1 else np.zeros((len(COEFFICIENTS),) * 2)
+    return {
+        "coefficients": list(COEFFICIENTS),
+        "reference_amplitude": axis.reference_amplitude,
+        "domain": {name: [_number(low), _number(high)] for name, (low, high) in axis.domain.items()},
+        "fit": {name: _number(value) for name, value in axis.fit.items()},
+        "mean": [_number(value) for value in axis.draws.mean(axis=0)],
+        "covariance": [[_number(value) for value in row] for row in covariance],
+        "draws": [[_number(value) for value in row] for row in axis.draws],
+    }
+
+
+def _axis(document: dict[str, Any]) -> AxisCalibration:
+    return AxisCalibration(
+        draws=np.asarray(document["draws"], dtype=np.float64),
+        reference_amplitude=float(document["reference_amplitude"]),
+        domain={name: (float(low), float(high)) for name, (low, high) in document["domain"].items()},
+        fit={name: float(value) for name, value in document["fit"].items()},
+    )

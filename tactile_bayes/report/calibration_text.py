@@ -1,0 +1,51 @@
+"""A size calibration as text for people."""
+
+from __future__ import annotations
+
+from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, SizeCalibration
+from tactile_bayes.presets import RESEARCH_USE
+
+LABELS = {
+    "m": "m",
+    "b_mm": "b, mm",
+    "e": "e",
+    "f": "f",
+    "scatter": "residual SD of ln d",
+    "scatter_slope": "  its slope with ln a",
+}
+
+
+def calibration_text(calibration: SizeCalibration) -> str:
+    """Fit, domain and r2 of each axis, and the recipe it holds for."""
+    lines = ["Eq 6: d = m sigma / (e a^f) + b, posterior mean +- SD"]
+    both = calibration.axes == ("both",)
+    axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]
+    lines.append(f"{'':24}" + "".join(f"{name:>22}" for name, _ in axes))
+    for index, name in enumerate(COEFFICIENTS):
+        cells = [f"{a.draws[:, index].mean():.3f} +- {a.draws[:, index].std():.3f}" for _, a in axes]
+        lines.append(f"{LABELS[name]:24}" + "".join(f"{cell:>22}" for cell in cells))
+    lines += _figures([axis for _, axis in axes])
+    lines.append(f"residual SD is given at amplitude {calibration.x.reference_amplitude:.3g}; fainter maps tell less")
+    if not both:
+        lines.append(f"correlation of the two residuals {calibration.residual_correlation:.2f}")
+    if not calibration.x.fit.get("e_identified"):
+        lines.append("the table has no depths: only m/e is determined, e is 1 by convention")
+    recipe = calibration.recipe
+    how = "declared" if recipe.declared else "as the maps were made here"
+    lines.append(
+        f"recipe ({how}): normalise {recipe.normalise}, background {recipe.background}, "
+        f"fit radius {recipe.radius_mm:g} mm"
+    )
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _figures(axes: list[AxisCalibration]) -> list[str]:
+    rows = [
+        ("r2 of ln d", [f"{axis.fit.get('r2', float('nan')):.2f}" for axis in axes]),
+        ("mean absolute error", [f"{axis.fit.get('mae_percent', float('nan')):.0f} %" for axis in axes]),
+        ("rows", [f"{axis.fit.get('rows', 0):.0f}" for axis in axes]),
+    ]
+    for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
+        cells = [f"{axis.domain[name][0]:.3g} to {axis.domain[name][1]:.3g}{unit}" for axis in axes]
+        rows.append((f"range of {name.removesuffix('_mm')}", cells))
+    return [f"{label:24}" + "".join(f"{cell:>22}" for cell in cells) for label, cells in rows]

@@ -1,0 +1,97 @@
+"""An estimate as plain data: the object that `estimate --json` prints."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.geometry import FloatArray, apply
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.estimate import Estimate
+from tactile_bayes.posterior.quantity import Quantity, summarise
+from tactile_bayes.presets import RESEARCH_USE
+
+SCHEMA = "tactile-bayes/estimate/1"
+SIZES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
+WIDTHS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd")
+
+
+def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probability: float) -> dict[str, Quantity]:
+    """Summaries of everything an estimate has draws of, by name; empty without an estimate."""
+    if estimate.map_posterior is None or estimate.draws is None:
+        return {}
+    posterior = estimate.map_posterior
+    draws: dict[str, FloatArray] = {name: getattr(posterior, name) for name in WIDTHS}
+    draws |= {"centre_mm.x": posterior.x_mm, "centre_mm.y": posterior.y_mm}
+    if tactile_map.patient_from_plane is not None:
+        on_plane = np.stack([posterior.x_mm, posterior.y_mm, np.zeros_like(posterior.x_mm)], axis=-1)
+        in_patient = apply(tactile_map.patient_from_plane, on_plane)
+        draws |= {"centre_patient_mm.x": in_patient[..., 0], "centre_patient_mm.y": in_patient[..., 1]}
+    if estimate.fit is not None and estimate.fit.bump.rotated:
+        draws["angle_deg"] = np.degrees(posterior.angle_rad)
+    if estimate.size is not None:
+        draws |= {name: getattr(estimate.size, name) for name in SIZES}
+    worth = estimate.draws.effective_draws
+    return {name: summarise(d, probability=probability, effective_draws=worth) for name, d in draws.items()}
+
+
+def estimate_document(
+    estimate: Estimate,
+    tactile_map: TactileMap,
+    *,
+    probability: float,
+    prior: BumpPrior,
+    provenance: Provenance,
+) -> dict[str, Any]:
+    """The JSON object of one map, see data_schema/estimate.schema.json."""
+    quantities = estimate_quantities(estimate, tactile_map, probability=probability)
+
+    def one(name: str) -> dict[str, float | str] | None:
+        return quantities[name].as_dict() if name in quantities else None
+
+    def point(name: str) -> dict[str, Any] | None:
+        return {axis: one(f"{name}.{axis}") for axis in "xy"} if f"{name}.x" in quantities else None
+
+    share = estimate.size.variance_share if estimate.size is not None else None
+    detection = estimate.detection
+    return {
+        "schema": SCHEMA,
+        "status": estimate.status,
+        "reason": estimate.reason,
+        **{name: one(name) for name in (*SIZES, *WIDTHS)},
+        "centre_mm": point("centre_mm"),
+        "centre_patient_mm": point("centre_patient_mm"),
+        "angle_deg": one("angle_deg"),
+        "detected_probability": None if detection is None else _round(detection.probability),
+        "variance_share": None if share is None else {k: _round(v) for k, v in share.items()},
+        "diagnostics": _diagnostics(estimate),
+        "candidates": [
+            {"x_mm": _round(c.centre_mm[0]), "y_mm": _round(c.centre_mm[1]), "fault": c.fault}
+            for c in estimate.candidates
+        ],
+        "left_out": list(estimate.left_out),
+        "prior": prior.as_dict(),
+        "research_use": RESEARCH_USE,
+        "provenance": provenance.as_dict(),
+    }
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.9g}")
+
+
+def _diagnostics(estimate: Estimate) -> dict[str, Any]:
+    """Figures of the method and the fit; a figure that is not finite is null."""
+    found: dict[str, Any] = dict(estimate.diagnostics)
+    if estimate.detection is not None:
+        found["log_bayes_factor"] = estimate.detection.log_bayes_factor
+    if estimate.size is not None:
+        found["invalid_draws"] = estimate.size.invalid
+    return {
+        name: (_round(value) if math.isfinite(value) else None) if isinstance(value, float) else value
+        for name, value in found.items()
+    }

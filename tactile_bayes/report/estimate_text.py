@@ -1,0 +1,108 @@
+"""An estimate as a short table a clinician can read."""
+
+from __future__ import annotations
+
+import math
+
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.estimate import Estimate
+from tactile_bayes.posterior.quantity import Quantity
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_document import estimate_quantities
+
+ROWS = (
+    ("max_size_mm", "largest size", "mm"),
+    ("min_size_mm", "smallest size", "mm"),
+    ("d_x_mm", "size across the head, d_x", "mm"),
+    ("d_y_mm", "size along the head, d_y", "mm"),
+    ("amplitude", "amplitude", ""),
+    ("sigma_x_mm", "map width sigma_x", "mm"),
+    ("sigma_y_mm", "map width sigma_y", "mm"),
+    ("angle_deg", "angle of the ellipse", "deg"),
+    ("centre_mm.x", "centre on the map, x", "mm"),
+    ("centre_mm.y", "centre on the map, y", "mm"),
+    ("centre_patient_mm.x", "centre from the xiphoid, x", "mm"),
+    ("centre_patient_mm.y", "centre from the xiphoid, y", "mm"),
+)
+NEAR_LEVEL = 0.02
+"""An offset of the background of this size and more is mentioned."""
+
+
+def decimals(mc_error: float, *, most: int = 3) -> int:
+    """Decimal places that the Monte-Carlo error of an interval's end supports."""
+    if not mc_error > 0:
+        return most
+    return min(most, max(0, -math.floor(math.log10(2.0 * mc_error))))
+
+
+def estimate_text(estimate: Estimate, tactile_map: TactileMap, *, probability: float) -> str:
+    """The report of one map: what was found with its interval, where the uncertainty comes from, what was left out."""
+    if estimate.status == "no_estimate":
+        return "\n".join([f"No estimate: {estimate.reason}.", *_looked_at(estimate), RESEARCH_USE]) + "\n"
+    quantities = estimate_quantities(estimate, tactile_map, probability=probability)
+    lines = [_table(quantities, probability), ""]
+    if estimate.reason:
+        lines.append(f"No size: {estimate.reason}.")
+    lines += [*_findings(estimate), *_warnings(estimate), *_left_out(estimate), RESEARCH_USE]
+    return "\n".join(lines) + "\n"
+
+
+def _table(quantities: dict[str, Quantity], probability: float) -> str:
+    head = f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
+    rows = [head]
+    for name, label, unit in ROWS:
+        if name in quantities:
+            q = quantities[name]
+            places = decimals(q.mc_error)
+            interval = f"{q.low:.{places}f} to {q.high:.{places}f} {unit}".rstrip()
+            rows.append(f"{label:28}{q.median:>9.{places}f}   {interval}")
+    return "\n".join(rows)
+
+
+def _findings(estimate: Estimate) -> list[str]:
+    lines = []
+    if estimate.detection is not None:
+        lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
+    if estimate.size is not None:
+        names = {"map": "the map", "calibration": "the coefficients of Eq 6", "residual": "the scatter about Eq 6"}
+        parts = [f"{share:.0f} % {names[key]}" for key, share in estimate.size.variance_share.items()]
+        lines.append(f"Variance of the largest size: {', '.join(parts)}.")
+        if estimate.size.invalid:
+            lines.append(f"{estimate.size.invalid} draws gave no size and were left out.")
+    if estimate.draws is not None and "rhat" in estimate.draws.diagnostics:
+        found = estimate.draws.diagnostics
+        ess = min(found["ess_bulk"], found["ess_tail"])
+        lines.append(f"Method ensemble: R-hat {found['rhat']:.3f}, {ess:.0f} effective draws.")
+    elif estimate.draws is not None:
+        lines.append(f"Method {estimate.draws.method}: {len(estimate.draws.flat)} independent draws.")
+    return lines
+
+
+def _warnings(estimate: Estimate) -> list[str]:
+    found = estimate.diagnostics
+    lines = [f"Outside the calibration's range: {text}." for text in _texts(found.get("outside_calibration"))]
+    if found.get("coarse_cells"):
+        lines.append("The cells are coarse for this width: map again with a smaller --cell-mm.")
+    offset = found.get("level_offset")
+    if isinstance(offset, float) and abs(offset) >= NEAR_LEVEL:
+        lines.append(
+            f"The level about the bump is {offset:+.3f} off the fixed background: something else bears on the head "
+            "(a rib, a second mass), or the lump is large for it; the size is less certain than the interval says."
+        )
+    return lines + _looked_at(estimate)
+
+
+def _texts(value: object) -> list[str]:
+    return [str(item) for item in value] if isinstance(value, list) else []
+
+
+def _looked_at(estimate: Estimate) -> list[str]:
+    return [
+        f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}."
+        for c in estimate.candidates
+        if c.fault
+    ]
+
+
+def _left_out(estimate: Estimate) -> list[str]:
+    return [f"Left out: {'; '.join(estimate.left_out)}."] if estimate.left_out else []
