@@ -1,0 +1,97 @@
+"""Write docs/commands.md from the commands themselves: `python docs/make_reference.py`."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+ROOT = Path(__file__).resolve().parent.parent
+TARGET = ROOT / "docs" / "commands.md"
+PROGRAM = "tactile-bayes"
+
+HEAD = """\
+# Command reference
+
+Generated from the program by `python docs/make_reference.py`; a test holds the two together. What the exit codes
+mean is in [exit-codes.md](exit-codes.md), how to complete words in the shell in [completion.md](completion.md).
+Every command also takes `-h` or `--help`.
+"""
+
+
+def every_command(group: click.Group, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    """All commands below a group with the words that call them, in the order of the help, each group first."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None, name
+        yield (*words, name), command
+        if isinstance(command, click.Group):
+            yield from every_command(command, (*words, name))
+
+
+def render(group: click.Group) -> str:
+    """The whole page."""
+    sections = [HEAD, _contents(group)]
+    sections += [_section(words, command) for words, command in every_command(group)]
+    return "\n".join(sections)
+
+
+def _contents(group: click.Group) -> str:
+    names = [" ".join((PROGRAM, *words)) for words, _ in every_command(group)]
+    return "".join(f"- [{name}](#{name.replace(' ', '-')})\n" for name in names)
+
+
+def _section(words: tuple[str, ...], command: click.Command) -> str:
+    call = " ".join((PROGRAM, *words))
+    context = click.Context(command, info_name=call)
+    usage = " ".join([call, *command.collect_usage_pieces(context)])
+    help_text = inspect.cleandoc(command.help or "").replace("\b\n", "").split("\f")[0].strip()
+    parts = [f"## {call}\n", f"```text\n{usage}\n```\n", f"{help_text}\n"]
+    rows = [_row(parameter) for parameter in command.params if isinstance(parameter, click.Option)]
+    if rows:
+        parts.append("| option | value | default | meaning |\n|---|---|---|---|\n" + "".join(rows))
+    return "\n".join(parts)
+
+
+def _row(option: click.Option) -> str:
+    facts = option.to_info_dict()
+    names = ", ".join(f"`{name}`" for name in (*facts["opts"], *facts["secondary_opts"]))
+    cells = (names, _value(option, facts), _default(facts), facts["help"] or "")
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |\n"
+
+
+def _value(option: click.Option, facts: dict[str, Any]) -> str:
+    if facts["is_flag"] or facts["count"]:
+        return ""
+    choices = facts["type"].get("choices")
+    text = option.metavar or (" or ".join(map(str, choices)) if choices else facts["type"]["name"].upper())
+    return f"{text}, repeatable" if facts["multiple"] else text
+
+
+def _default(facts: dict[str, Any]) -> str:
+    if facts["required"]:
+        return "required"
+    value = facts["default"]
+    if value is None or value is False or value == () or callable(value):
+        return ""
+    return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+
+
+def main() -> None:
+    """Write the page, or say with ``--check`` whether it is up to date."""
+    sys.path.insert(0, str(ROOT))
+    from tactile_bayes.cli import cli
+
+    text = render(cli)
+    if "--check" in sys.argv[1:]:
+        sys.exit(0 if TARGET.is_file() and TARGET.read_text(encoding="utf-8") == text else 1)
+    TARGET.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
