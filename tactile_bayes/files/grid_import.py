@@ -8,6 +8,7 @@ centres are placed about the centre of the grid, so x and y run from -(n-1)/2 to
 from __future__ import annotations
 
 import csv
+import warnings
 from pathlib import Path
 from typing import Any, Final
 
@@ -198,7 +199,7 @@ def _image(path: Path) -> FloatArray:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # damage is told by the errors below
             pages, mode = getattr(image, "n_frames", 1), image.mode
             pixels = np.asarray(image)
     except UnidentifiedImageError:

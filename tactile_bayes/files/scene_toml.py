@@ -112,7 +112,7 @@ def _told(error: Any) -> BadDataError:
 def _where(path: list[Any]) -> str:
     text = ""
     for part in path:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+        text += f"[{part}]" if str(part).isdigit() else f".{part}" if text else str(part)
     return text
 
 

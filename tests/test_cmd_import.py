@@ -1,0 +1,88 @@
+"""`import` as a user runs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import numpy as np
+import pytest
+
+import tactile_bayes
+from tactile_bayes.files.map_nc import read_map
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
+
+Run = Callable[..., "CompletedProcess[str]"]
+DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
+
+
+def test_arrays_become_a_scan(run_cli: Run, shared_data: Path, tmp_path: Path) -> None:
+    source = shared_data / "scans" / "s01_sphere15_hd1_clean.npz"
+    done = run_cli("import", source, "-o", "a.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for words in ("1400 frames of 16 x 26 taxels in 6.995 s, 200.0 Hz", "840 poses, 120.0 Hz", "landmarks: sternal"):
+        assert words in done.stdout
+    assert "Research use only" in done.stdout
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.mcap").frames.counts, np.load(source)["counts"])
+
+
+def test_a_grid_becomes_a_map(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "g.csv").write_text("1,1.1,1\n1,1.3,\n")
+    done = run_cli("import", "g.csv", "-o", "g.nc", "--spacing-mm", 1.5, "--normalise", "mean", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "2 x 3 cells of 1.5 mm, 5 with data" in done.stdout
+    assert "background level 1 (normalise mean)" in done.stdout
+    grid = read_map(tmp_path / "g.nc")
+    np.testing.assert_array_equal(grid.mean, [[1, 1.1, 1], [1, 1.3, np.nan]])
+    assert grid.recipe.source == "grid"
+    assert grid.background == 1.0
+
+
+def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: Path) -> None:
+    data = DEMO.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    done = run_cli("import", "cut.mcap", "-o", "mended.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "lost: cut off at byte" in done.stdout
+    file = read_scan_report(tmp_path / "mended.mcap")
+    assert file.complete
+    assert "cut off" in file.provenance["settings"]["lost"][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["x.npz", "-o", "a.mcap", "--spacing-mm", "1"], 2, "are for maps"),
+        (["g.csv", "-o", "g.nc"], 2, "--spacing-mm"),
+        (["g.csv", "-o", "g.csv", "--spacing-mm", "1"], 2, "--force"),
+        (["g.csv", "-o", "no/g.nc", "--spacing-mm", "1"], 2, "not a directory"),
+        (["none.npz", "-o", "a.mcap"], 3, "cannot be read"),
+        (["g.csv", "-o", "a.mcap", "--as", "scan"], 3, "not an .npz file"),
+        (["g.npz", "-o", "a.mcap"], 3, "give --as map"),
+    ],
+)
+def test_mistakes_end_in_one_line_and_their_code(
+    run_cli: Run, tmp_path: Path, arguments: list[str], code: int, words: str
+) -> None:
+    (tmp_path / "g.csv").write_text("1,2\n")
+    np.savez(tmp_path / "g.npz", mean=np.ones((2, 2)))
+    before = sorted(tmp_path.iterdir())
+    done = run_cli("import", *arguments, cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", ["import", "simulate"])
+def test_help_imports_nothing_heavy(name: str) -> None:
+    heavy = ["numpy", "mcap", "google.protobuf", "PIL", "netCDF4", "fastjsonschema"]
+    code = (
+        "import sys\nfrom tactile_bayes.cli import cli\n"
+        f"cli.main([{name!r}, '--help'], standalone_mode=False)\n"
+        f"loaded = [m for m in {heavy!r} if m in sys.modules]\nassert not loaded, loaded"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=DEMO.parents[2])

@@ -1,0 +1,47 @@
+"""`simulate` as a user runs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+from tactile_bayes.files.scan_mcap import read_scan_report
+
+Run = Callable[..., "CompletedProcess[str]"]
+SCENE = "[scene]\nseed = 4\nduration_s = 0.2\n[[lump]]\namplitude = 0.3\nd_mm = 15\n"
+
+
+def test_a_scene_becomes_a_scan_with_its_seed(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SCENE)
+    done = run_cli("simulate", "s.toml", "-o", "a.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "a.mcap: scan, seed 4" in done.stdout
+    assert "40 frames of 16 x 26" in done.stdout
+    assert "d 15 mm" in done.stdout
+    assert "Research use only" in done.stdout
+    file = read_scan_report(tmp_path / "a.mcap")
+    assert file.provenance["seed"] == 4
+    assert file.provenance["inputs"][0]["role"] == "scene"
+
+
+def test_the_same_seed_gives_the_same_bytes(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SCENE)
+    for name, seed in (("a", 9), ("b", 9), ("c", 10)):
+        done = run_cli("simulate", "s.toml", "-o", f"{name}.mcap", "--seed", seed, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    a, b, c = ((tmp_path / f"{name}.mcap").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_mistakes_end_in_one_line_and_their_code(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "bad.toml").write_text("[scene]\nduration_ms = 5\n")
+    done = run_cli("simulate", "bad.toml", "-o", "a.mcap", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr == "error: bad.toml: scene.duration_ms is not known; give duration_s, in the unit it names\n"
+    (tmp_path / "a.mcap").write_text("mine")
+    done = run_cli("simulate", "bad.toml", "-o", "a.mcap", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--force" in done.stderr
+    assert (tmp_path / "a.mcap").read_text() == "mine"
