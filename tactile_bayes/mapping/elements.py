@@ -101,7 +101,7 @@ def _levels(scan: Scan) -> _Levels:
     for start in range(0, len(counts), _CHUNK):
         chunk = counts[start : start + _CHUNK].astype(np.float64)
         total += chunk.sum(axis=0)
-        steps += (np.diff(chunk, axis=0, prepend=last) ** 2).sum(axis=0)
+        steps += np.abs(np.diff(chunk, axis=0, prepend=last)).sum(axis=0)  # not squared: one spike is no flicker
         saturated += (chunk >= calibration.saturation_count).sum(axis=0)
         last = chunk[-1:]
     n = len(counts)
@@ -109,6 +109,6 @@ def _levels(scan: Scan) -> _Levels:
         counts.min(axis=0),
         counts.max(axis=0),
         calibration.gain_kpa_per_count * (total / n) + calibration.offset_kpa,
-        calibration.gain_kpa_per_count * np.sqrt(steps / max(n - 1, 1)),
+        calibration.gain_kpa_per_count * (steps / max(n - 1, 1)),
         saturated / n,
     )

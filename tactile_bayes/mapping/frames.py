@@ -152,7 +152,7 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
     if not gated:
         share = max(float(selection.valid_share.max()) for selection in selections)
         raise BadDataError(
-            f"no frame has {VALID_SHARE:.0%} of its taxels valid (the best has {share:.1%})",
+            f"no frame has {100 * VALID_SHARE:g} % of its taxels valid (the best has {100 * share:.1f} %)",
             way_out="repair the array, or press less hard if taxels are saturated",
         )
     raise _outside_window(selections, pressure_window_kpa)

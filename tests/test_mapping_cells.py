@@ -1,0 +1,107 @@
+"""Sums in cells: exact, and the same whatever the order and the parts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.mapping.cells import MAX_CELLS, READINGS_PER_CALL, VALUE_LIMIT, VALUE_STEP, CellSums, cell_index
+
+
+def readings(seed: int, n: int = 500) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.normal(0, 9, n), rng.normal(3, 5, n), rng.lognormal(0, 0.7, n)
+
+
+def summed(x, y, value, *, cell_mm=1.0, parts=1) -> CellSums:
+    sums = CellSums(cell_mm)
+    for piece in np.array_split(np.arange(len(x)), parts):
+        sums.add(x[piece], y[piece], value[piece])
+    return sums.trimmed()
+
+
+def same(one: CellSums, two: CellSums) -> bool:
+    return (
+        one.first == two.first
+        and one.clipped == two.clipped
+        and all(np.array_equal(getattr(one, name), getattr(two, name)) for name in ("count", "total", "square"))
+    )
+
+
+@given(seed=st.integers(0, 999), parts=st.integers(1, 40), cell_mm=st.sampled_from([0.5, 1.0, 2.7]))
+def test_any_order_and_any_parts_give_the_same_bits(seed, parts, cell_mm):
+    x, y, value = readings(seed)
+    order = np.random.default_rng(seed + 1).permutation(len(x))
+    assert same(
+        summed(x, y, value, cell_mm=cell_mm),
+        summed(x[order], y[order], value[order], cell_mm=cell_mm, parts=parts),
+    )
+
+
+@given(seed=st.integers(0, 999), cut=st.integers(0, 500))
+def test_merging_two_halves_either_way_gives_the_whole(seed, cut):
+    x, y, value = readings(seed)
+    whole = summed(x, y, value)
+    for first, second in ((slice(cut), slice(cut, None)), (slice(cut, None), slice(cut))):
+        merged = summed(x[first], y[first], value[first])
+        merged.merge(summed(x[second], y[second], value[second]))
+        assert same(merged.trimmed(), whole)
+
+
+def test_mean_and_variance_are_those_of_the_readings_to_the_step():
+    x, y, value = readings(3)
+    sums = summed(x, y, value, cell_mm=4.0)
+    mean, variance = sums.mean(), sums.variance()
+    for row, column in np.argwhere(sums.count > 0):
+        here = (cell_index(x, 4.0) == column + sums.first[1]) & (cell_index(y, 4.0) == row + sums.first[0])
+        assert sums.count[row, column] == here.sum()
+        assert mean[row, column] == pytest.approx(value[here].mean(), abs=VALUE_STEP / 2)
+        assert variance[row, column] == pytest.approx(value[here].var(), abs=2 * VALUE_STEP * value.max())
+    assert np.isnan(mean[sums.count == 0]).all()
+    assert np.isnan(variance[sums.count == 0]).all()
+
+
+def test_cells_are_centred_on_multiples_of_their_side():
+    sums = summed(np.array([-0.49, 0.49, 0.51]), np.zeros(3), np.ones(3))
+    assert sums.x_mm().tolist() == [0.0, 1.0]
+    assert sums.count.tolist() == [[2, 1]]
+
+
+def test_values_beyond_the_range_are_clipped_and_counted():
+    sums = summed(np.zeros(3), np.zeros(3), np.array([1.0, 1e9, -1e9]))
+    assert sums.clipped == 2
+    assert sums.mean()[0, 0] == pytest.approx(1 / 3, abs=VALUE_STEP)
+
+
+def test_a_full_call_of_extreme_values_sums_exactly():
+    value = np.full(READINGS_PER_CALL, VALUE_LIMIT)
+    sums = summed(np.zeros(len(value)), np.zeros(len(value)), value)
+    assert sums.square[0, 0] == READINGS_PER_CALL * int(VALUE_LIMIT / VALUE_STEP) ** 2
+    assert sums.variance()[0, 0] == 0.0
+
+
+def test_more_readings_than_sum_exactly_are_refused():
+    too_many = np.zeros(READINGS_PER_CALL + 1)
+    with pytest.raises(ValueError, match="exact up to"):
+        CellSums(1.0).add(too_many, too_many, too_many)
+
+
+def test_cells_of_another_size_do_not_merge():
+    with pytest.raises(ValueError, match=r"cells of 2\.0 mm"):
+        CellSums(1.0).merge(CellSums(2.0))
+
+
+def test_a_vast_map_is_refused_before_memory_is_asked_for():
+    sums = CellSums(1.0)
+    with pytest.raises(BadDataError, match=f"at most {MAX_CELLS} fit"):
+        sums.add(np.array([0.0, 1e9]), np.array([0.0, 1e9]), np.ones(2))
+
+
+def test_nothing_added_is_an_empty_map():
+    sums = CellSums(1.0)
+    sums.add(np.zeros(0), np.zeros(0), np.zeros(0))
+    sums.merge(CellSums(1.0))
+    assert sums.trimmed().count.shape == (0, 0)

@@ -1,0 +1,89 @@
+"""Poses at the frames' times: interpolated, never extrapolated, never over a gap."""
+
+from __future__ import annotations
+
+import mapping_scans as scans
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile_bayes.geometry import quaternion_from_rotation
+from tactile_bayes.mapping.poses import distinct_poses, poses_at
+from tactile_bayes.scan import TrackerPoses
+
+
+def turning(n: int = 50, *, step_s: float = 0.008, degrees: float = 0.3) -> TrackerPoses:
+    """A tracker that moves and turns evenly."""
+    time = 10 + step_s * np.arange(n)
+    quaternion = np.array([quaternion_from_rotation(scans.rotation(degrees * i)) for i in range(n)])
+    return TrackerPoses(time, np.stack([2.0 * np.arange(n), -np.arange(n), np.zeros(n)], axis=1), quaternion)
+
+
+def test_even_motion_is_interpolated_exactly():
+    poses = turning()
+    found = poses_at(poses, poses.time_s[:-1] + 0.002)
+    assert found.known.all()
+    assert found.position_mm[7] == pytest.approx([2 * 7.25, -7.25, 0])
+    assert found.rotation[7] == pytest.approx(scans.rotation(0.3 * 7.25), abs=1e-9)
+
+
+@given(st.lists(st.booleans(), min_size=50, max_size=50))
+def test_signs_of_quaternions_do_not_matter(flips):
+    poses = turning()
+    flipped = TrackerPoses(poses.time_s, poses.position_mm, poses.quaternion_wxyz * np.where(flips, -1, 1)[:, None])
+    time = poses.time_s[:-1] + 0.003
+    assert poses_at(flipped, time).rotation == pytest.approx(poses_at(poses, time).rotation, abs=1e-15)
+
+
+def test_latency_moves_the_poses_back_in_time():
+    poses = turning()
+    late = TrackerPoses(poses.time_s + 0.013, poses.position_mm, poses.quaternion_wxyz)
+    time = poses.time_s[5:-5] + 0.001
+    straight, corrected = poses_at(poses, time), poses_at(late, time, latency_ms=13.0)
+    assert corrected.position_mm == pytest.approx(straight.position_mm, abs=1e-9)
+    assert np.abs(poses_at(late, time).position_mm - straight.position_mm).max() > 1
+
+
+def test_repeated_samples_are_dropped_whatever_their_sign():
+    poses = turning()
+    twice = np.repeat(np.arange(50), 2)
+    sign = np.where(np.arange(100) % 3 == 0, -1, 1)[:, None]
+    repeated = TrackerPoses(10 + 0.004 * np.arange(100), poses.position_mm[twice], poses.quaternion_wxyz[twice] * sign)
+    fresh = distinct_poses(repeated)
+    assert np.array_equal(fresh.time_s, 10 + 0.004 * np.arange(0, 100, 2))
+    time = poses.time_s[:-1] + 0.003
+    assert poses_at(repeated, time).position_mm == pytest.approx(poses_at(poses, time).position_mm, abs=1e-9)
+
+
+def test_frames_in_a_gap_or_outside_are_not_known():
+    poses = turning()
+    keep = (np.arange(50) < 20) | (np.arange(50) >= 30)
+    gap = TrackerPoses(poses.time_s[keep], poses.position_mm[keep], poses.quaternion_wxyz[keep])
+    time = np.array([9.999, 10.0, 10.1, 10.152, 10.16, 10.2, 10.24, 10.241, 10.392, 10.393])
+    assert poses_at(gap, time).known.tolist() == [False, True, True, True, False, False, True, True, True, False]
+    assert poses_at(gap, time, max_gap_ms=100.0).known.tolist() == [False, *[True] * 8, False]
+
+
+def test_a_frozen_tracker_is_a_gap():
+    poses = turning()
+    position, quaternion = poses.position_mm.copy(), poses.quaternion_wxyz.copy()
+    position[20:30], quaternion[20:30] = position[20], quaternion[20]
+    frozen = TrackerPoses(poses.time_s, position, quaternion)
+    known = poses_at(frozen, poses.time_s + 0.001).known
+    assert not known[21:29].any()
+    assert known[:20].all()
+
+
+def test_no_pose_knows_no_frame():
+    nothing = TrackerPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)))
+    found = poses_at(nothing, np.arange(3.0))
+    assert not found.known.any()
+    assert np.isfinite(found.rotation).all()
+
+
+def test_one_pose_knows_the_frame_at_its_time_only():
+    one = TrackerPoses(np.array([1.0]), np.array([[1.0, 2.0, 3.0]]), np.array([[1.0, 0, 0, 0]]))
+    found = poses_at(one, np.array([0.5, 1.0, 1.5]))
+    assert found.known.tolist() == [False, True, False]
+    assert found.position_mm[1].tolist() == [1.0, 2.0, 3.0]
