@@ -1,0 +1,246 @@
+"""Map files: any map comes back as it was, equal maps are equal bytes, and every fault is one line."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import stat
+from dataclasses import replace
+from pathlib import Path
+
+import netCDF4
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from mapping_scans import rotation
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.map_nc import SCHEMA, read_map, read_map_header, write_map
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.geometry import rigid
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+
+PROVENANCE = Provenance("map", {"cell_mm": 1.0}, {"scan_1": "0" * 64})
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+MODERATE = st.floats(-1e6, 1e6)
+
+
+@st.composite
+def transforms(draw) -> np.ndarray | None:
+    if draw(st.booleans()):
+        return None
+    turn = rotation(draw(st.floats(-180, 180)), about=draw(st.sampled_from([(0, 0, 1), (1, 2, 3)])))
+    return rigid(turn, np.array([draw(MODERATE) for _ in range(3)]))
+
+
+@st.composite
+def maps(draw) -> TactileMap:
+    """Any map, the odd ones included: no cell, one cell, no data, huge and tiny values."""
+    shape = (draw(st.integers(0, 5)), draw(st.integers(0, 5)))
+    count = draw(arrays(np.int64, shape, elements=st.integers(0, 2**62)))
+    mean, variance = (draw(arrays(np.float64, shape, elements=FINITE)) for _ in range(2))
+    cell = draw(st.floats(1e-3, 1e3))
+    return TactileMap(
+        mean=np.where(count > 0, mean, np.nan),
+        variance=np.where(count > 0, variance, np.nan),
+        count=count,
+        x_mm=(draw(st.integers(-99, 99)) + np.arange(shape[1])) * cell,
+        y_mm=(draw(st.integers(-99, 99)) + np.arange(shape[0])) * cell,
+        recipe=MapRecipe(
+            draw(st.sampled_from(["scan", "grid"])),
+            draw(st.sampled_from(["mean", "gain", "none"])),
+            cell,
+            draw(st.none() | st.tuples(MODERATE, MODERATE)),
+            draw(MODERATE),
+        ),
+        plane_from_base=draw(transforms()),
+        patient_from_plane=draw(transforms()),
+        background=draw(st.none() | FINITE),
+        frame_count=draw(st.integers(0, 2**40)),
+        quality=draw(st.dictionaries(st.text(max_size=9), FINITE, max_size=4)),
+        masked_taxels=tuple(draw(st.lists(st.text(max_size=30), max_size=4))),
+    )
+
+
+def plain_map(ny: int = 6, nx: int = 8) -> TactileMap:
+    rng = np.random.default_rng(5)
+    return TactileMap(
+        rng.random((ny, nx)), rng.random((ny, nx)), np.full((ny, nx), 9), np.arange(nx) - 3.0, np.arange(ny) - 2.0,
+        MapRecipe("scan", "mean", 1.0, (5.0, 14.0), 4.0), plane_from_base=np.eye(4), quality={"frames_used": 7.0},
+    )  # fmt: skip
+
+
+def assert_same(one: TactileMap, two: TactileMap) -> None:
+    for name in ("mean", "variance", "count", "x_mm", "y_mm", "plane_from_base", "patient_from_plane"):
+        a, b = getattr(one, name), getattr(two, name)
+        if a is None or b is None:
+            assert a is b, name
+        else:
+            assert a.dtype == b.dtype
+            assert a.tobytes() == b.tobytes(), name
+    for name in ("recipe", "background", "frame_count", "quality", "masked_taxels"):
+        assert getattr(one, name) == getattr(two, name), name
+
+
+@given(tactile_map=maps())
+def test_any_map_comes_back_bit_for_bit(tactile_map, tmp_path_factory):
+    path = tmp_path_factory.mktemp("map") / "map.nc"
+    write_map(path, tactile_map, provenance=PROVENANCE)
+    assert_same(read_map(path), tactile_map)
+
+
+def test_equal_maps_are_equal_bytes_for_the_owner_only(tmp_path):
+    for name in ("a.nc", "b.nc"):
+        write_map(tmp_path / name, plain_map(), provenance=PROVENANCE)
+    assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
+    assert stat.S_IMODE((tmp_path / "a.nc").stat().st_mode) == 0o600
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.nc", "b.nc"]
+
+
+def test_an_existing_file_stays_without_force(tmp_path):
+    path = tmp_path / "map.nc"
+    path.write_text("mine")
+    with pytest.raises(UsageError, match="--force"):
+        write_map(path, plain_map(), provenance=PROVENANCE)
+    assert path.read_text() == "mine"
+    write_map(path, plain_map(), provenance=PROVENANCE, force=True)
+    assert_same(read_map(path), plain_map())
+
+
+def test_unknown_figures_come_back_as_nan(tmp_path):
+    write_map(tmp_path / "map.nc", replace(plain_map(), quality={"tilt_deg": math.nan}), provenance=PROVENANCE)
+    assert math.isnan(read_map(tmp_path / "map.nc").quality["tilt_deg"])
+
+
+def test_the_header_says_what_the_file_is(tmp_path):
+    write_map(tmp_path / "map.nc", plain_map(), provenance=PROVENANCE)
+    header = read_map_header(tmp_path / "map.nc")
+    assert header["schema"] == SCHEMA
+    assert header["shape"] == (6, 8)
+    assert header["recipe"] == plain_map().recipe
+    assert header["provenance"] == json.loads(json.dumps(PROVENANCE.as_dict()))
+
+
+def test_other_programs_see_units_and_axes(tmp_path):
+    write_map(tmp_path / "map.nc", replace(plain_map(), recipe=MapRecipe("scan", "none", 1.0)), provenance=PROVENANCE)
+    with netCDF4.Dataset(tmp_path / "map.nc") as file:
+        assert file["mean"].dimensions == ("y", "x")
+        assert {name: file[name].units for name in ("mean", "variance", "count", "x_mm")} == {
+            "mean": "kPa", "variance": "kPa2", "count": "1", "x_mm": "mm"
+        }  # fmt: skip
+
+
+def test_a_map_off_its_lattice_is_not_written(tmp_path):
+    with pytest.raises(BadDataError, match="x_mm steps by 2 to 2 mm"):
+        write_map(tmp_path / "map.nc", replace(plain_map(), x_mm=2.0 * np.arange(8)), provenance=PROVENANCE)
+    assert not list(tmp_path.iterdir())
+
+
+def _edit(change):
+    """Change an open file."""
+
+    def apply(path: Path) -> None:
+        with netCDF4.Dataset(path, "a") as file:
+            change(file)
+
+    return apply
+
+
+def _recipe(**fields):
+    def change(file) -> None:
+        file.setncattr("recipe", json.dumps(json.loads(file.recipe) | fields))
+
+    return _edit(change)
+
+
+def _cut(share: float):
+    return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+def _flip(path: Path) -> None:
+    """One bit in each packed variable."""
+    data = bytearray(path.read_bytes())
+    for start in range(len(data) - 20):
+        if data[start : start + 2] == b"\x78\x5e":
+            data[start + 12] ^= 1
+    path.write_bytes(bytes(data))
+
+
+FAULTS = {
+    "text": (lambda path: path.write_text("mean,count\n"), "not a readable netCDF file"),
+    "empty": (lambda path: path.write_bytes(b""), "not a readable netCDF file"),
+    "cut short": (_cut(0.5), "not a readable netCDF file"),
+    "no file": (Path.unlink, "cannot be read .*check the path"),
+    "a directory": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
+    "another file": (_edit(lambda file: file.delncattr("schema")), "attribute schema is missing; give a map"),
+    "a later schema": (_edit(lambda file: file.setncattr("schema", "tactile-bayes/map/9")), "map/9', not"),
+    "no mean": (_edit(lambda file: file.renameVariable("mean", "average")), "variable mean is missing"),
+    "no dimension": (_edit(lambda file: file.renameDimension("y", "rows")), r"dimensions \('rows',\), not \('y',\)"),
+    "broken JSON": (_edit(lambda file: file.setncattr("quality", "{")), r"attribute quality holds '\{'"),
+    "quality in words": (_edit(lambda file: file.setncattr("quality", '{"a": "b"}')), "quality.a is 'b', not a number"),
+    "quality a list": (_edit(lambda file: file.setncattr("quality", "[]")), "attribute quality holds"),
+    "infinite background": (_edit(lambda file: file.setncattr("background", "Infinity")), "background holds inf"),
+    "no cell": (_recipe(cell_mm=0), "recipe.cell_mm is 0"),
+    "unknown recipe": (_recipe(normalise="median"), "recipe.normalise is 'median'"),
+    "half a window": (_recipe(pressure_window_kpa=[5]), r"recipe.pressure_window_kpa is \[5\]"),
+    "another cell": (_recipe(cell_mm=2.0), "steps by 1 to 1 mm, not by the cell of 2 mm"),
+    "negative count": (_edit(lambda file: file["count"].__setitem__((0, 0), -1)), "count holds -1"),
+    "infinite mean": (_edit(lambda file: file["mean"].__setitem__((0, 0), np.inf)), "infinite values"),
+    "an axis of NaN": (
+        _edit(lambda file: file["x_mm"].__setitem__(0, np.nan)),
+        "x_mm holds values that are not finite",
+    ),
+    "no rotation": (_edit(lambda file: file["plane_from_base"].__setitem__((0, 0), 2.0)), "not a rigid transform"),
+    "a flipped bit": (_flip, "the file is damaged"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), FAULTS.values(), ids=FAULTS)
+def test_a_file_with_a_fault_is_refused_in_one_line_that_names_it(spoil, message, tmp_path):
+    path = tmp_path / "map.nc"
+    write_map(path, plain_map(), provenance=PROVENANCE)
+    spoil(path)
+    with pytest.raises(BadDataError, match=message) as refusal:
+        read_map(path)
+    assert str(refusal.value).startswith(str(path))
+    assert "\n" not in str(refusal.value)
+
+
+def _foreign(path: Path, kind: str = "f8", dimensions=("y", "x"), size: int = 3) -> None:
+    """A map with another variable in the place of `count`."""
+    source = path.with_name("source.nc")
+    write_map(source, plain_map(), provenance=PROVENANCE)
+    with netCDF4.Dataset(source) as old, netCDF4.Dataset(path, "w") as new:
+        new.setncatts(old.__dict__)
+        for name in old.dimensions:
+            new.createDimension(name, size if name in ("y", "x") else 4)
+        for name, variable in old.variables.items():
+            new.createVariable(name, kind if name == "count" else variable.dtype,
+                               dimensions if name == "count" else variable.dimensions)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"kind": "f8"}, "count is float64, not int64"),
+        ({"kind": "i8", "dimensions": ("x", "y")}, "count has dimensions"),
+        ({"kind": "i8", "size": 5000}, "has 25000000 cells, over"),
+    ],
+)
+def test_variables_of_another_kind_are_refused_before_they_are_read(options, message, tmp_path):
+    path = tmp_path / "map.nc"
+    _foreign(path, **options)
+    with pytest.raises(BadDataError, match=message):
+        read_map(path)
+
+
+def test_a_damaged_copy_leaves_the_original_readable(tmp_path):
+    write_map(tmp_path / "map.nc", plain_map(), provenance=PROVENANCE)
+    shutil.copy(tmp_path / "map.nc", tmp_path / "copy.nc")
+    _cut(0.9)(tmp_path / "copy.nc")
+    with pytest.raises(BadDataError):
+        read_map(tmp_path / "copy.nc")
+    assert_same(read_map(tmp_path / "map.nc"), plain_map())
