@@ -1,0 +1,125 @@
+"""A command imports only what it uses: `--help` no numpy, the Laplace estimate no scipy.stats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_bayes.cli import COMMANDS
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+
+DEMO = Path(__file__).resolve().parent.parent / "tactile_bayes" / "demo"
+HEAVY = (
+    "numpy",
+    "scipy",
+    "pandas",
+    "matplotlib",
+    "emcee",
+    "arviz",
+    "xarray",
+    "netCDF4",
+    "h5py",
+    "mcap",
+    "PIL",
+    "serial",
+)
+NOT_FOR_LAPLACE = ("scipy.stats", "emcee", "arviz", "pandas", "matplotlib", "xarray")
+
+# Runs the help of a command and of all below it in this process, then names what was imported.
+HELP = """
+import sys
+import click
+from tactile_bayes.cli import cli
+
+def ask(command, words):
+    command.main([*words, "--help"], prog_name="tactile-bayes", standalone_mode=False)
+
+def walk(command, words):
+    ask(cli, words)
+    if isinstance(command, click.Group):
+        for name in command.list_commands(click.Context(command)):
+            walk(command.get_command(click.Context(command), name), [*words, name])
+
+words = sys.argv[1:]
+if words:
+    walk(cli.get_command(click.Context(cli), words[0]), words)
+else:
+    ask(cli, [])
+print("\\nimported:", *sys.modules)
+"""
+
+RUN = """
+import sys
+from tactile_bayes.cli import cli
+status = cli.main(sys.argv[1:], prog_name="tactile-bayes", standalone_mode=False)
+assert not status, status
+print("\\nimported:", *sys.modules)
+"""
+
+
+def imported_by(process) -> set[str]:
+    assert process.returncode == 0, process.stderr
+    return set(process.stdout.rpartition("imported:")[2].split())
+
+
+def test_the_list_of_commands_imports_none_of_them(run_python):
+    modules = imported_by(run_python("-c", HELP))
+    assert not modules & set(HEAVY)
+    assert not {name for name in modules if name.startswith("tactile_bayes.commands.")}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_imports_nothing_heavy(run_python, command):
+    modules = imported_by(run_python("-c", HELP, command))
+    assert f"tactile_bayes.commands.{COMMANDS[command][0]}" in modules
+    assert not modules & set(HEAVY)
+
+
+@pytest.fixture
+def estimate_inputs(tmp_path: Path, run_cli) -> tuple[Path, Path]:
+    """A small map of a plain bump, and a size calibration learned from a small table."""
+    x = np.arange(-20.0, 21.0)
+    bump = 1 + 0.4 * np.exp(-(x[None, :] ** 2 + x[:, None] ** 2) / (2 * 6.0**2))
+    mean = bump + np.random.default_rng(1).normal(0, 0.01, bump.shape)
+    count = np.full(mean.shape, 50, dtype=np.int64)
+    recipe = MapRecipe("grid", "mean", 1.0)
+    tactile_map = TactileMap(mean, np.full(mean.shape, 0.005), count, x, x, recipe, frame_count=2000)
+    map_path, table, calibration = (tmp_path / name for name in ("map.nc", "table.csv", "size.json"))
+    write_map(map_path, tactile_map, provenance=Provenance("test", {}))
+    rows = [
+        f"{d},{h},{0.6 * h**-2:.4f},{0.35 * d * h**0.6 * wobble:.4f}"
+        for d in (10, 15, 20)
+        for h, wobble in ((0.8, 1.02), (1.0, 0.99), (1.5, 1.01))
+    ]
+    table.write_text("d_mm,depth_ratio,amplitude,sigma_x_mm\n" + "\n".join(rows) + "\n")
+    learned = run_cli("calibrate", "size", table, "-o", calibration)
+    assert learned.returncode == 0, learned.stderr
+    return map_path, calibration
+
+
+def test_the_laplace_estimate_imports_only_what_it_uses(run_python, estimate_inputs):
+    map_path, calibration = estimate_inputs
+    options = ("--size-calibration", calibration, "--method", "laplace", "--json")
+    modules = imported_by(run_python("-c", RUN, "estimate", map_path, *options))
+    assert "tactile_bayes.posterior.laplace" in modules
+    assert not modules & set(NOT_FOR_LAPLACE)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("map", DEMO / "scan.mcap", "-o", "map.nc"),
+        ("simulate", DEMO / "scene.toml", "-o", "scan.mcap"),
+        ("import", DEMO / "scan.mcap", "-o", "scan.mcap"),
+        ("show", DEMO / "scan.mcap"),
+        ("validate", DEMO / "trial.csv", "--excision", DEMO / "excision.csv"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_neither_draws_nor_samples_imports_no_plot_and_no_sampler(words, run_python, tmp_path):
+    modules = imported_by(run_python("-c", RUN, *words, cwd=tmp_path))
+    assert not modules & set(NOT_FOR_LAPLACE)
