@@ -1,0 +1,81 @@
+"""Sizes estimated from scans of known lumps, through the commands a user would type.
+
+Usage: python -m benchmarks.known_scans DIRECTORY [--method ensemble]
+
+DIRECTORY holds ``phantoms.csv`` and ``scans/`` with ``*.npz`` and ``truth.csv`` (one row a lump). Nothing is tuned to
+them: every option has its default.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+
+def run(*words: object, codes: tuple[int, ...] = (0,)) -> str:
+    """Run the program; any other exit code ends the benchmark with what it said."""
+    command = [sys.executable, "-m", "tactile_bayes", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode not in codes:
+        raise SystemExit(f"{' '.join(command)}: exit {done.returncode}\n{done.stderr}")
+    return done.stdout
+
+
+def truths(path: Path) -> dict[str, list[float]]:
+    """Diameters of each scan's lumps, in mm; an empty list for a scan without a lump."""
+    found: dict[str, list[float]] = defaultdict(list)
+    with path.open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            found[row["scan"]] += [float(row["d_mm"])] if row["lump"] else []
+    return found
+
+
+def estimates(data: Path, method: str) -> Iterator[tuple[str, list[float], dict[str, Any]]]:
+    """Name, true diameters and JSON estimate of each scan."""
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        size = work / "size.json"
+        run("calibrate", "size", data / "phantoms.csv", "-o", size)
+        for name, sizes in truths(data / "scans" / "truth.csv").items():
+            scan, tactile_map = work / f"{name}.mcap", work / f"{name}.nc"
+            run("import", data / "scans" / f"{name}.npz", "-o", scan)
+            run("map", scan, "-o", tactile_map)
+            words = ("estimate", tactile_map, "--size-calibration", size, "--method", method, "--json")
+            yield name, sizes, json.loads(run(*words, codes=(0, 6)))
+
+
+def main() -> None:
+    """Print one row a scan, and the mean absolute error over the scans with a lump."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--method", default="ensemble")
+    arguments = parser.parse_args()
+    print(f"{'scan':28}{'true, mm':>12}{'max size, mm':>14}{'95 % interval':>18}{'error':>8}  covered")
+    errors, covered = [], 0
+    for name, sizes, found in estimates(arguments.data, arguments.method):
+        true = " and ".join(f"{d:g}" for d in sizes) or "no lump"
+        if found["status"] == "no_estimate":
+            print(f"{name:28}{true:>12}  no estimate: {found['reason']}")
+            continue
+        q = found["max_size_mm"]
+        error = q["median"] / max(sizes) - 1.0 if sizes else float("nan")
+        inside = bool(sizes) and q["low"] <= max(sizes) <= q["high"]
+        errors.append(abs(error))
+        covered += inside
+        interval = f"{q['low']:.1f} to {q['high']:.1f}"
+        print(
+            f"{name:28}{true:>12}{q['median']:>14.1f}{interval:>18}{100 * error:>+7.0f}%  {'yes' if inside else 'NO'}"
+        )
+    print(f"mean absolute error {100 * sum(errors) / len(errors):.1f} %, {covered} of {len(errors)} intervals cover")
+
+
+if __name__ == "__main__":
+    main()
