@@ -1,0 +1,143 @@
+"""The map command, as a person runs it."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from pathlib import Path
+
+import mapping_scans as scans
+import numpy as np
+import pytest
+
+from tactile_bayes.files.map_nc import read_map, read_map_header
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_mcap import write_scan
+from tactile_bayes.mapping import build_map
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.scan import Landmarks, Scan
+
+
+def small_scan(*, level_kpa: float = 8.0) -> Scan:
+    levels = level_kpa + np.sin(np.arange(120))
+    levels[:5] = 2.0
+    marks = Landmarks(np.array([60.0, 200.0, -40.0]), np.array([60.0, 20.0, -35.0]))
+    return scans.make_scan(scans.strokes(), field=scans.gaussian(), levels_kpa=levels, landmarks=marks)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Two scans of one examination and one pressed too lightly."""
+    for name, scan in {
+        "one.mcap": scans.part(small_scan(), slice(70)),
+        "two.mcap": scans.part(small_scan(), slice(70, None)),
+        "light.mcap": small_scan(level_kpa=2.0),
+    }.items():
+        write_scan(tmp_path / name, scan, provenance=Provenance("test", {}))
+    return tmp_path
+
+
+def test_scans_become_the_map_the_function_builds(folder, run_cli):
+    done = run_cli("map", "one.mcap", "two.mcap", "-o", "map.nc", "--figure", "map.png", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    written, built = read_map(folder / "map.nc"), build_map(small_scan())
+    assert np.array_equal(written.mean, built.mean, equal_nan=True)
+    assert np.array_equal(written.count, built.count)
+    header = read_map_header(folder / "map.nc")
+    assert header["provenance"]["settings"] == {
+        "cell_mm": 1.0,
+        "pressure_window_kpa": [5.0, 14.0],
+        "normalise": "mean",
+        "latency_ms": 0.0,
+    }
+    assert [one["role"] for one in header["provenance"]["inputs"]] == ["scan_1", "scan_2"]
+    for name in ("map.nc", "map.png"):
+        assert stat.S_IMODE((folder / name).stat().st_mode) == 0o600
+
+
+def test_the_table_says_what_was_used_and_what_was_left_out(folder, run_cli):
+    lines = run_cli("map", "one.mcap", "two.mcap", "-o", "map.nc", cwd=folder).stdout.splitlines()
+    table = {line[:15].strip(): line[15:].strip() for line in lines if line}
+    assert table["frames used"] == "115 of 120, 2 scans"
+    assert table["left out"] == "5 mean pressure below the window of 5 to 14 kPa"
+    assert re.fullmatch(r"rms 0\.0 mm, 0\.0 deg from the head's face", table["plane"])
+    assert table["resolves"] == "lumps of map width sigma 1.3 mm or more"
+    assert table["patient axes"] == "from the landmarks"
+    assert lines[-1] == RESEARCH_USE
+
+
+def test_equal_inputs_give_equal_bytes_and_no_names(folder, run_cli):
+    (folder / "Jane_Doe.mcap").write_bytes((folder / "one.mcap").read_bytes())
+    for scan, out in (("one.mcap", "a.nc"), ("Jane_Doe.mcap", "b.nc")):
+        assert run_cli("map", scan, "-o", out, cwd=folder).returncode == 0
+    assert (folder / "a.nc").read_bytes() == (folder / "b.nc").read_bytes()
+    assert b"Jane" not in (folder / "b.nc").read_bytes()
+
+
+def test_options_reach_the_map(folder, run_cli):
+    options = ["--cell-mm", 2, "--pressure-window-kpa", 6, 12, "--normalise", "none", "--latency-ms", 4.5]
+    done = run_cli("map", "one.mcap", "-o", "map.nc", *options, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    recipe = read_map(folder / "map.nc").recipe
+    assert (recipe.cell_mm, recipe.pressure_window_kpa, recipe.normalise, recipe.latency_ms) == (
+        2,
+        (6, 12),
+        "none",
+        4.5,
+    )
+    assert "kPa (normalise none)" in done.stdout
+
+
+def test_gain_says_how_it_settled(folder, run_cli):
+    done = run_cli("map", "two.mcap", "-o", "map.nc", "--normalise", "gain", cwd=folder)
+    assert re.search(r"gain solve +\d+ passes, last change \d\.\de-\d+", done.stdout)
+
+
+def test_timings_go_to_stderr_when_asked_for(folder, run_cli):
+    done = run_cli("map", "one.mcap", "-o", "map.nc", "-v", cwd=folder)
+    assert [line.split(":")[0] for line in done.stderr.splitlines()] == ["read", "map", "write"]
+
+
+REFUSED = {
+    "pressed too lightly": (["light.mcap"], 3, "would keep nine in ten"),
+    "no such scan": (["none.mcap"], 3, "none.mcap: cannot be read"),
+    "no scan": ([], 2, "Missing argument"),
+    "a scan twice": (["one.mcap", "one.mcap"], 2, "given twice"),
+    "an unknown way": (["one.mcap", "--normalise", "median"], 2, "'mean', 'gain', 'none'"),
+    "no window": (["one.mcap", "--pressure-window-kpa", "9", "3"], 3, "two rising pressures"),
+    "no cell": (["one.mcap", "--cell-mm", "0"], 3, "cell_mm is 0.0; it must be positive"),
+    "figure over the map": (["one.mcap", "--figure", "map.nc"], 2, "choose another name"),
+    "no directory": (["one.mcap", "--figure", "nowhere/map.png"], 2, "nowhere is not a directory"),
+}
+
+
+@pytest.mark.parametrize(("words", "code", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_mapped_ends_in_one_line_and_no_file(folder, run_cli, words, code, message):
+    before = sorted(path.name for path in folder.iterdir())
+    done = run_cli("map", *words, "-o", "map.nc", cwd=folder)
+    assert done.returncode == code
+    assert message in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_outputs_and_inputs_are_not_overwritten(folder, run_cli):
+    (folder / "map.nc").write_text("mine")
+    assert run_cli("map", "one.mcap", "-o", "map.nc", cwd=folder).returncode == 2
+    assert (folder / "map.nc").read_text() == "mine"
+    assert run_cli("map", "one.mcap", "-o", "map.nc", "--force", cwd=folder).returncode == 0
+    os.link(folder / "one.mcap", folder / "alias.nc")
+    before = (folder / "one.mcap").read_bytes()
+    done = run_cli("map", "one.mcap", "-o", "alias.nc", "--force", cwd=folder)
+    assert (done.returncode, (folder / "one.mcap").read_bytes()) == (2, before)
+    assert "is an input of this command" in done.stderr
+
+
+def test_an_unfinished_recording_is_mapped_and_its_loss_told(folder, run_cli):
+    (folder / "cut.mcap").write_bytes((folder / "one.mcap").read_bytes()[:-200])
+    done = run_cli("map", "cut.mcap", "-o", "map.nc", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "scan 1: cut off at byte" in done.stdout
