@@ -68,8 +68,7 @@ def axes(monkeypatch):
     return kept
 
 
-@pytest.mark.parametrize("fit", [None, FIT])
-@pytest.mark.parametrize("normalise", ["mean", "gain", "none"])
+@pytest.mark.parametrize(("fit", "normalise"), [(None, "mean"), (FIT, "gain"), (None, "none")])
 def test_a_map_is_drawn_in_the_same_bytes_each_time(tmp_path, fit, normalise):
     for name in ("a.png", "b.png"):
         map_figure(bump_map(normalise=normalise), tmp_path / name, fit=fit, title="Map 1")

@@ -41,6 +41,13 @@ def test_any_order_and_any_parts_give_the_same_bits(seed, parts, cell_mm):
     )
 
 
+def test_sums_of_floats_would_show_their_order():
+    """The control to the test above: without whole numbers it fails."""
+    x, _, value = readings(0)
+    cell, order = cell_index(x, 1.0) - int(np.floor(x.min())), np.random.default_rng(1).permutation(len(x))
+    assert not np.array_equal(np.bincount(cell, value), np.bincount(cell[order], value[order]))
+
+
 @given(seed=st.integers(0, 999), cut=st.integers(0, 500))
 def test_merging_two_halves_either_way_gives_the_whole(seed, cut):
     x, y, value = readings(seed)

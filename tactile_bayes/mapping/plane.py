@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Plane, apply, fit_plane, inverse
 from tactile_bayes.mapping.poses import FramePoses
 from tactile_bayes.scan import HeadGeometry
@@ -18,6 +19,8 @@ _POSITION_STEP = 2.0**-16
 _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
 _CHUNK = 512
+# Mean directions shorter than this (of 1) are no direction: the head was turned by over 90 degrees (SD).
+_LEAST_RESULTANT = 0.3
 
 # Arrays of Python's integers, which never overflow.
 WholeArray = NDArray[Any]
@@ -62,13 +65,25 @@ class HeadMoments:
         return cls(0, _whole(np.zeros(3)), _whole(np.zeros((3, 3))), _whole(np.zeros((3, 3))), _whole(np.zeros((2, 3))))
 
     def plane(self) -> Plane:
-        """Best-fit plane of the taxel centres; see `tactile_bayes.geometry.fit_plane` for what it refuses."""
+        """Best-fit plane of the taxel centres.
+
+        Raises
+        ------
+        BadDataError
+            When the head was turned all round, so that its x axis has no mean direction; or see
+            `tactile_bayes.geometry.fit_plane`.
+        """
         n = self.count
         centroid = np.array(self.position / n, dtype=np.float64) * _POSITION_STEP
         between = (n * self.product - np.outer(self.position, self.position)) / (n * n)
         covariance = np.array(between, dtype=np.float64) * _POSITION_STEP**2
         covariance += np.array(self.spread / n, dtype=np.float64) * _SPREAD_STEP
         head_x, head_z = np.array(self.axes / n, dtype=np.float64) * _AXIS_STEP
+        if not np.linalg.norm(head_x) > _LEAST_RESULTANT:
+            raise BadDataError(
+                f"the head was turned all round (resultant of its x axis {np.linalg.norm(head_x):.2f} of 1)",
+                way_out="keep its direction while scanning; map parts with one direction apart",
+            )
         return fit_plane(centroid, covariance, head_x=head_x, head_z=head_z)
 
 
