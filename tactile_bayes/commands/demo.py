@@ -11,7 +11,7 @@ import click
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import RESEARCH_USE
 
-EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv")
+EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.toml", "empty.toml")
 
 
 @click.command("demo")
@@ -42,7 +42,7 @@ def command(ctx: click.Context, output: Path, method: str, force: bool) -> None:
     from tactile_bayes.commands import calibrate, estimate, map, validate
 
     _prepare(output, force=force)
-    scan, table, trial, excision = (output / name for name in EMBEDDED)
+    scan, table, trial, excision = (output / name for name in EMBEDDED[:4])
     tactile_map, size = output / "map.nc", output / "size.json"
     _step(ctx, map.command, "map", scans=(scan,), output=tactile_map, force=force)
     _step(ctx, calibrate.size, "calibrate size", table=table, output=size, force=force)

@@ -176,8 +176,7 @@ def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration, fit: Fit
 def _fault_reason(candidates: tuple[Candidate, ...]) -> str:
     first = candidates[0]
     where = f"near ({first.centre_mm[0]:.1f}, {first.centre_mm[1]:.1f}) mm"
-    more = f" ({len(candidates) - 1} lower bumps fail too)" if len(candidates) > 1 else ""
-    return f"no bump can be measured: the highest, {where}, is {first.fault}{more}"
+    return f"no bump can be measured ({len(candidates)} looked at); the highest, {where}: {first.fault}"
 
 
 def _choose_rotation(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tuple[BumpFit, float | None]:

@@ -163,7 +163,7 @@ def fit_bump(
         fit = _best_fit(tactile_map, bump, cells, weight=weight, centre=centre, start=start)
         moved = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
         if not fit.converged or moved > options.radius_mm / 2:
-            return None, "no bump that the window holds (the fit ran away)"
+            return None, "no bump that the window holds: the fit ran away"
         settled = weight_variance is not None and moved < 0.25 * cells.cell_mm
         centre, start = (float(fit.theta[1]), float(fit.theta[2])), fit.theta
         weight_variance = float(np.mean(fit.residual**2))

@@ -26,6 +26,7 @@ ROWS = (
 )
 NEAR_LEVEL = 0.02
 """An offset of the background of this size and more is mentioned."""
+MOST_PASSED_OVER = 4
 
 
 def decimals(mc_error: float, *, most: int = 3) -> int:
@@ -97,11 +98,11 @@ def _texts(value: object) -> list[str]:
 
 
 def _looked_at(estimate: Estimate) -> list[str]:
-    return [
-        f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}."
-        for c in estimate.candidates
-        if c.fault
-    ]
+    """The places passed over and why; the many of an empty map are counted."""
+    faulty = [candidate for candidate in estimate.candidates if candidate.fault]
+    lines = [f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}." for c in faulty]
+    more = len(lines) - MOST_PASSED_OVER
+    return [*lines[:MOST_PASSED_OVER], f"Passed over {more} lower bumps."] if more > 0 else lines
 
 
 def _left_out(estimate: Estimate) -> list[str]:
