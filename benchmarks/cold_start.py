@@ -1,0 +1,66 @@
+"""Every command on the embedded data, from a cold process to its last byte, and the peers it is held against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+DEMO = Path(__file__).resolve().parent.parent / "tactile_bayes" / "demo"
+
+# What any Python program, any numerical one and any sampler pays before it begins.
+PEERS: dict[str, tuple[str, ...]] = {
+    "python": ("-c", "pass"),
+    "numpy": ("-c", "import numpy"),
+    "emcee and arviz": ("-c", "import emcee, arviz"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One command line.
+
+    Parameters
+    ----------
+    name
+        What ``--only`` calls it.
+    words
+        After ``tactile-bayes``; run in a folder of its own.
+    peer
+        Key of `PEERS`.
+    needs
+        Names of the cases that make its inputs.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    peer: str
+    needs: tuple[str, ...] = ()
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """For the Python interpreter."""
+        return ("-m", "tactile_bayes", *self.words)
+
+
+def _estimate(method: str, peer: str) -> Case:
+    words = ("estimate", "map.nc", "--size-calibration", "size.json", "--method", method, "--json")
+    return Case(f"estimate-{method}", words, peer, ("map", "calibrate-size"))
+
+
+CASES: tuple[Case, ...] = (
+    Case("help", ("--help",), "python"),
+    Case("import", ("import", str(DEMO / "scan.mcap"), "-o", "again.mcap", "--force"), "numpy"),
+    Case("simulate", ("simulate", str(DEMO / "scene.toml"), "-o", "scan.mcap", "--force"), "numpy"),
+    Case("map", ("map", str(DEMO / "scan.mcap"), "-o", "map.nc", "--force"), "numpy"),
+    Case(
+        "calibrate-size",
+        ("calibrate", "size", str(DEMO / "phantoms.csv"), "-o", "size.json", "--force"),
+        "emcee and arviz",
+    ),
+    _estimate("optimise", "numpy"),
+    _estimate("laplace", "numpy"),
+    _estimate("ensemble", "emcee and arviz"),
+    Case("validate", ("validate", str(DEMO / "trial.csv"), "--excision", str(DEMO / "excision.csv")), "numpy"),
+    Case("show", ("show", "map.nc"), "numpy", ("map",)),
+    Case("demo", ("demo", "-o", "demo", "--force"), "emcee and arviz"),
+)
