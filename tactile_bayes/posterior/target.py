@@ -11,6 +11,9 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.least_squares import ModelFunction
 from tactile_bayes.posterior.noise import ErrorModel
 
+BLOCK = 64
+"""Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""
+
 LogPrior = Callable[[FloatArray], FloatArray]
 
 
@@ -54,10 +57,13 @@ class Target:
 
     def excess(self, theta: FloatArray) -> FloatArray:
         """(m,) rise of the weighted sum of squares above its minimum, divided by the inflation."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            sse = (self.data - self.predict(theta)) ** 2 @ self.weight
+        sse = np.concatenate([self._sse(theta[i : i + BLOCK]) for i in range(0, len(theta), BLOCK)])
         rise = np.clip(sse - self.sse_min, 0.0, None) / self.errors.inflation
         return np.where(np.isfinite(rise), rise, np.inf)
+
+    def _sse(self, theta: FloatArray) -> FloatArray:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray((self.data - self.predict(theta)) ** 2 @ self.weight)
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """(m,) log density of (m, p) parameter vectors; -inf where the model overflows."""
