@@ -167,7 +167,7 @@ def _one_map(
 ) -> Answer:
     from tactile_bayes.commands.progress import progress_bar
 
-    with progress_bar("steps") as progress:
+    with progress_bar("effective draws") as progress:
         tactile_map, estimate, provenance = _run(path, settings, progress=progress)
     if estimate.status == "estimate":
         if output:

@@ -63,6 +63,8 @@ def ensemble(
         Vectorised: (m, p) to (m,).
     centre, covariance : (p,), (p, p) arrays
         Mode and approximate covariance.
+    progress
+        Called with the effective draws so far and those wanted.
 
     Raises
     ------
@@ -80,12 +82,12 @@ def ensemble(
     for steps in range(options.block, options.max_steps + 1, options.block):
         for sampler in samplers:
             sampler.advance(options.block)
-        if progress is not None:
-            progress(steps, options.max_steps)
         chains = np.stack([sampler.chain() for sampler in samplers])
         figures = chain_diagnostics(chains)
-        reached = min(figures["ess_bulk"], figures["ess_tail"]) >= options.least_ess
-        if reached and figures["rhat"] <= options.most_rhat:
+        least = min(figures["ess_bulk"], figures["ess_tail"])
+        if progress is not None:
+            progress(int(min(least, options.least_ess)), int(options.least_ess))
+        if least >= options.least_ess and figures["rhat"] <= options.most_rhat:
             figures |= {"steps": float(steps), "walkers": float(samplers[0].walkers), "ensembles": len(samplers)}
             figures |= {"evaluations": float(steps * samplers[0].walkers * len(samplers))}
             figures |= {"acceptance": float(np.mean([sampler.acceptance() for sampler in samplers]))}

@@ -21,7 +21,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
+from tactile_bayes.posterior.ensemble import EnsembleOptions, Progress, ensemble
 from tactile_bayes.posterior.laplace import mode_and_covariance
 from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
 
@@ -68,7 +68,9 @@ def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: Seque
     return np.array([s / reference.get(key, np.nan) for key, s in zip(group, sigma_mm, strict=True)])
 
 
-def learn_size_calibration(table: SizeTable, *, recipe: Recipe, rng: np.random.Generator) -> SizeCalibration:
+def learn_size_calibration(
+    table: SizeTable, *, recipe: Recipe, rng: np.random.Generator, progress: Progress | None = None
+) -> SizeCalibration:
     """Learn Eq 6 from a table.
 
     Parameters
@@ -77,6 +79,8 @@ def learn_size_calibration(table: SizeTable, *, recipe: Recipe, rng: np.random.G
         At least eight rows with positive amplitude.
     recipe
         How the table's maps were made.
+    progress
+        As of `ensemble`, for each axis anew.
 
     Raises
     ------
@@ -98,11 +102,11 @@ def learn_size_calibration(table: SizeTable, *, recipe: Recipe, rng: np.random.G
         return _AxisData(table.d_mm[rising], table.amplitude[rising], sigma[rising], kept)
 
     x_data = axis(table.sigma_x_mm, table.width_change_x)
-    x = _learn_axis(x_data, rng=rng)
+    x = _learn_axis(x_data, rng=rng, progress=progress)
     if table.sigma_y_mm is None:
         return SizeCalibration(x, x, 1.0, recipe, axes=("both",))
     y_data = axis(table.sigma_y_mm, table.width_change_y)
-    y = _learn_axis(y_data, rng=rng)
+    y = _learn_axis(y_data, rng=rng, progress=progress)
     correlation = np.corrcoef(_standard_residuals(x, x_data), _standard_residuals(y, y_data))[0, 1]
     return SizeCalibration(x, y, float(np.clip(correlation, -1, 1)), recipe)
 
@@ -112,7 +116,7 @@ def _standard_residuals(axis: AxisCalibration, data: _AxisData) -> FloatArray:
     return np.asarray((np.log(data.d_mm) - np.log(predicted)) / axis.scatter(data.amplitude))
 
 
-def _learn_axis(data: _AxisData, *, rng: np.random.Generator) -> AxisCalibration:
+def _learn_axis(data: _AxisData, *, rng: np.random.Generator, progress: Progress | None) -> AxisCalibration:
     scale = np.array([0.05, 0.5, 0.03, 0.1, 0.1, 0.05, 0.1])
     start = _start(data)
     if data.width_change is None or np.isfinite(data.width_change).sum() < 4:
@@ -124,7 +128,7 @@ def _learn_axis(data: _AxisData, *, rng: np.random.Generator) -> AxisCalibration
 
     mode, covariance, _ = mode_and_covariance(log_density, start, scale=scale)
     options = EnsembleOptions(keep=DRAWS_KEPT, max_steps=20_000, block=300)
-    draws = ensemble(log_density, mode, covariance, rng=rng, options=options)
+    draws = ensemble(log_density, mode, covariance, rng=rng, options=options, progress=progress)
     coefficients = _coefficients(draws.flat, data)
     axis = AxisCalibration(coefficients, data.centre[0], _domain(data))
     predicted = axis.size_mm(data.sigma_mm, data.amplitude)
