@@ -82,6 +82,12 @@ class BumpFit:
         sigma_x, sigma_y, angle = self.bump.widths(self.theta)
         return float(sigma_x), float(sigma_y), float(angle)
 
+    def linear_excess(self, theta: FloatArray) -> FloatArray:
+        """(m,) `Target.excess` of a model linear about the fit: what a method by mode and curvature takes it for."""
+        information = self.fit.jacobian.T @ (self.weight[:, None] * self.fit.jacobian)
+        off = theta - self.theta
+        return np.asarray(np.einsum("mp,pq,mq->m", off, information, off) / self.errors.inflation)
+
     def target(self, prior: BumpPrior | None) -> Target:
         """Posterior density of the parameters; flat priors when `prior` is None."""
         floor = 1e-9 * self.bump.scale  # a map without any noise still has the rounding of its numbers

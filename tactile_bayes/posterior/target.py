@@ -73,10 +73,10 @@ class Target:
         total = likelihood + self.log_prior(theta)
         return np.where(np.isfinite(total), total, -np.inf)
 
-    def draw_noise_sd(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """(m,) noise scale given the parameters: a scaled inverse chi, exact under this model."""
-        chi2 = rng.chisquare(self.errors.dof + self.dimension, size=len(theta))
-        return np.sqrt((self.errors.dof * self.errors.noise_sd**2 + self.excess(theta)) / chi2)
+    def draw_noise_sd(self, excess: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """(m,) noise scale given the draws' (m,) `excess`: a scaled inverse chi, exact under this model."""
+        chi2 = rng.chisquare(self.errors.dof + self.dimension, size=len(excess))
+        return np.sqrt((self.errors.dof * self.errors.noise_sd**2 + excess) / chi2)
 
 
 def numerical_gradient_and_hessian(
