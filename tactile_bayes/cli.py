@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 import click
@@ -57,6 +58,8 @@ def cli() -> None:
 
 def main() -> None:
     """Run the program; every known error becomes one line on stderr and its documented exit code."""
+    # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         status = cli.main(prog_name="tactile-bayes", standalone_mode=False)
     except click.Abort:
