@@ -28,7 +28,7 @@ def cell_mean_gaussian(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: Fl
     -----
     Averaging over a cell is a convolution with a box, which adds :math:`h^2/12` to each variance and brings a fourth
     cumulant of :math:`-h^4/120` along each axis of the grid. Both are kept (Edgeworth series); the first term left
-    out is of order :math:`h^6/(12096\,\sigma^6)`, below 2e-5 of the height at :math:`h = 0.75\,\sigma`.
+    out is :math:`h^6/(12096\,\sigma^6)` for each axis, below 3e-5 of the height at :math:`h = 0.75\,\sigma`.
 
     Wellman & Howe (1999) eq. 7 is the case ``cell_mm=0`` and a diagonal covariance.
     """

@@ -1,0 +1,123 @@
+"""Is there a lump? False lumps on lump-free maps, and lumps that must be found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_scans import shared_scan
+from posterior_maps import bump_map, correlated_field, grid_map
+
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.detection import detect
+from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.fit import FitOptions, find_bump
+
+SIZE = 51
+NOISE = 0.02
+FAST = EstimateOptions(method="optimise", fit=FitOptions(rotation="off"))
+TILT = np.linspace(-0.05, 0.05, SIZE)[None, :] * np.ones((SIZE, 1))
+
+
+def lump_free(kind: str, rng: np.random.Generator) -> np.ndarray:
+    white = rng.standard_normal((SIZE, SIZE))
+    match kind:
+        case "white":
+            return NOISE * white
+        case "tilt":
+            return NOISE * white + TILT
+        case "3 mm":
+            return NOISE * correlated_field(rng, SIZE, length_cells=3.0)
+        case _:
+            return NOISE * correlated_field(rng, SIZE, length_cells=6.0)
+
+
+def run(values: np.ndarray) -> Estimate:
+    return estimate_map(grid_map(values), calibration=None, options=FAST, rng=np.random.default_rng(1))
+
+
+def false_lumps(kind: str, *, maps: int) -> int:
+    rng = np.random.default_rng(21)
+    return sum(run(1 + lump_free(kind, rng)).status == "estimate" for _ in range(maps))
+
+
+KINDS = ("white", "tilt", "3 mm", "6 mm")
+
+
+def test_lump_free_maps_show_none() -> None:
+    """40 maps, 10 of each kind: a true rate of 2 % gives more than 3 in 1 run of 120."""
+    assert sum(false_lumps(kind, maps=10) for kind in KINDS) <= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_false_lumps_are_rarer_than_one_in_fifty(kind: str) -> None:
+    assert false_lumps(kind, maps=300) <= 6
+
+
+def test_a_lump_on_each_of_those_maps_is_seen() -> None:
+    """The negative control: the same maps with a lump of 0.2 do not come back empty."""
+    rng = np.random.default_rng(22)
+    kinds = ["white", "tilt", "3 mm", "6 mm"] * 5
+    seen = [run(bump_map(amplitude=0.2).mean + lump_free(kind, rng)).status == "estimate" for kind in kinds]
+    assert sum(seen) >= 19
+
+
+def test_the_probability_rises_with_the_amplitude() -> None:
+    noise = lump_free("white", np.random.default_rng(23))
+    factors = []
+    for amplitude in (0.01, 0.02, 0.04, 0.3):
+        tactile_map = bump_map(amplitude=amplitude, noise=noise)
+        found = find_bump(tactile_map, FitOptions(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
+        assert found is not None
+        factors.append(
+            detect(
+                tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior()
+            ).log_bayes_factor
+        )
+    assert factors == sorted(factors)
+    assert factors[0] < np.log(0.95 / 0.05) < factors[2]
+
+
+def test_a_larger_map_asks_for_stronger_evidence() -> None:
+    """A search over more places finds more chance bumps: the odds fall with the area, all else alike."""
+    rng = np.random.default_rng(24)
+    noise = NOISE * rng.standard_normal((201, 201))
+    wide = bump_map(half_mm=100, amplitude=0.1, x=0.0, y=0.0, noise=noise)
+    cut = slice(48, 153)  # wider than the disc of blocks that the evidence looks at
+    small = replace(
+        wide,
+        mean=wide.mean[cut, cut],
+        variance=wide.variance[cut, cut],
+        count=wide.count[cut, cut],
+        x_mm=wide.x_mm[cut],
+        y_mm=wide.y_mm[cut],
+    )
+    factor = []
+    for tactile_map in (wide, small):
+        found = find_bump(tactile_map, FitOptions(rotation="off", centre_mm=(1.0, -1.0), radius_mm=15.0))[-1].fit
+        assert found is not None
+        answer = detect(tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior())
+        factor.append(answer.log_bayes_factor)
+    assert factor[1] - factor[0] == pytest.approx(np.log(201**2 / 105**2), abs=0.2)
+
+
+def test_a_depression_is_no_lump() -> None:
+    tactile_map = bump_map(amplitude=-0.3)
+    found = find_bump(tactile_map, FitOptions(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
+    assert found is not None
+    answer = detect(tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior())
+    assert answer.probability == 0.0
+
+
+def test_the_simulated_scan_without_a_mass_has_no_lump_and_those_with_one_do(shared_data: Path) -> None:
+    statuses = {}
+    for name in ("s08_no_mass", "s01_sphere15_hd1_clean", "s11_resting15_hd1"):
+        tactile_map = build_map([shared_scan(shared_data / "scans" / f"{name}.npz")])
+        found = estimate_map(tactile_map, calibration=None, options=FAST, rng=np.random.default_rng(1))
+        statuses[name[:3]] = (found.status, bool(found.reason))
+    assert statuses["s08"] == ("no_estimate", True)
+    assert statuses["s01"][0] == statuses["s11"][0] == "estimate"
