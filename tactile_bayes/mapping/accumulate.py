@@ -6,14 +6,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import CellSums, IntArray, cell_index
+from tactile_bayes.mapping.cells import CellSums
+from tactile_bayes.mapping.engine import Engine
 from tactile_bayes.mapping.frames import SelectedFrames, chunks
 from tactile_bayes.mapping.project import Projection, project
+from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.scan import CountArray
 
 GAIN_TOLERANCE = 1e-4
-MAX_GAIN_PASSES = 50
 
 Progress = Callable[[int, int], None]
 
@@ -50,30 +53,59 @@ class Accumulated:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Source:
-    """One scan's used frames, ready to be read chunk by chunk any number of times."""
+class Source:
+    """One scan's used frames, ready to be read chunk by chunk any number of times.
+
+    Parameters
+    ----------
+    selection, readout
+        The scan with its used frames, and the taxels that are read.
+    projection
+        Of the used frames only, in their order.
+    """
 
     selection: SelectedFrames
+    readout: Readout
     projection: Projection
 
-    def readings(self, cell_mm: float) -> Iterator[tuple[IntArray, FloatArray, IntArray, IntArray]]:
-        """Frame indices (f,), pressures (f, k; NaN where saturated), rows and columns of the cells (f, k)."""
-        good = self.selection.good_taxels
-        for part in chunks(self.selection.scan):
-            frames = part.start + np.flatnonzero(self.selection.used[part])
-            if not len(frames):
-                continue
-            pressure = self.selection.scan.pressure_kpa(part.start, part.stop)[frames - part.start][:, good]
-            x, y = self.projection.xy(frames)
-            yield frames, pressure, cell_index(y, cell_mm), cell_index(x, cell_mm)
+    @classmethod
+    def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Source:
+        """Project the used frames of a scan."""
+        good = selection.good_taxels
+        projection = project(
+            selection.scan.head,
+            selection.poses.part(selection.used),
+            plane_from_base=plane_from_base,
+            taxels=good,
+            cell_mm=cell_mm,
+        )
+        return cls(selection, Readout.of(selection.scan.element_calibration, good), projection)
+
+    @property
+    def frames(self) -> NDArray[np.intp]:
+        """Indices of the used frames in the scan."""
+        return np.flatnonzero(self.selection.used)
+
+    def parts(self, size: int) -> Iterator[tuple[slice, CountArray]]:
+        """Stretches of at most `size` used frames, and their (f, k) counts."""
+        frames, counts = self.frames, self.selection.scan.frames.counts
+        for part in chunks(len(frames), size):
+            chosen = frames[part]
+            whole = chosen[-1] - chosen[0] == len(chosen) - 1  # a stretch without gaps need not be copied
+            yield part, self.readout.counts(counts[chosen[0] : chosen[-1] + 1] if whole else counts[chosen])
+
+
+def sources_of(selections: list[SelectedFrames], *, plane_from_base: FloatArray, cell_mm: float) -> list[Source]:
+    """The scans on one lattice."""
+    return [Source.of(part, plane_from_base=plane_from_base, cell_mm=cell_mm) for part in selections]
 
 
 def accumulate(
-    selections: list[SelectedFrames],
+    sources: list[Source],
     *,
-    plane_from_base: FloatArray,
     cell_mm: float,
     normalise: str,
+    engine: Engine,
     progress: Progress = no_progress,
 ) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane.
@@ -84,97 +116,37 @@ def accumulate(
         ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does. A lump under the head is
         in that mean, so the map's amplitude and widths come out low by a few per cent. ``"gain"`` solves for one gain
         a frame jointly with the map. ``"none"`` keeps kPa.
+    engine
+        Which inner loops to use.
     progress
         Called with the frames done and the frames in all, anew in each pass.
     """
-    sources = [
-        _Source(part, project(part.scan.head, part.poses, plane_from_base=plane_from_base, taxels=part.good_taxels))
-        for part in selections
-    ]
+    levels = [source.selection.level_kpa[source.selection.used] for source in sources]
     if normalise == "none":
-        return Accumulated(_one_pass(sources, [np.ones(len(part.used)) for part in selections], cell_mm, progress))
-    means = [part.level_kpa for part in selections]
-    if normalise == "mean":
-        return Accumulated(_one_pass(sources, means, cell_mm, progress))
-    return _solve_gains(sources, means, cell_mm, progress)
+        levels = [np.ones(len(level)) for level in levels]
+    if normalise != "gain":
+        return Accumulated(add_all(sources, levels, cell_mm=cell_mm, engine=engine, progress=progress))
+    from tactile_bayes.mapping.gains import solve_gains
+
+    solved = solve_gains(sources, levels, tolerance=GAIN_TOLERANCE, progress=progress)
+    sums = add_all(sources, solved.gains, cell_mm=cell_mm, engine=engine, progress=progress)
+    return Accumulated(sums, float(np.nanmedian(sums.mean())), solved.passes, solved.last_change)
 
 
-def _one_pass(sources: list[_Source], gains: list[FloatArray], cell_mm: float, progress: Progress) -> CellSums:
+def add_all(
+    sources: list[Source],
+    levels: list[FloatArray],
+    *,
+    cell_mm: float,
+    engine: Engine,
+    progress: Progress = no_progress,
+) -> CellSums:
+    """One pass over all used frames, each divided by its level."""
     sums = CellSums(cell_mm)
-    done, total = 0, sum(int(source.selection.used.sum()) for source in sources)
-    for source, gain in zip(sources, gains, strict=True):
-        for frames, pressure, row, column in source.readings(cell_mm):
-            _add_valid(sums, row, column, pressure / gain[frames, None])
-            done += len(frames)
+    done, total = 0, sum(len(source.projection) for source in sources)
+    for source, level in zip(sources, levels, strict=True):
+        for part, counts in source.parts(engine.chunk_frames(source.readout.size)):
+            engine.add(sums, source.readout, counts, projection=source.projection.part(part), level=level[part])
+            done += len(counts)
             progress(done, total)
     return sums
-
-
-def _add_valid(sums: CellSums, row: IntArray, column: IntArray, value: FloatArray) -> None:
-    valid = np.isfinite(value)
-    if valid.all():
-        sums.add_cells(row, column, value)
-    elif valid.any():
-        sums.add_cells(row[valid], column[valid], value[valid])
-
-
-def _solve_gains(sources: list[_Source], gains: list[FloatArray], cell_mm: float, progress: Progress) -> Accumulated:
-    """Alternate between the map, given the gains, and each frame's least-squares gain, given the map.
-
-    The model is pressure = gain of the frame x map at the cell. Only the product is determined: the level is set in
-    the end so that the median of the map's cells is 1, since most cells lie beside the lump.
-
-    Notes
-    -----
-    Frames far apart are tied only through those between them, so plain alternation creeps. Every third step goes
-    further along the direction of the last two (SQUAREM, Varadhan & Roland 2008, Scand. J. Statist. 35, scheme S3),
-    on the logarithms of the gains.
-    """
-    path = [_joined(sources, gains)]
-    passes, change = 0, np.inf
-    while change > GAIN_TOLERANCE and passes < MAX_GAIN_PASSES:
-        sums = _one_pass(sources, _parted(sources, path[-1]), cell_mm, progress)
-        path.append(_joined(sources, [_gains(source, sums) for source in sources]))
-        change = float(np.abs(path[-1] - path[-2]).max(initial=0.0))
-        passes += 1
-        if len(path) == 3:
-            path = [_extrapolated(*path)]
-    return Accumulated(sums, float(np.nanmedian(sums.mean())), passes, change)
-
-
-def _joined(sources: list[_Source], gains: list[FloatArray]) -> FloatArray:
-    """Logarithms of the used frames' gains, all scans in one array."""
-    return np.concatenate([np.log(gain[part.selection.used]) for part, gain in zip(sources, gains, strict=True)])
-
-
-def _parted(sources: list[_Source], logarithms: FloatArray) -> list[FloatArray]:
-    """Back to one array a scan, 1 for frames that are not used."""
-    ends = np.cumsum([int(source.selection.used.sum()) for source in sources])[:-1]
-    gains = []
-    for source, part in zip(sources, np.split(logarithms, ends), strict=True):
-        gain = np.ones(len(source.selection.used))
-        gain[source.selection.used] = np.exp(part)
-        gains.append(gain)
-    return gains
-
-
-def _extrapolated(start: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Where the steps from `start` over `first` to `second` lead to."""
-    step = first - start
-    bend = second - first - step
-    size = float(np.linalg.norm(bend))
-    if not size > 0:
-        return second
-    length = max(1.0, float(np.linalg.norm(step)) / size)
-    return start + 2 * length * step + length**2 * bend
-
-
-def _gains(source: _Source, sums: CellSums) -> FloatArray:
-    """Least-squares gain of each frame against the map's mean: sum(p m) / sum(m^2) over its valid readings."""
-    mean, gain = sums.mean(), np.ones(len(source.selection.used))
-    for frames, pressure, row, column in source.readings(sums.cell_mm):
-        valid = np.isfinite(pressure)  # cells that only saturated readings hit may lie outside the sums
-        expected, measured = np.zeros(pressure.shape), np.where(valid, pressure, 0.0)
-        expected[valid] = mean[row[valid] - sums.first[0], column[valid] - sums.first[1]]
-        gain[frames] = (measured * expected).sum(axis=1) / (expected * expected).sum(axis=1)
-    return gain

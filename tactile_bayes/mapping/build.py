@@ -8,7 +8,8 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_base
-from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress
+from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress, sources_of
+from tactile_bayes.mapping.engine import choose_engine
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
@@ -34,6 +35,7 @@ def build_map(
     normalise: str = "mean",
     latency_ms: float = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
+    engine: str = "auto",
     progress: Progress = no_progress,
 ) -> TactileMap:
     """Build the tactile map of one scan, or of several scans of one examination on a common plane.
@@ -52,6 +54,8 @@ def build_map(
         By how much a pose's stamp is late against the frames.
     max_pose_gap_ms
         Frames between two distinct poses further apart than this are left out.
+    engine
+        ``"numpy"``, ``"fast"`` (compiled; needs the extra ``[fast]``) or ``"auto"``: the same map, bit for bit.
     progress
         Called with frames done and frames in all, anew in each pass over the scans.
 
@@ -69,9 +73,14 @@ def build_map(
     parts = [scans] if isinstance(scans, Scan) else list(scans)
     _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms)
     _check_same_examination(parts)
+    loops = choose_engine(engine, readings=sum(scan.frames.counts.size for scan in parts))
     selections = [
         select_frames(
-            scan, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms, max_pose_gap_ms=max_pose_gap_ms
+            scan,
+            pressure_window_kpa=pressure_window_kpa,
+            latency_ms=latency_ms,
+            max_pose_gap_ms=max_pose_gap_ms,
+            engine=loops,
         )
         for scan in parts
     ]
@@ -80,9 +89,8 @@ def build_map(
     for part in selections:
         moments = moments + head_moments(part.scan.head, part.used_poses)
     plane = moments.plane()
-    done = accumulate(
-        selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm, normalise=normalise, progress=progress
-    )
+    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
+    done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
     recipe = MapRecipe("scan", normalise, float(cell_mm), _window(pressure_window_kpa), float(latency_ms))
     return _as_map(done, selections, plane, recipe)
 

@@ -12,10 +12,13 @@ from tactile_bayes.geometry import FloatArray
 
 IntArray = NDArray[np.int64]
 
-# Values are counted in steps of 2^-12 and clipped to +-64, so 2^17 squares of a call sum exactly in float64 (2^53).
+# Values are counted in steps of 2^-12 and clipped to +-64, so 2^16 squares of a call sum exactly in float64 (2^53).
 VALUE_STEP = 2.0**-12
 VALUE_LIMIT = 64.0
-READINGS_PER_CALL = 2**17
+LIMIT_STEPS = VALUE_LIMIT / VALUE_STEP
+READINGS_PER_CALL = 2**16
+# Count and sum of a call travel as one number, count x 2^36 + sum: 2^16 sums of at most 2^18 steps stay below 2^34.
+_PACK_BITS = 36
 MAX_CELLS = 2**22
 _GROWTH = 16
 
@@ -70,17 +73,41 @@ class CellSums:
         """Add readings whose cells are known already."""
         first = (int(row.min()), int(column.min()))
         shape = (int(row.max()) - first[0] + 1, int(column.max()) - first[1] + 1)
-        self._make_room(first, shape)
         steps = np.rint(value * (1.0 / VALUE_STEP))
-        limit = VALUE_LIMIT / VALUE_STEP
-        if float(np.abs(steps).max()) > limit:
-            self.clipped += int((np.abs(steps) > limit).sum())
-            steps = np.clip(steps, -limit, limit)
-        flat = ((row - first[0]) * shape[1] + (column - first[1])).ravel()
-        window = self._window(first, shape)
-        for sums, weights in ((self.count, None), (self.total, steps.ravel()), (self.square, (steps * steps).ravel())):
-            part = np.bincount(flat, weights, shape[0] * shape[1])
-            sums[window] += part.astype(np.int64).reshape(shape)
+        self.add_steps(first, shape, (row - first[0]) * shape[1] + (column - first[1]), steps)
+
+    def add_steps(self, first: tuple[int, int], shape: tuple[int, int], flat: IntArray, steps: FloatArray) -> None:
+        """Add at most `READINGS_PER_CALL` values in whole steps; `steps` is used up.
+
+        Parameters
+        ----------
+        first, shape
+            Block of the lattice that holds all of them.
+        flat : (...) int array
+            Cell of each in the block, row by row.
+        steps : (...) array
+            Whole numbers; beyond `LIMIT_STEPS` either way they are clipped and counted.
+        """
+        self.make_room(first, shape)
+        if max(float(steps.max()), -float(steps.min())) > LIMIT_STEPS:
+            self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
+            np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
+        cells, weights, index = shape[0] * shape[1], steps.ravel(), flat.ravel()
+        square = np.bincount(index, weights * weights, cells).astype(np.int64)
+        weights += 2.0**_PACK_BITS
+        packed = np.bincount(index, weights, cells).astype(np.int64)
+        count = (packed + (1 << (_PACK_BITS - 1))) >> _PACK_BITS
+        self.add_block(
+            first, count.reshape(shape), (packed - (count << _PACK_BITS)).reshape(shape), square.reshape(shape)
+        )
+
+    def add_block(self, first: tuple[int, int], count: IntArray, total: IntArray, square: IntArray) -> None:
+        """Add sums over a block of the lattice."""
+        self.make_room(first, _shape(count))
+        window = self.window(first, _shape(count))
+        self.count[window] += count
+        self.total[window] += total
+        self.square[window] += square
 
     def merge(self, other: CellSums) -> None:
         """Add all of another's sums."""
@@ -89,11 +116,7 @@ class CellSums:
         self.clipped += other.clipped
         if not other.count.size:
             return
-        self._make_room(other.first, _shape(other.count))
-        window = self._window(other.first, _shape(other.count))
-        self.count[window] += other.count
-        self.total[window] += other.total
-        self.square[window] += other.square
+        self.add_block(other.first, other.count, other.total, other.square)
 
     def trimmed(self) -> CellSums:
         """A copy without the empty rows and columns around the data."""
@@ -129,11 +152,12 @@ class CellSums:
         ratio *= step
         return ratio
 
-    def _window(self, first: tuple[int, int], shape: tuple[int, int]) -> tuple[slice, slice]:
+    def window(self, first: tuple[int, int], shape: tuple[int, int]) -> tuple[slice, slice]:
+        """Where a block of the lattice lies in the arrays."""
         top, left = first[0] - self.first[0], first[1] - self.first[1]
         return slice(top, top + shape[0]), slice(left, left + shape[1])
 
-    def _make_room(self, first: tuple[int, int], shape: tuple[int, int]) -> None:
+    def make_room(self, first: tuple[int, int], shape: tuple[int, int]) -> None:
         """Grow the arrays, with a margin, so that the given block of the lattice is inside."""
         top, left, bottom, right = first[0], first[1], first[0] + shape[0], first[1] + shape[1]
         if self.count.size:
@@ -142,10 +166,10 @@ class CellSums:
                 return
             top, left = min(top, self.first[0]), min(left, self.first[1])
             bottom, right = max(bottom, held_bottom), max(right, held_right)
-        _refuse_vast(bottom - top, right - left, self.cell_mm)
+        refuse_vast(bottom - top, right - left, self.cell_mm)
         roomy = CellSums(self.cell_mm, (top - _GROWTH, left - _GROWTH))
         new_shape = (bottom - top + 2 * _GROWTH, right - left + 2 * _GROWTH)
-        window = roomy._window(self.first, _shape(self.count))
+        window = roomy.window(self.first, _shape(self.count))
         for name in ("count", "total", "square"):
             array = np.zeros(new_shape, dtype=np.int64)
             if self.count.size:
@@ -158,8 +182,9 @@ def _shape(array: IntArray) -> tuple[int, int]:
     return (array.shape[0], array.shape[1])
 
 
-def _refuse_vast(rows: int, columns: int, cell_mm: float) -> None:
-    if rows * columns > MAX_CELLS:
+def refuse_vast(rows: int, columns: int, cell_mm: float, *, most: int = MAX_CELLS) -> None:
+    """Raise `BadDataError` for a map of more than `MAX_CELLS` cells, or more than `most` along one axis."""
+    if rows * columns > MAX_CELLS or max(rows, columns) > most:
         raise BadDataError(
             f"the map would have {rows} x {columns} cells of {cell_mm:g} mm ({rows * columns} in all)",
             way_out=f"use larger cells (at most {MAX_CELLS} fit) or cut out poses far from the breast",

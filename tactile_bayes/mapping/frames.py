@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import READINGS_PER_CALL
 from tactile_bayes.mapping.elements import TaxelFault, find_faults
+from tactile_bayes.mapping.engine import Engine, NumpyEngine
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS, FramePoses, poses_at
+from tactile_bayes.mapping.readout import Readout
 from tactile_bayes.scan import Scan
 
 BoolArray = NDArray[np.bool_]
@@ -81,11 +82,10 @@ def good_taxels(scan: Scan, faults: tuple[TaxelFault, ...]) -> BoolArray:
     return good
 
 
-def chunks(scan: Scan) -> Iterator[slice]:
-    """Stretches of frames small enough for the processor's cache and for exact sums."""
-    size = max(1, READINGS_PER_CALL // max(1, scan.head.shape[0] * scan.head.shape[1]))
-    for start in range(0, len(scan.frames), size):
-        yield slice(start, min(start + size, len(scan.frames)))
+def chunks(frames: int, size: int) -> Iterator[slice]:
+    """Stretches of `size` frames."""
+    for start in range(0, frames, size):
+        yield slice(start, min(start + size, frames))
 
 
 def select_frames(
@@ -94,6 +94,7 @@ def select_frames(
     pressure_window_kpa: tuple[float, float],
     latency_ms: float = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
+    engine: Engine | None = None,
 ) -> SelectedFrames:
     """Decide about every frame of a scan.
 
@@ -108,22 +109,18 @@ def select_frames(
     faults = find_faults(scan)
     _refuse_dead(scan, faults)
     poses = poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
-    level, share = _levels(scan, good_taxels(scan, faults))
+    level, share = _levels(scan, good_taxels(scan, faults), engine or NumpyEngine())
     candidate = poses.known & (share >= VALID_SHARE)
     low, high = candidate & (level < pressure_window_kpa[0]), candidate & (level > pressure_window_kpa[1])
     return SelectedFrames(scan, faults, poses, level, share, low, high, candidate & ~low & ~high)
 
 
-def _levels(scan: Scan, good: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _levels(scan: Scan, good: BoolArray, engine: Engine) -> tuple[FloatArray, FloatArray]:
     """Mean over the valid taxels and share of valid taxels of each frame."""
+    readout = Readout.of(scan.element_calibration, good)
     level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
-    for part in chunks(scan):
-        pressure = scan.pressure_kpa(part.start, part.stop)[:, good]
-        valid = np.isfinite(pressure)
-        number = valid.sum(axis=1)
-        total = np.where(valid, pressure, 0.0).sum(axis=1)
-        level[part] = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-        share[part] = number / good.size
+    for part in chunks(len(scan.frames), engine.chunk_frames(good.size)):
+        level[part], share[part] = engine.levels(readout, readout.counts(scan.frames.counts[part]))
     return level, share
 
 

@@ -31,6 +31,10 @@ class FramePoses:
     rotation: FloatArray
     known: NDArray[np.bool_]
 
+    def part(self, frames: slice | NDArray[np.bool_] | NDArray[np.intp]) -> FramePoses:
+        """Some of the frames."""
+        return FramePoses(self.position_mm[frames], self.rotation[frames], self.known[frames])
+
 
 def distinct_poses(poses: TrackerPoses) -> TrackerPoses:
     """Poses without repeats, with quaternion signs unrolled and times strictly rising.

@@ -1,4 +1,4 @@
-"""From a frame's pose to where each of its taxels lies on the plane."""
+"""From a frame's pose to the cell that each of its taxels falls in."""
 
 from __future__ import annotations
 
@@ -8,50 +8,84 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.geometry import FloatArray, apply, inverse
+from tactile_bayes.mapping.cells import refuse_vast
 from tactile_bayes.mapping.poses import FramePoses
 from tactile_bayes.scan import HeadGeometry
+
+IntArray = NDArray[np.int64]
+
+# Directions (in cells a mm), taxels (mm about their middle) and shifts (in cells) are rounded to these steps, 2e-5 mm
+# at the most on the plane. Their products and sums then fit float64 exactly up to 2^15 cells, so that a matrix product
+# of any width, a loop and a compiled loop put every reading into the same cell.
+_TURN_STEP = 2.0**-22
+_TAXEL_STEP_MM = 2.0**-15
+_SHIFT_STEP = 2.0**-30
+_MOST_CELLS = 2**15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """Frames' taxels on the plane: ``xy = turn @ taxel + shift``, frame by frame.
+    """Frames' taxels on the lattice of cells: ``uv = turn @ taxel + shift``, frame by frame; the cell is floor(uv).
 
     The face of the head is curved, so its true surface is used: two rows of each frame's rotation against three
-    coordinates of each taxel. Products are added term by term rather than by a matrix product, whose rounding depends
-    on how many frames it is given at once.
+    coordinates of each taxel.
 
     Parameters
     ----------
-    taxels_mm : (k, 3) array
-        Taxel centres in the tracker's frame.
+    taxels_mm : (3, k) array
+        Taxel centres in the tracker's axes, about their middle.
     turn : (n, 2, 3) array
-        First two rows of the rotation from the tracker to the plane.
-    shift_mm : (n, 2) array
-        Where the tracker lies on the plane.
+        First two rows of the rotation from the tracker to the plane, in cells a mm.
+    shift : (n, 2) array
+        Where the taxels' middle lies on the lattice, in cells; half a cell is added, so that cell k is centred on k.
+    cell_mm
+        Side of a cell.
     """
 
     taxels_mm: FloatArray
     turn: FloatArray
-    shift_mm: FloatArray
+    shift: FloatArray
+    cell_mm: float
 
-    def xy(self, frames: slice | NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        """x and y in mm, each (frames, k), of the given frames' taxels."""
-        turn, shift = self.turn[frames], self.shift_mm[frames]
-        x, y = (self._coordinate(turn[:, axis], shift[:, axis]) for axis in (0, 1))
-        return x, y
+    def __len__(self) -> int:
+        return len(self.turn)
 
-    def _coordinate(self, turn: FloatArray, shift: FloatArray) -> FloatArray:
-        position = turn[:, 0, None] * self.taxels_mm[:, 0]
-        position += turn[:, 1, None] * self.taxels_mm[:, 1]
-        position += turn[:, 2, None] * self.taxels_mm[:, 2]
-        position += shift[:, None]
+    def part(self, frames: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Projection:
+        """Some of the frames."""
+        return Projection(self.taxels_mm, self.turn[frames], self.shift[frames], self.cell_mm)
+
+    def block(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First row and column, and shape, of a block of the lattice that holds every reading.
+
+        Raises
+        ------
+        BadDataError
+            When the block would be so wide that cells could not be told exactly.
+        """
+        reach = np.abs(self.turn) @ np.abs(self.taxels_mm).max(axis=1, initial=0.0)
+        low = np.floor((self.shift - reach).min(axis=0))
+        wide = np.floor((self.shift + reach).max(axis=0)) - low + 1
+        if max(float(np.abs(low).max()), float(wide.max())) > _MOST_CELLS:
+            refuse_vast(int(wide[1] + abs(low[1])), int(wide[0] + abs(low[0])), self.cell_mm, most=_MOST_CELLS)
+        return (int(low[1]), int(low[0])), (int(wide[1]), int(wide[0]))
+
+    def flat(self, first: tuple[int, int], shape: tuple[int, int]) -> IntArray:
+        """(n, k) indices of the readings' cells in a block given by its first row and column and its shape."""
+        row = self._coordinate(1, first[0]).astype(np.int64)  # not negative inside the block: cutting off is floor
+        row *= shape[1]
+        row += self._coordinate(0, first[1]).astype(np.int64)
+        return row
+
+    def _coordinate(self, axis: int, first: int) -> FloatArray:
+        position: FloatArray = self.turn[:, axis] @ self.taxels_mm
+        position += (self.shift[:, axis] - first)[:, None]
         return position
 
 
 def project(
-    head: HeadGeometry, poses: FramePoses, *, plane_from_base: FloatArray, taxels: NDArray[np.bool_]
+    head: HeadGeometry, poses: FramePoses, *, plane_from_base: FloatArray, taxels: NDArray[np.bool_], cell_mm: float
 ) -> Projection:
-    """Projection of the chosen taxels of all frames onto the plane.
+    """Projection of the chosen taxels of all frames onto the cells of the plane.
 
     Parameters
     ----------
@@ -60,11 +94,23 @@ def project(
     """
     rows = plane_from_base[:2, :3]
     origin_mm = inverse(plane_from_base)[:3, 3]  # subtracted first: bases may lie far away
-    offset = poses.position_mm - origin_mm
+    tracker_from_head = inverse(head.scanhead_from_tracker)
+    middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
+    centres = _rounded(apply(tracker_from_head, head.surface_mm[taxels]) - middle, _TAXEL_STEP_MM)
     turn = (rows[None, :, :, None] * poses.rotation[:, None, :, :]).sum(axis=2)
-    shift = (rows[None, :, :] * offset[:, None, :]).sum(axis=2)
-    centres = apply(inverse(head.scanhead_from_tracker), head.surface_mm[taxels])
-    return Projection(centres, turn, shift)
+    offset = poses.position_mm - origin_mm
+    shift = (rows[None, :, :] * offset[:, None, :]).sum(axis=2) + (turn * middle).sum(axis=2)
+    return Projection(
+        np.ascontiguousarray(centres.T),
+        _rounded(turn / cell_mm, _TURN_STEP),
+        _rounded(shift / cell_mm + 0.5, _SHIFT_STEP),
+        cell_mm,
+    )
+
+
+def _rounded(values: FloatArray, step: float) -> FloatArray:
+    whole: FloatArray = np.rint(values * (1.0 / step)) * step
+    return whole
 
 
 def yaw_deg(head: HeadGeometry, rotation: FloatArray, *, plane_from_base: FloatArray) -> FloatArray:

@@ -1,0 +1,160 @@
+"""Two ways through the inner loops, numpy and compiled, which give the same bits; and the choice between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping import loops
+from tactile_bayes.mapping.cells import LIMIT_STEPS, READINGS_PER_CALL, VALUE_STEP, CellSums
+from tactile_bayes.mapping.project import Projection
+from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.presets import PRESSURE_RANGE_KPA
+from tactile_bayes.scan import CountArray
+
+ENGINES: Final = ("auto", "numpy", "fast")
+# Starting the compiler costs 1 s of CPU or more, and each reading saves 5 ns or so (`make bench-map`).
+WORTH_COMPILING_READINGS = 250_000_000
+_FAST_FRAMES = 4096
+
+
+class Engine(Protocol):
+    """What a way through the loops must do; `chunk_frames` says how many frames a call should bring."""
+
+    def chunk_frames(self, taxels: int) -> int:
+        """Frames a call."""
+        ...
+
+    def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
+        """Level in kPa and valid share of (f, k) counts; see `Readout.levels`."""
+        ...
+
+    def add(
+        self, sums: CellSums, readout: Readout, counts: CountArray, *, projection: Projection, level: FloatArray
+    ) -> None:
+        """Add (f, k) counts, each over its frame's `level`, to the cells where `projection` puts them."""
+        ...
+
+
+class NumpyEngine:
+    """The core path: whole-array operations on chunks that stay in the processor's cache."""
+
+    def chunk_frames(self, taxels: int) -> int:
+        """Frames whose sums are exact in one call."""
+        return max(1, min(128, READINGS_PER_CALL // max(1, taxels)))
+
+    def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
+        """Level in kPa and valid share of each frame."""
+        return readout.levels(*readout.pressure_kpa(counts))
+
+    def add(
+        self, sums: CellSums, readout: Readout, counts: CountArray, *, projection: Projection, level: FloatArray
+    ) -> None:
+        """Scatter with `numpy.bincount`."""
+        if not counts.size:
+            return
+        steps, valid = readout.pressure_kpa(counts)
+        steps *= (1.0 / VALUE_STEP / level)[:, None]
+        np.rint(steps, out=steps)
+        first, shape = projection.block()
+        flat = projection.flat(first, shape)
+        if valid is None:
+            sums.add_steps(first, shape, flat, steps)
+        elif valid.any():
+            sums.add_steps(first, shape, flat[valid], steps[valid])
+
+
+class LoopEngine:
+    """One fused loop a frame.
+
+    Parameters
+    ----------
+    levels_loop, scatter_loop
+        `tactile_bayes.mapping.loops`, compiled or as they are.
+    """
+
+    def __init__(self, levels_loop: Callable[..., Any], scatter_loop: Callable[..., Any]) -> None:
+        self._levels, self._scatter = levels_loop, scatter_loop
+
+    def chunk_frames(self, taxels: int) -> int:
+        """Enough that what a call costs beside its loop does not show."""
+        del taxels
+        return _FAST_FRAMES
+
+    def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
+        """Level in kPa and valid share of each frame."""
+        total, number = np.zeros(len(counts)), np.zeros(len(counts), dtype=np.int64)
+        self._levels(counts, *_calibration(readout), total, number)
+        level = np.full(len(counts), np.nan)
+        np.divide(total, number, out=level, where=number > 0)
+        return level, number / readout.size
+
+    def add(
+        self, sums: CellSums, readout: Readout, counts: CountArray, *, projection: Projection, level: FloatArray
+    ) -> None:
+        """Scatter reading by reading."""
+        if not counts.size:
+            return
+        first, shape = projection.block()
+        cells = np.zeros((shape[0] * shape[1] + 1, 4), dtype=np.int64)
+        sums.clipped += self._scatter(
+            counts,
+            *_calibration(readout),
+            1.0 / VALUE_STEP / level,
+            LIMIT_STEPS,
+            projection.taxels_mm,
+            projection.turn,
+            projection.shift - np.array([first[1], first[0]]),
+            np.int32(shape[1]),
+            cells,
+        )
+        count, total, square = np.moveaxis(cells[:-1, :3].reshape(*shape, 3), -1, 0)
+        sums.add_block(first, count, total, square)
+
+
+def _calibration(readout: Readout) -> tuple[FloatArray, FloatArray, int, float]:
+    return readout.gain_kpa, readout.offset_kpa, readout.full_count, PRESSURE_RANGE_KPA[1]
+
+
+def fast_is_installed() -> bool:
+    """Whether the extra ``[fast]`` is there."""
+    return find_spec("numba") is not None
+
+
+@cache
+def compiled_engine() -> Engine:
+    """The loops, compiled; the machine code is kept on disk beside them where that can be written."""
+    import numba
+
+    # The sum of a frame may be taken in any order, because it has no rounding; nothing else may.
+    levels = numba.njit(nogil=True, cache=True, fastmath={"reassoc", "nsz"})(loops.levels_loop)
+    scatter = numba.njit(nogil=True, cache=True)(loops.scatter_loop)
+    return LoopEngine(levels, scatter)
+
+
+def choose_engine(name: str, *, readings: int) -> Engine:
+    """The engine called `name`; ``"auto"`` compiles when the job is long enough to repay it.
+
+    Parameters
+    ----------
+    readings
+        How many the job will read, all passes together.
+
+    Raises
+    ------
+    UsageError
+        When ``"fast"`` is asked for and not installed.
+    """
+    if name not in ENGINES:
+        raise UsageError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
+    if name == "fast" and not fast_is_installed():
+        raise UsageError("the fast engine is not installed; pip install 'tactile-bayes[fast]', or use numpy")
+    if name == "fast" or (name == "auto" and readings >= WORTH_COMPILING_READINGS and fast_is_installed()):
+        return compiled_engine()
+    return NumpyEngine()

@@ -1,0 +1,92 @@
+"""The two inner loops of map building as plain Python that a compiler can take as it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+# Arrays and numbers of the kinds named in the docstrings; a compiler infers them from the call.
+_Any = Any
+
+
+def levels_loop(counts: _Any, gain: _Any, offset: _Any, full: _Any, top: _Any, total: _Any, number: _Any) -> None:
+    """Sum of the valid pressures of each frame, and how many there are.
+
+    Parameters
+    ----------
+    counts : (f, k) uint16
+    gain, offset : (k,) float64
+        On the grid of `tactile_bayes.mapping.readout.PRESSURE_STEP_KPA`, so that the order of adding is free.
+    full, top
+        Count and pressure from which a reading is saturated.
+    total : (f,) float64, number : (f,) int64
+        Filled in.
+    """
+    for f in range(counts.shape[0]):
+        row, sum_kpa, saturated = counts[f], 0.0, np.int64(0)
+        for k in range(counts.shape[1]):
+            pressure = row[k] * gain[k] + offset[k]
+            saturated += np.int32(row[k] >= full) | np.int32(pressure >= top)
+            sum_kpa += pressure
+        if saturated:  # seldom: not in the loop above, which then runs eight taxels at a time
+            for k in range(counts.shape[1]):
+                pressure = row[k] * gain[k] + offset[k]
+                sum_kpa -= pressure if row[k] >= full or pressure >= top else 0.0
+        total[f] = sum_kpa
+        number[f] = counts.shape[1] - saturated
+
+
+def scatter_loop(
+    counts: _Any,
+    gain: _Any,
+    offset: _Any,
+    full: _Any,
+    top: _Any,
+    scale: _Any,
+    limit: _Any,
+    taxels: _Any,
+    turn: _Any,
+    shift: _Any,
+    columns: _Any,
+    cells: _Any,
+) -> int:
+    """Add every valid reading to its cell, and return how many were clipped.
+
+    Parameters
+    ----------
+    counts, gain, offset, full, top
+        See `levels_loop`.
+    scale : (f,) float64
+        Steps a kPa, frame by frame.
+    limit
+        Largest value in steps.
+    taxels, turn, shift
+        See `tactile_bayes.mapping.project.Projection`; the shift is counted from the block's first cell.
+    columns : int32
+        Columns of the block.
+    cells : (rows x columns + 1, 4) int64
+        Count, sum and sum of squares of each cell, and nothing, which keeps a cell on one line of the cache. Invalid
+        readings go to the last row.
+    """
+    index, steps = np.empty(counts.shape[1], np.int32), np.empty(counts.shape[1], np.int32)
+    nowhere, clipped = np.int32(cells.shape[0] - 1), 0
+    for f in range(counts.shape[0]):
+        row = counts[f]
+        for k in range(counts.shape[1]):
+            u = turn[f, 0, 0] * taxels[0, k] + turn[f, 0, 1] * taxels[1, k] + turn[f, 0, 2] * taxels[2, k] + shift[f, 0]
+            v = turn[f, 1, 0] * taxels[0, k] + turn[f, 1, 1] * taxels[1, k] + turn[f, 1, 2] * taxels[2, k] + shift[f, 1]
+            index[k] = np.int32(v) * columns + np.int32(u)
+        for k in range(counts.shape[1]):
+            pressure = row[k] * gain[k] + offset[k]
+            value = np.rint(pressure * scale[f])
+            good = row[k] < full and pressure < top
+            index[k] = index[k] if good else nowhere
+            clipped += 1 if good and abs(value) > limit else 0
+            steps[k] = np.int32(min(max(value, -limit), limit))
+        for k in range(counts.shape[1]):
+            i, step = index[k], np.int64(steps[k])
+            cells[i, 0] += 1
+            cells[i, 1] += step
+            cells[i, 2] += step * step
+    return clipped
