@@ -90,14 +90,12 @@ class BumpFit:
 
     def target(self, prior: BumpPrior | None) -> Target:
         """Posterior density of the parameters; flat priors when `prior` is None."""
-        floor = 1e-9 * self.bump.scale  # a map without any noise still has the rounding of its numbers
-        errors = replace(self.errors, noise_sd=max(self.errors.noise_sd, floor))
         return Target(
             predict=lambda theta: self.bump.predict(theta, self.cells),
             data=self.cells.value,
             weight=self.weight,
             log_prior=flat_prior if prior is None else self._log_prior(prior),
-            errors=errors,
+            errors=self.errors,
             sse_min=self.fit.sse,
             dimension=len(self.theta),
         )
@@ -176,6 +174,9 @@ def fit_bump(
         if settled:
             break
     errors = error_model(cells, jacobian=fit.jacobian, residual=fit.residual, weight=weight)
+    # a map without any noise still has the rounding of its numbers
+    rounding = 1e-9 * bump.scale + 1e-14 * float(np.abs(cells.value).max())
+    errors = replace(errors, noise_sd=max(errors.noise_sd, rounding))
     covariance = errors.noise_sd**2 * errors.inflation * inverse_information(fit.jacobian, weight)
     sigma_x, sigma_y, _ = bump.widths(fit.theta)
     share = covered_share(tactile_map, centre, radius_mm=1.5 * float(max(sigma_x, sigma_y)))

@@ -96,6 +96,8 @@ def learn_size_calibration(
         )
     if np.ptp(table.d_mm[rising]) <= 0:
         raise BadDataError("all rows have one diameter", way_out="a calibration needs lumps of several sizes")
+    if any(s is not None and np.ptp(s[rising]) <= 0 for s in (table.sigma_x_mm, table.sigma_y_mm)):
+        raise BadDataError("all rows have one width", way_out="m and b need maps of several widths to be told apart")
 
     def axis(sigma: FloatArray, change: FloatArray | None) -> _AxisData:
         kept = None if change is None else change[rising]

@@ -69,6 +69,9 @@ class AxisCalibration:
     def __post_init__(self) -> None:
         if self.draws.ndim != 2 or self.draws.shape[1] != len(COEFFICIENTS) or not len(self.draws):
             raise BadDataError(f"draws of an axis have shape {self.draws.shape}", way_out="they must be (n, 6)")
+        others = [self.reference_amplitude, *(end for ends in self.domain.values() for end in ends)]
+        if not (np.isfinite(self.draws).all() and np.isfinite(others).all()):
+            raise BadDataError("an axis holds a number that is not finite", way_out="learn the calibration anew")
 
     def size_mm(self, sigma_mm: FloatArray, amplitude: FloatArray, *, draws: FloatArray | None = None) -> FloatArray:
         r"""Diameter by Eq 6, without residual scatter: :math:`d = m\,\sigma / (e\,a^f) + b`.
