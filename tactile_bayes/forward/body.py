@@ -1,0 +1,132 @@
+"""The breast as a body: fat over gland over a rigid chest wall, with one circular lump at or above their boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tactile_bayes.errors import BadDataError
+
+FAT_KPA = 5.0
+GLAND_RATIO = 10.0
+POISSON = 0.495
+THICKNESS_MM = 70.0
+SEATS = {"centred": 0.0, "resting": 1.0}
+"""Named seats. Where the lump's centre lies on the fat-gland boundary, and where the lump only touches it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """The body without its lump.
+
+    Parameters
+    ----------
+    fat_mm
+        Thickness of the fat: depth of the fat-gland boundary.
+    thickness_mm
+        Depth of the rigid chest wall, to which the gland is bonded.
+    fat_kpa
+        Young's modulus of fat.
+    gland_ratio
+        Young's modulus of gland over that of fat.
+    poisson
+        Poisson's ratio of all tissues, at least 0 and below 0.5.
+    """
+
+    fat_mm: float
+    thickness_mm: float = THICKNESS_MM
+    fat_kpa: float = FAT_KPA
+    gland_ratio: float = GLAND_RATIO
+    poisson: float = POISSON
+
+    def __post_init__(self) -> None:
+        _require(0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"above 0 and below {self.thickness_mm:g}")
+        _require(self.fat_kpa > 0, "fat_kpa", self.fat_kpa, "above 0")
+        _require(self.gland_ratio > 0, "gland_ratio", self.gland_ratio, "above 0")
+        _require(0 <= self.poisson < 0.5, "poisson", self.poisson, "at least 0 and below 0.5")
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """Three layers and the place of a circular lump; its stiffness is not part of the geometry.
+
+    Parameters
+    ----------
+    d_mm
+        Diameter of the lump.
+    depth_ratio
+        h/d: depth of the lump's centre below the skin over its diameter, above 0.5.
+    seat
+        How far the lump stands out of the gland, 0 to 1. The fat-gland boundary lies at depth ``h + seat d/2``: through
+        the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat).
+    thickness_mm
+        Depth of the chest wall; None takes 70 mm, or ``h + 0.6 d + 2 mm`` where that is deeper.
+    fat_kpa, gland_ratio, poisson
+        As in `Layers`; the lump has the tissues' Poisson's ratio.
+
+    Notes
+    -----
+    Wellman & Howe (1999) section 2.2: fat of 5 kPa, gland ten times as stiff, a rigid chest wall, plane strain.
+    """
+
+    d_mm: float
+    depth_ratio: float
+    seat: float = 0.0
+    thickness_mm: float | None = None
+    fat_kpa: float = FAT_KPA
+    gland_ratio: float = GLAND_RATIO
+    poisson: float = POISSON
+
+    def __post_init__(self) -> None:
+        _require(0 < self.d_mm < 1e4, "d_mm", self.d_mm, "above 0, in mm")
+        limit = "above 0.5, or the lump stands out of the skin"
+        _require(0.5 < self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
+        _require(0 <= self.seat <= 1, "seat", self.seat, "between 0 (centred) and 1 (resting)")
+        if self.thickness_mm is None:
+            deep = self.centre_mm + 0.6 * self.d_mm + 2.0
+            object.__setattr__(self, "thickness_mm", max(THICKNESS_MM, deep))
+        bottom = self.centre_mm + self.radius_mm
+        _require(
+            self.layers.thickness_mm > 1.0001 * bottom,
+            "thickness_mm",
+            self.layers.thickness_mm,
+            f"above {bottom:g} mm, the depth of the lump's lowest point",
+        )
+
+    @property
+    def centre_mm(self) -> float:
+        """Depth h of the lump's centre."""
+        return self.depth_ratio * self.d_mm
+
+    @property
+    def radius_mm(self) -> float:
+        """Half the diameter."""
+        return 0.5 * self.d_mm
+
+    @property
+    def layers(self) -> Layers:
+        """The body without the lump."""
+        thickness = THICKNESS_MM if self.thickness_mm is None else self.thickness_mm
+        fat = self.centre_mm + self.seat * self.radius_mm
+        return Layers(fat, thickness, self.fat_kpa, self.gland_ratio, self.poisson)
+
+
+def parse_seat(text: str) -> float:
+    """The seat that ``centred``, ``resting`` or a number from 0 to 1 names.
+
+    Raises
+    ------
+    BadDataError
+        When it is none of these.
+    """
+    try:
+        seat = SEATS[text] if text in SEATS else float(text)
+    except ValueError:
+        seat = -1.0
+    if not 0 <= seat <= 1:
+        raise BadDataError(f"seat is {text!r}", way_out="give centred, resting or a number from 0 to 1")
+    return seat
+
+
+def _require(holds: bool, name: str, value: float, rule: str) -> None:
+    if not holds:
+        raise BadDataError(f"{name} is {value:g}", way_out=f"it must be {rule}")
