@@ -134,7 +134,8 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
     Raises
     ------
     BadDataError
-        When the points lie too nearly on a line to span a plane, or the normal disagrees with the head's.
+        When the points lie too nearly on a line to span a plane, the normal disagrees with the head's, or `head_x` is
+        zero or along the normal.
     """
     variances, axes = np.linalg.eigh(covariance_mm2)
     spread = np.sqrt(np.clip(variances, 0.0, None))[::-1]
@@ -144,7 +145,7 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
             way_out="scan with strokes side by side",
         )
     normal = axes[:, 0]
-    agreement = float(normal @ head_z) / float(np.linalg.norm(head_z))
+    agreement = float(normal @ head_z) / max(float(np.sqrt(head_z @ head_z)), 1e-300)
     if abs(agreement) < 0.9:
         angle = np.degrees(np.arccos(abs(agreement)))
         raise BadDataError(
@@ -153,8 +154,15 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         )
     normal = normal if agreement > 0 else -normal
     x_axis = head_x - (head_x @ normal) * normal
-    x_axis = x_axis / np.linalg.norm(x_axis)
-    rotation = np.stack([x_axis, np.cross(normal, x_axis), normal])
+    length, of = float(np.sqrt(x_axis @ x_axis)), float(np.sqrt(head_x @ head_x))
+    if not length > 0.1 * of:
+        raise BadDataError(
+            f"the head's x axis has no direction on the plane (length {length:.2g} of {of:.2g})",
+            way_out="check scanhead_from_tracker, and keep the head's direction while scanning",
+        )
+    x, n = x_axis / length, normal
+    y = np.array([n[1] * x[2] - n[2] * x[1], n[2] * x[0] - n[0] * x[2], n[0] * x[1] - n[1] * x[0]])  # n cross x
+    rotation = np.stack([x, y, n])
     return Plane(rigid(rotation, -rotation @ centroid_mm), float(spread[2]), spread)
 
 

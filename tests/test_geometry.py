@@ -120,3 +120,9 @@ def test_the_patient_frame_has_its_origin_at_the_xiphoid_and_y_to_the_notch() ->
 def test_landmarks_that_fix_no_frame_are_refused(notch: list[float], normal: list[float], words: str) -> None:
     with pytest.raises(BadDataError, match=words):
         patient_from_base(np.array(notch), np.zeros(3), normal=np.array(normal))
+
+
+@pytest.mark.parametrize("head_x", [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.01, 0.0, 1.0]])
+def test_a_head_axis_without_direction_on_the_plane_is_refused(head_x: list[float]) -> None:
+    with pytest.raises(BadDataError, match="no direction on the plane .*scanhead_from_tracker"):
+        fit_plane(np.zeros(3), np.diag([9.0, 4.0, 0.1]), head_x=np.array(head_x), head_z=np.array([0.0, 0.0, 1.0]))

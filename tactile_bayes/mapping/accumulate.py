@@ -12,7 +12,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.cells import CellSums
 from tactile_bayes.mapping.engine import Engine
 from tactile_bayes.mapping.frames import SelectedFrames, chunks
-from tactile_bayes.mapping.project import Projection, project
+from tactile_bayes.mapping.project import Projection, Projector
 from tactile_bayes.mapping.readout import Readout
 from tactile_bayes.scan import CountArray
 
@@ -72,13 +72,8 @@ class Source:
     def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Source:
         """Project the used frames of a scan."""
         good = selection.good_taxels
-        projection = project(
-            selection.scan.head,
-            selection.poses.part(selection.used),
-            plane_from_base=plane_from_base,
-            taxels=good,
-            cell_mm=cell_mm,
-        )
+        projector = Projector(selection.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
+        projection = projector.at(selection.poses.part(selection.used))
         return cls(selection, Readout.of(selection.scan.element_calibration, good), projection)
 
     @property

@@ -131,6 +131,7 @@ def _as_map(done: Accumulated, selections: list[SelectedFrames], plane: Plane, r
         "coverage": float((sums.count >= COVERED_READINGS).mean()),
         "median_count": float(np.median(sums.count[sums.count > 0])),
         "clipped_values": float(sums.clipped),
+        "negative_readings": float(sums.negative),
         "gain_passes": float(done.passes),
         "gain_last_change": done.last_change,
         "gain_unsettled": float(not done.settled),

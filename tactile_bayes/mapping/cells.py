@@ -47,6 +47,9 @@ class CellSums:
         Readings, their sum in `VALUE_STEP` and the sum of their squares in `VALUE_STEP` squared.
     clipped
         Readings beyond `VALUE_LIMIT` that were added at the limit.
+    negative
+        Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift
+        the mean.
     """
 
     cell_mm: float
@@ -55,6 +58,7 @@ class CellSums:
     total: IntArray = field(default_factory=_no_cells)
     square: IntArray = field(default_factory=_no_cells)
     clipped: int = 0
+    negative: int = 0
 
     def add(self, x_mm: FloatArray, y_mm: FloatArray, value: FloatArray) -> None:
         """Add readings at positions on the plane; arrays of one shape, all finite, of at most `READINGS_PER_CALL`.
@@ -89,7 +93,10 @@ class CellSums:
             Whole numbers; beyond `LIMIT_STEPS` either way they are clipped and counted.
         """
         self.make_room(first, shape)
-        if max(float(steps.max()), -float(steps.min())) > LIMIT_STEPS:
+        lowest = float(steps.min())
+        if lowest < 0:
+            self.negative += int((steps < 0).sum())
+        if max(float(steps.max()), -lowest) > LIMIT_STEPS:
             self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
             np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
         cells, weights, index = shape[0] * shape[1], steps.ravel(), flat.ravel()
@@ -114,6 +121,7 @@ class CellSums:
         if other.cell_mm != self.cell_mm:
             raise ValueError(f"cells of {other.cell_mm} mm cannot be merged into cells of {self.cell_mm} mm")
         self.clipped += other.clipped
+        self.negative += other.negative
         if not other.count.size:
             return
         self.add_block(other.first, other.count, other.total, other.square)
@@ -122,21 +130,21 @@ class CellSums:
         """A copy without the empty rows and columns around the data."""
         rows, columns = np.flatnonzero(self.count.any(axis=1)), np.flatnonzero(self.count.any(axis=0))
         if not len(rows):
-            return CellSums(self.cell_mm, clipped=self.clipped)
+            return CellSums(self.cell_mm, clipped=self.clipped, negative=self.negative)
         window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
         first = (self.first[0] + int(rows[0]), self.first[1] + int(columns[0]))
         parts = (self.count[window].copy(), self.total[window].copy(), self.square[window].copy())
-        return CellSums(self.cell_mm, first, *parts, clipped=self.clipped)
+        return CellSums(self.cell_mm, first, *parts, clipped=self.clipped, negative=self.negative)
 
     def mean(self) -> FloatArray:
         """(ny, nx) mean of each cell; NaN without readings."""
         return self._per_reading(self.total, VALUE_STEP)
 
-    def variance(self) -> FloatArray:
+    def variance(self, mean: FloatArray | None = None) -> FloatArray:
         """(ny, nx) variance of the readings about their cell's mean (divided by n); NaN without readings."""
         spread = self._per_reading(self.square, VALUE_STEP**2)
-        spread -= self.mean() ** 2
-        return np.maximum(spread, 0.0)
+        spread -= np.square(self.mean() if mean is None else mean)
+        return np.maximum(spread, 0.0, out=spread)
 
     def x_mm(self) -> FloatArray:
         """Centres of the columns."""

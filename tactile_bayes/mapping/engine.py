@@ -103,7 +103,7 @@ class LoopEngine:
             return
         first, shape = projection.block()
         cells = np.zeros((shape[0] * shape[1] + 1, 4), dtype=np.int64)
-        sums.clipped += self._scatter(
+        clipped, negative = self._scatter(
             counts,
             *_calibration(readout),
             1.0 / VALUE_STEP / level,
@@ -114,6 +114,8 @@ class LoopEngine:
             np.int32(shape[1]),
             cells,
         )
+        sums.clipped += int(clipped)
+        sums.negative += int(negative)
         count, total, square = np.moveaxis(cells[:-1, :3].reshape(*shape, 3), -1, 0)
         sums.add_block(first, count, total, square)
 

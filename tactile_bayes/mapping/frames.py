@@ -110,9 +110,17 @@ def select_frames(
     _refuse_dead(scan, faults)
     poses = poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
     level, share = _levels(scan, good_taxels(scan, faults), engine or NumpyEngine())
-    candidate = poses.known & (share >= VALID_SHARE)
-    low, high = candidate & (level < pressure_window_kpa[0]), candidate & (level > pressure_window_kpa[1])
-    return SelectedFrames(scan, faults, poses, level, share, low, high, candidate & ~low & ~high)
+    low, high, used = gate(poses.known, level, share, pressure_window_kpa=pressure_window_kpa)
+    return SelectedFrames(scan, faults, poses, level, share, low, high, used)
+
+
+def gate(
+    known: BoolArray, level_kpa: FloatArray, valid_share: FloatArray, *, pressure_window_kpa: tuple[float, float]
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Which frames lie below the window, which above, and which are used; ends of the window included."""
+    candidate = known & (valid_share >= VALID_SHARE)
+    low, high = candidate & (level_kpa < pressure_window_kpa[0]), candidate & (level_kpa > pressure_window_kpa[1])
+    return low, high, candidate & ~low & ~high
 
 
 def _levels(scan: Scan, good: BoolArray, engine: Engine) -> tuple[FloatArray, FloatArray]:

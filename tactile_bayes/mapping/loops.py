@@ -50,8 +50,8 @@ def scatter_loop(
     shift: _Any,
     columns: _Any,
     cells: _Any,
-) -> int:
-    """Add every valid reading to its cell, and return how many were clipped.
+) -> tuple[int, int]:
+    """Add every valid reading to its cell, and return how many were clipped and how many were below 0.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def scatter_loop(
         readings go to the last row.
     """
     index, steps = np.empty(counts.shape[1], np.int32), np.empty(counts.shape[1], np.int32)
-    nowhere, clipped = np.int32(cells.shape[0] - 1), 0
+    nowhere, clipped, negative = np.int32(cells.shape[0] - 1), 0, 0
     for f in range(counts.shape[0]):
         row = counts[f]
         for k in range(counts.shape[1]):
@@ -83,10 +83,11 @@ def scatter_loop(
             good = row[k] < full and pressure < top
             index[k] = index[k] if good else nowhere
             clipped += 1 if good and abs(value) > limit else 0
+            negative += 1 if good and value < 0 else 0
             steps[k] = np.int32(min(max(value, -limit), limit))
         for k in range(counts.shape[1]):
             i, step = index[k], np.int64(steps[k])
             cells[i, 0] += 1
             cells[i, 1] += step
             cells[i, 2] += step * step
-    return clipped
+    return clipped, negative

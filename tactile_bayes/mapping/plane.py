@@ -19,6 +19,10 @@ _POSITION_STEP = 2.0**-16
 _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
 _CHUNK = 512
+# Steps from one place up to 2^26 (1 m), and 2^10 frames: squares stay below 2^62. Beyond 2^52 steps floats have gaps.
+_FAR_STEPS = 2**26
+_FRAMES_AT_ONCE = 2**10
+_FARTHEST_STEPS = 2.0**52
 # Mean directions shorter than this (of 1) are no direction: the head was turned by over 90 degrees (SD).
 _LEAST_RESULTANT = 0.3
 
@@ -73,60 +77,108 @@ class HeadMoments:
             When the head was turned all round, so that its x axis has no mean direction; or see
             `tactile_bayes.geometry.fit_plane`.
         """
-        n = self.count
-        centroid = np.array(self.position / n, dtype=np.float64) * _POSITION_STEP
-        between = (n * self.product - np.outer(self.position, self.position)) / (n * n)
-        covariance = np.array(between, dtype=np.float64) * _POSITION_STEP**2
-        covariance += np.array(self.spread / n, dtype=np.float64) * _SPREAD_STEP
-        head_x, head_z = np.array(self.axes / n, dtype=np.float64) * _AXIS_STEP
-        if not np.linalg.norm(head_x) > _LEAST_RESULTANT:
+        n, position, product = self.count, self.position.tolist(), self.product.tolist()
+        # In Python's integers up to the last division: positions far from the base lose nothing.
+        between = [[(n * product[i][j] - position[i] * position[j]) / (n * n) for j in range(3)] for i in range(3)]
+        spread = [[value / n for value in row] for row in self.spread.tolist()]
+        head_x, head_z = np.array([[value / n for value in row] for row in self.axes.tolist()]) * _AXIS_STEP
+        resultant = float(np.sqrt(head_x @ head_x))
+        if not resultant > _LEAST_RESULTANT:
             raise BadDataError(
-                f"the head was turned all round (resultant of its x axis {np.linalg.norm(head_x):.2f} of 1)",
+                f"the head was turned all round (resultant of its x axis {resultant:.2f} of 1)",
                 way_out="keep its direction while scanning; map parts with one direction apart",
             )
-        return fit_plane(centroid, covariance, head_x=head_x, head_z=head_z)
+        return fit_plane(
+            np.array([value / n for value in position]) * _POSITION_STEP,
+            np.array(between) * _POSITION_STEP**2 + np.array(spread) * _SPREAD_STEP,
+            head_x=head_x,
+            head_z=head_z,
+        )
+
+
+class MomentSums:
+    """Moments of one head that grow frame by frame, in 64-bit numbers for as long as they cannot overflow.
+
+    Parameters
+    ----------
+    head
+        Every taxel counts, working or not: where the head was does not depend on what it read.
+    """
+
+    def __init__(self, head: HeadGeometry) -> None:
+        tracker_from_head = inverse(head.scanhead_from_tracker)
+        taxels = apply(tracker_from_head, head.surface_mm.reshape(-1, 3))
+        self._middle = taxels.mean(axis=0)
+        self._covariance = (taxels - self._middle).T @ (taxels - self._middle) / len(taxels)
+        self._axes = np.ascontiguousarray(tracker_from_head[:3, [0, 2]].T)
+        self._whole = HeadMoments.none()
+        self._begin(np.zeros(3, dtype=np.int64))
+
+    def _begin(self, reference: NDArray[np.int64]) -> None:
+        """Count positions from `reference` on."""
+        self._reference, self._count = reference, 0
+        self._first, self._product = np.zeros(3, dtype=np.int64), np.zeros((3, 3), dtype=np.int64)
+        self._spread, self._directions = np.zeros((3, 3), dtype=np.int64), np.zeros((2, 3), dtype=np.int64)
+
+    def add(self, poses: FramePoses) -> None:
+        """Add the frames of which the pose is known."""
+        rotation, position = poses.rotation, poses.position_mm
+        if not poses.known.all():
+            rotation, position = rotation[poses.known], position[poses.known]
+        for start in range(0, len(rotation), _CHUNK):
+            self._add(rotation[start : start + _CHUNK], position[start : start + _CHUNK])
+
+    def _add(self, rotation: FloatArray, position: FloatArray) -> None:
+        centres = np.rint((position + (rotation * self._middle).sum(axis=2)) * (1.0 / _POSITION_STEP))
+        if float(np.abs(centres).max()) > _FARTHEST_STEPS:
+            raise BadDataError(
+                f"the head was {float(np.abs(centres).max()) * _POSITION_STEP:.3g} mm from the tracker's base",
+                way_out="check the unit of the positions (mm)",
+            )
+        steps = centres.astype(np.int64)
+        if not self._count:
+            self._begin(steps[0])
+        offset = steps - self._reference
+        if self._count + len(steps) > _FRAMES_AT_ONCE or int(np.abs(offset).max()) >= _FAR_STEPS:
+            self._whole = self.moments()
+            self._begin(steps[0])
+            offset = steps - self._reference
+        if int(np.abs(offset).max()) >= _FAR_STEPS:
+            self._add_apart(rotation, position)
+            return
+        spread = np.einsum("fij,jk,flk->fil", rotation, self._covariance, rotation)
+        axes = (rotation[:, None] * self._axes[None, :, None, :]).sum(axis=3)
+        self._count += len(steps)
+        self._first += offset.sum(axis=0)
+        self._product += offset.T @ offset
+        self._spread += np.rint(spread * (1.0 / _SPREAD_STEP)).astype(np.int64).sum(axis=0)
+        self._directions += np.rint(axes * (1.0 / _AXIS_STEP)).astype(np.int64).sum(axis=0)
+
+    def _add_apart(self, rotation: FloatArray, position: FloatArray) -> None:
+        """One by one: these lie too far apart to be counted from one place."""
+        for one in range(len(rotation)):
+            self._add(rotation[one : one + 1], position[one : one + 1])
+
+    def moments(self) -> HeadMoments:
+        """All so far, from the tracker's base."""
+        n, place, first, product = self._count, self._reference.tolist(), self._first.tolist(), self._product.tolist()
+        position = [first[i] + n * place[i] for i in range(3)]
+        outer = [
+            [product[i][j] + first[i] * place[j] + place[i] * first[j] + n * place[i] * place[j] for j in range(3)]
+            for i in range(3)
+        ]
+        parts = (position, outer, self._spread.tolist(), self._directions.tolist())
+        now = HeadMoments(n, *(np.array(part, dtype=object) for part in parts))
+        return self._whole + now if self._whole.count else now
 
 
 def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
-    """Moments of the taxel centres at the known ones of `poses`.
-
-    Every taxel counts, working or not: where the head was does not depend on what it read.
-    """
-    position, rotation = poses.position_mm[poses.known], poses.rotation[poses.known]
-    tracker_from_head = inverse(head.scanhead_from_tracker)
-    taxels = apply(tracker_from_head, head.surface_mm.reshape(-1, 3))
-    middle = taxels.mean(axis=0)
-    covariance = (taxels - middle).T @ (taxels - middle) / len(taxels)
-    centres = _whole((position + (rotation * middle).sum(axis=2)) / _POSITION_STEP)
-    spread = np.einsum("fij,jk,flk->fil", rotation, covariance, rotation)
-    axes = np.einsum("fij,jk->fki", rotation, tracker_from_head[:3, [0, 2]])
-    moments = HeadMoments.none()
-    for start in range(0, len(centres), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        first, product = _position_moments(centres[part])
-        moments = moments + HeadMoments(
-            len(centres[part]), first, product, _sum(spread[part] / _SPREAD_STEP), _sum(axes[part] / _AXIS_STEP)
-        )
-    return moments
+    """Moments of the taxel centres at the known ones of `poses`."""
+    sums = MomentSums(head)
+    sums.add(poses)
+    return sums.moments()
 
 
 def _whole(values: FloatArray) -> WholeArray:
     whole: WholeArray = np.rint(values).astype(np.int64).astype(object)
     return whole
-
-
-def _sum(values: FloatArray) -> WholeArray:
-    total: WholeArray = np.rint(values).astype(np.int64).sum(axis=0).astype(object)
-    return total
-
-
-def _position_moments(centres: WholeArray) -> tuple[WholeArray, WholeArray]:
-    """Sum and sum of outer products, exactly: about the first centre in int64 where that cannot overflow."""
-    n, reference = len(centres), centres[0]
-    offset = centres - reference
-    if max(abs(offset.max()), abs(offset.min())) < 2**26:  # 1 m: 512 squares stay below 2^61
-        offset = offset.astype(np.int64)
-    first = offset.sum(axis=0).astype(object)
-    product = (offset.T @ offset).astype(object)
-    cross = np.outer(first, reference)
-    return first + n * reference, product + cross + cross.T + n * np.outer(reference, reference)

@@ -82,30 +82,37 @@ class Projection:
         return position
 
 
-def project(
-    head: HeadGeometry, poses: FramePoses, *, plane_from_base: FloatArray, taxels: NDArray[np.bool_], cell_mm: float
-) -> Projection:
-    """Projection of the chosen taxels of all frames onto the cells of the plane.
+class Projector:
+    """What of a projection does not change from frame to frame.
 
     Parameters
     ----------
     taxels : (rows, columns) bool array
         Taxels to project, in row order.
     """
-    rows = plane_from_base[:2, :3]
-    origin_mm = inverse(plane_from_base)[:3, 3]  # subtracted first: bases may lie far away
-    tracker_from_head = inverse(head.scanhead_from_tracker)
-    middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
-    centres = _rounded(apply(tracker_from_head, head.surface_mm[taxels]) - middle, _TAXEL_STEP_MM)
-    turn = (rows[None, :, :, None] * poses.rotation[:, None, :, :]).sum(axis=2)
-    offset = poses.position_mm - origin_mm
-    shift = (rows[None, :, :] * offset[:, None, :]).sum(axis=2) + (turn * middle).sum(axis=2)
-    return Projection(
-        np.ascontiguousarray(centres.T),
-        _rounded(turn / cell_mm, _TURN_STEP),
-        _rounded(shift / cell_mm + 0.5, _SHIFT_STEP),
-        cell_mm,
-    )
+
+    def __init__(
+        self, head: HeadGeometry, *, plane_from_base: FloatArray, taxels: NDArray[np.bool_], cell_mm: float
+    ) -> None:
+        self._rows = np.ascontiguousarray(plane_from_base[:2, :3])
+        self._origin_mm = inverse(plane_from_base)[:3, 3]
+        self._cell_mm = cell_mm
+        tracker_from_head = inverse(head.scanhead_from_tracker)
+        self._middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
+        centres = apply(tracker_from_head, head.surface_mm[taxels]) - self._middle
+        self._taxels = np.ascontiguousarray(_rounded(centres, _TAXEL_STEP_MM).T)
+
+    def at(self, poses: FramePoses) -> Projection:
+        """Projection of the frames at `poses` onto the cells of the plane."""
+        turn = (self._rows[None, :, :, None] * poses.rotation[:, None, :, :]).sum(axis=2)
+        offset = poses.position_mm - self._origin_mm  # first of all: bases may lie far away
+        shift = (self._rows[None, :, :] * offset[:, None, :]).sum(axis=2) + (turn * self._middle).sum(axis=2)
+        return Projection(
+            self._taxels,
+            _rounded(turn / self._cell_mm, _TURN_STEP),
+            _rounded(shift / self._cell_mm + 0.5, _SHIFT_STEP),
+            self._cell_mm,
+        )
 
 
 def _rounded(values: FloatArray, step: float) -> FloatArray:

@@ -1,0 +1,272 @@
+"""A map that grows frame by frame: live, in shards or all at once, it ends in the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.geometry import FloatArray, Plane, check_rigid
+from tactile_bayes.mapping.cells import CellSums
+from tactile_bayes.mapping.elements import TaxelFault
+from tactile_bayes.mapping.engine import Engine, NumpyEngine
+from tactile_bayes.mapping.frames import chunks, gate
+from tactile_bayes.mapping.plane import HeadMoments, MomentSums, head_moments
+from tactile_bayes.mapping.poses import FramePoses
+from tactile_bayes.mapping.project import Projector
+from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
+from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry
+
+_TALLIES = ("frames_total", "frames_used", "dropped_no_pose", "dropped_elements", "dropped_low", "dropped_high")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapGrid:
+    """Where the cells of a map lie.
+
+    Parameters
+    ----------
+    plane_from_base : (4, 4) array
+        Cells are centred on whole multiples of their side in this `plane`.
+    cell_mm
+        Side of the square cells.
+    """
+
+    plane_from_base: FloatArray
+    cell_mm: float = CELL_MM
+
+    def __post_init__(self) -> None:
+        check_rigid(self.plane_from_base, name="plane_from_base")
+        if not (np.isfinite(self.cell_mm) and self.cell_mm > 0):
+            raise BadDataError(f"cell_mm is {self.cell_mm}", way_out="it must be positive, in mm")
+
+    @classmethod
+    def under(cls, head: HeadGeometry, poses: FramePoses, *, cell_mm: float = CELL_MM) -> MapGrid:
+        """On the best plane of the known ones of `poses`: to begin with, before the head has moved."""
+        return cls(head_moments(head, poses).plane().plane_from_base, cell_mm)
+
+    def same(self, other: MapGrid) -> bool:
+        """Whether the cells are the same, to the bit."""
+        return self.cell_mm == other.cell_mm and np.array_equal(self.plane_from_base, other.plane_from_base)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instrument:
+    """What turns counts and poses into pressures on a plane, and which frames count.
+
+    Parameters
+    ----------
+    head, element_calibration
+        Of the scan head.
+    faults
+        Taxels left out of every frame.
+    pressure_window_kpa
+        Frames whose mean lies outside are left out.
+    normalise
+        ``"mean"`` or ``"none"``. A gain a frame needs all frames at once: see `tactile_bayes.mapping.build_map`.
+    """
+
+    head: HeadGeometry
+    element_calibration: ElementCalibration
+    faults: Sequence[TaxelFault] = ()
+    pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
+    normalise: str = "mean"
+    readout: Readout = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.normalise not in ("mean", "none"):
+            raise UsageError(f"frames cannot be added one by one with normalise {self.normalise!r}; use mean or none")
+        object.__setattr__(self, "readout", Readout.of(self.element_calibration, self.good))
+
+    @property
+    def good(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """(rows, columns) True for taxels that are used."""
+        good = np.ones(self.head.shape, dtype=bool)
+        for fault in self.faults:
+            good[fault.row, fault.column] = False
+        return good
+
+    def differs(self, other: Instrument) -> str:
+        """The name of the first thing that differs, or nothing."""
+        arrays = (
+            ("head", self.head.surface_mm, other.head.surface_mm),
+            ("lever arm", self.head.scanhead_from_tracker, other.head.scanhead_from_tracker),
+            ("element calibration", self.readout.gain_kpa, other.readout.gain_kpa),
+            ("element calibration", self.readout.offset_kpa, other.readout.offset_kpa),
+            ("set of taxels left out", self.readout.taxels, other.readout.taxels),
+            ("saturation count", np.array(self.readout.full_count), np.array(other.readout.full_count)),
+            ("pressure window", np.array(self.pressure_window_kpa), np.array(other.pressure_window_kpa)),
+            ("way to normalise", np.array(self.normalise), np.array(other.normalise)),
+        )
+        return next((name for name, one, two in arrays if not np.array_equal(one, two)), "")
+
+
+class MapAccumulator:
+    """Frames go in, in any portions and any order; a map comes out at any time.
+
+    Parameters
+    ----------
+    grid
+        Where the cells lie.
+    instrument
+        Head, calibration, gate and way to normalise.
+    keep_frames
+        Keep counts and poses (0.9 kB a frame of 416 taxels), which `rebuild` needs. Without, memory does not grow.
+    engine
+        Which inner loops to use.
+
+    Notes
+    -----
+    Everything that is added up is a whole number of tiny steps (`CellSums`, `HeadMoments`, `Readout`), so neither
+    portions nor order leave a trace.
+    """
+
+    def __init__(
+        self, grid: MapGrid, instrument: Instrument, *, keep_frames: bool = True, engine: Engine | None = None
+    ) -> None:
+        self.grid, self.instrument = grid, instrument
+        self._engine = engine or NumpyEngine()
+        self._sums = CellSums(grid.cell_mm)
+        self._projector = Projector(
+            instrument.head, plane_from_base=grid.plane_from_base, taxels=instrument.good, cell_mm=grid.cell_mm
+        )
+        self._moments, self._merged = MomentSums(instrument.head), HeadMoments.none()
+        self._tally = dict.fromkeys(_TALLIES, 0)
+        self._saturated = 0
+        self._kept: list[tuple[CountArray, FramePoses]] | None = [] if keep_frames else None
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Frames and readings so far, used and left out by reason."""
+        more = {
+            "saturated_readings": self._saturated,
+            "clipped_values": self._sums.clipped,
+            "negative_readings": self._sums.negative,
+            "masked_taxels": len(self.instrument.faults),
+        }
+        return {name: float(value) for name, value in (self._tally | more).items()}
+
+    def add(self, counts: CountArray, poses: FramePoses) -> int:
+        """Add frames.
+
+        Parameters
+        ----------
+        counts : (n, rows, columns) uint16 array
+        poses
+            The n poses at the frames' times.
+
+        Returns
+        -------
+        int
+            Frames used.
+        """
+        if counts.dtype != np.uint16 or counts.shape != (len(poses.known), *self.instrument.head.shape):
+            raise BadDataError(
+                f"counts is {counts.dtype} of shape {counts.shape} for {len(poses.known)} poses",
+                way_out="give uint16 (n, rows, columns), one pose a frame",
+            )
+        if self._kept is not None:
+            self._kept.append((counts, poses))
+        size = self._engine.chunk_frames(self.instrument.readout.size)
+        return sum(self._add(counts[part], poses.part(part)) for part in chunks(len(counts), size))
+
+    def _add(self, counts: CountArray, poses: FramePoses) -> int:
+        instrument, readings = self.instrument, self.instrument.readout.counts(counts)
+        level, share = self._engine.levels(instrument.readout, readings)
+        low, high, used = gate(poses.known, level, share, pressure_window_kpa=instrument.pressure_window_kpa)
+        number = int(np.count_nonzero(used))
+        refused = int(np.count_nonzero(low)), int(np.count_nonzero(high))
+        unknown = len(counts) - int(np.count_nonzero(poses.known))
+        tallies = (len(counts), number, unknown, len(counts) - number - sum(refused) - unknown, *refused)
+        for name, value in zip(_TALLIES, tallies, strict=True):
+            self._tally[name] += value
+        if number < len(counts):
+            readings, poses, level, share = readings[used], poses.part(used), level[used], share[used]
+        if number:
+            self._scatter(readings, poses, level)
+            taxels, array = len(instrument.readout.taxels), instrument.readout.size
+            self._saturated += int(np.rint((taxels - share * array).sum()))
+        return number
+
+    def _scatter(self, readings: CountArray, poses: FramePoses, level: FloatArray) -> None:
+        readout, normalise = self.instrument.readout, self.instrument.normalise
+        self._moments.add(poses)
+        divisor = level if normalise == "mean" else np.ones(len(level))
+        self._engine.add(self._sums, readout, readings, projection=self._projector.at(poses), level=divisor)
+
+    def merge(self, other: MapAccumulator) -> None:
+        """Add all that another one was given.
+
+        Raises
+        ------
+        BadDataError
+            When its cells, plane, head, calibration or rules differ: its sums mean something else.
+        """
+        differs = "" if self.grid.same(other.grid) else "plane or cell size"
+        differs = differs or self.instrument.differs(other.instrument)
+        if differs:
+            raise BadDataError(
+                f"maps of another {differs} cannot be merged", way_out="build both with the same one, or rebuild one"
+            )
+        self._sums.merge(other._sums)
+        self._merged = self._merged + other._all_moments()
+        self._saturated += other._saturated
+        for name in _TALLIES:
+            self._tally[name] += other._tally[name]
+        self._kept = None if self._kept is None or other._kept is None else self._kept + other._kept
+
+    def plane(self) -> Plane:
+        """Best-fit plane of the frames used so far.
+
+        Raises
+        ------
+        BadDataError
+            When no frame was used, or they span no plane; see `HeadMoments.plane`.
+        """
+        moments = self._all_moments()
+        if not moments.count:
+            raise BadDataError("no frame was used yet", way_out="press within the window and move the head")
+        return moments.plane()
+
+    def _all_moments(self) -> HeadMoments:
+        moments = self._moments.moments()
+        return self._merged + moments if self._merged.count else moments
+
+    def rebuild(self, plane: Plane | None = None) -> MapAccumulator:
+        """A new one with the frames kept so far, on another plane: by default the best-fit plane of them.
+
+        Raises
+        ------
+        UsageError
+            When the frames were not kept.
+        """
+        if self._kept is None:
+            raise UsageError("the frames were not kept; make the accumulator with keep_frames=True")
+        grid = MapGrid((plane or self.plane()).plane_from_base, self.grid.cell_mm)
+        anew = MapAccumulator(grid, self.instrument, engine=self._engine)
+        for counts, poses in self._kept:
+            anew.add(counts, poses)
+        return anew
+
+    def snapshot(self) -> TactileMap:
+        """The map so far; later frames do not change it. Without a frame it has no cell."""
+        sums, instrument = self._sums.trimmed(), self.instrument
+        mean = sums.mean()
+        window = (float(instrument.pressure_window_kpa[0]), float(instrument.pressure_window_kpa[1]))
+        return TactileMap(
+            mean=mean,
+            variance=sums.variance(mean),
+            count=sums.count,
+            x_mm=sums.x_mm(),
+            y_mm=sums.y_mm(),
+            recipe=MapRecipe("scan", instrument.normalise, float(self.grid.cell_mm), window),
+            plane_from_base=self.grid.plane_from_base,
+            background=None if instrument.normalise == "none" else 1.0,
+            frame_count=self._tally["frames_used"],
+            quality=self.figures,
+            masked_taxels=tuple(str(fault) for fault in instrument.faults),
+        )
