@@ -1,0 +1,169 @@
+"""The scan head's packets, and a tracker's in the same framing: what each payload holds and how it is read.
+
+All numbers are little-endian. Kinds below 128 go from the device to the host, the others from the host to the device.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import numpy as np
+
+from tactile_bayes.errors import DeviceError
+from tactile_bayes.hardware.framing import Packet, PacketParser, encode_packet
+from tactile_bayes.hardware.readings import (
+    CountArray,
+    EndReading,
+    FrameReading,
+    HelloReading,
+    PoseReading,
+    Reading,
+    SequenceCheck,
+)
+
+HELLO: Final = 1
+FRAME: Final = 2
+END: Final = 3
+POSE: Final = 4
+ASK: Final = 128
+START: Final = 129
+STOP: Final = 130
+
+BITS_PER_BYTE_8N1: Final = 10
+DEFAULT_BAUD: Final = 2_000_000
+_HELLO: Final = struct.Struct("<BBHI")  # rows, columns, saturation count, frames per 1000 s
+_END: Final = struct.Struct("<II")  # sent, dropped
+_POSE: Final = struct.Struct("<H7d")  # ns beyond the header's microseconds, x y z mm, w x y z
+_MAX_ID: Final = 64
+
+
+def encode_hello(hello: HelloReading, *, sequence: int = 0, device_us: int = 0) -> bytes:
+    """Who the device is: rows and columns (0 for a tracker), saturation count, rate, name."""
+    numbers = _HELLO.pack(hello.rows, hello.columns, hello.saturation_count, round(hello.rate_hz * 1000))
+    name = hello.device_id.encode()[:_MAX_ID]
+    return encode_packet(HELLO, numbers + name, sequence=sequence, device_us=device_us)
+
+
+def encode_frame(counts: CountArray, *, sequence: int, device_us: int) -> bytes:
+    """One (rows, columns) frame: row after row, each along the head."""
+    return encode_packet(FRAME, counts.astype("<u2").tobytes(), sequence=sequence, device_us=device_us)
+
+
+def encode_end(sent: int, dropped: int, *, sequence: int = 0, device_us: int = 0) -> bytes:
+    """The device stops, and says what it sent and what it could not send."""
+    return encode_packet(END, _END.pack(sent, dropped), sequence=sequence, device_us=device_us)
+
+
+def encode_pose(pose: PoseReading, *, sequence: int) -> bytes:
+    """A pose without rounding: doubles in mm, and the nanoseconds that the header's microseconds leave."""
+    device_us, rest_ns = divmod(pose.device_ns or 0, 1000)
+    payload = _POSE.pack(rest_ns, *pose.position_mm, *pose.quaternion_wxyz)
+    return encode_packet(POSE, payload, sequence=sequence, device_us=device_us)
+
+
+def encode_command(kind: int, *, every: int = 1) -> bytes:
+    """`ASK`, `START` (send every n-th frame) or `STOP`."""
+    payload = struct.pack("<B", every) if kind == START else b""
+    return encode_packet(kind, payload, sequence=0, device_us=0)
+
+
+class HeadParser:
+    """Readings of a device that speaks the open framing, head or tracker."""
+
+    def __init__(self, *, every: int = 1) -> None:
+        self.packets = PacketParser()
+        self.sequence = SequenceCheck()
+        self.hello: HelloReading | None = None
+        self.misfits = 0
+        self._every = every
+
+    @property
+    def garbage_bytes(self) -> int:
+        """Bytes that belong to no valid packet."""
+        return self.packets.counts.damaged_bytes
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Readings that are complete with `data`; a packet whose payload does not fit its kind is counted."""
+        found = []
+        for packet in self.packets.feed(data):
+            reading = self._read(packet)
+            if reading is not None:
+                found.append(reading)
+        return found
+
+    def _read(self, packet: Packet) -> Reading | None:
+        match packet.kind:
+            case 2:
+                return self._frame(packet)
+            case 4:
+                return self._pose(packet)
+            case 1:
+                return self._hello(packet)
+            case 3 if len(packet.payload) >= _END.size:
+                return EndReading(*_END.unpack_from(packet.payload))
+            case _:
+                self.misfits += 1
+                return None
+
+    def _frame(self, packet: Packet) -> FrameReading | None:
+        shape = (self.hello.rows, self.hello.columns) if self.hello else None
+        if shape is None or len(packet.payload) != 2 * shape[0] * shape[1]:
+            self.misfits += 1
+            return None
+        lost = self.sequence.missing_before(packet.sequence // self._every)
+        counts = np.frombuffer(packet.payload, dtype="<u2").reshape(shape)
+        return FrameReading(counts, packet.device_us * 1000, lost)
+
+    def _pose(self, packet: Packet) -> PoseReading | None:
+        if len(packet.payload) != _POSE.size:
+            self.misfits += 1
+            return None
+        self.sequence.missing_before(packet.sequence)
+        rest_ns, x, y, z, qw, qx, qy, qz = _POSE.unpack(packet.payload)
+        return PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns)
+
+    def _hello(self, packet: Packet) -> HelloReading | None:
+        if len(packet.payload) < _HELLO.size:
+            self.misfits += 1
+            return None
+        rows, columns, saturation, millihertz = _HELLO.unpack_from(packet.payload)
+        name = packet.payload[_HELLO.size :].decode("utf-8", "replace")
+        self.hello = HelloReading(name, rows, columns, saturation, millihertz / 1000)
+        return self.hello
+
+
+def frame_bytes_on_wire(taxels: int) -> int:
+    """The most bytes that one frame can take: header, checksum, stuffing, a zero byte at each end."""
+    body = 14 + 2 * taxels + 4
+    return body + body // 254 + 1 + 2
+
+
+def needed_baud(taxels: int, *, rate_hz: float) -> int:
+    """Line rate in baud that the frames need, with a start and a stop bit for each byte."""
+    return round(frame_bytes_on_wire(taxels) * rate_hz * BITS_PER_BYTE_8N1)
+
+
+def check_link_rate(hello: HelloReading, *, baud: int, every: int = 1, port: str = "head") -> None:
+    """Refuse a line too slow for the head's frames.
+
+    Parameters
+    ----------
+    every
+        The head sends every n-th frame.
+    port
+        Named in the message.
+
+    Raises
+    ------
+    DeviceError
+        With the line rate that is needed and the decimation that would fit.
+    """
+    need = needed_baud(hello.rows * hello.columns, rate_hz=hello.rate_hz / every)
+    if need <= baud:
+        return
+    fits = int(np.ceil(needed_baud(hello.rows * hello.columns, rate_hz=hello.rate_hz) / baud))
+    raise DeviceError(
+        f"{port}: {hello.rows} x {hello.columns} taxels at {hello.rate_hz / every:g} Hz need {need / 1e6:.2f} Mbaud, "
+        f"the line has {baud / 1e6:g}; raise it with --head-baud, or give --every {fits}"
+    )

@@ -1,0 +1,96 @@
+"""OpenIGTLink TRANSFORM messages, as PlusServer and 3D Slicer send them over TCP: messages to poses.
+
+A message is a header of 58 bytes and a body, big-endian, with a CRC-64 of the body. A transform's body is the 3 x 4
+matrix column by column, float32, in mm.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import numpy as np
+
+from tactile_bayes.geometry import quaternion_from_rotation
+from tactile_bayes.hardware.readings import PoseReading, Reading
+
+PORT: Final = 18944
+_HEADER: Final = struct.Struct(">H12s20sIIQQ")  # version, type, device, s, fraction, body size, CRC
+_BODY: Final = struct.Struct(">12f")
+_POLYNOMIAL: Final = 0x42F0E1EBA9EA3693
+_LONGEST: Final = 1 << 20
+_RIGID_SLACK: Final = 0.02
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 56
+        for _ in range(8):
+            crc = (crc << 1 ^ (_POLYNOMIAL if crc >> 63 else 0)) & 0xFFFF_FFFF_FFFF_FFFF
+        table.append(crc)
+    return tuple(table)
+
+
+_TABLE: Final = _crc_table()
+
+
+def crc64(data: bytes) -> int:
+    """CRC-64 (ECMA-182) with initial value 0, as OpenIGTLink uses it."""
+    crc = 0
+    for byte in data:
+        crc = (crc << 8 ^ _TABLE[crc >> 56 ^ byte]) & 0xFFFF_FFFF_FFFF_FFFF
+    return crc
+
+
+class IgtlinkParser:
+    """TRANSFORM messages of one device name (any, when empty); other messages are passed over."""
+
+    def __init__(self, *, device: str = "") -> None:
+        self.garbage_bytes = 0
+        self._device = device.encode()
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Poses that are complete with `data`."""
+        buffer, place = self._rest + data, 0
+        found: list[Reading] = []
+        while len(buffer) - place >= _HEADER.size:
+            version, kind, device, seconds, fraction, size, crc = _HEADER.unpack_from(buffer, place)
+            if not 1 <= version <= 3 or size > _LONGEST or not kind.rstrip(b"\0").isalnum():
+                place += 1
+                self.garbage_bytes += 1
+                continue
+            end = place + _HEADER.size + size
+            if end > len(buffer):
+                break
+            body = buffer[place + _HEADER.size : end]
+            if crc64(body) != crc:
+                place += 1
+                self.garbage_bytes += 1
+                continue
+            place = end
+            wanted = not self._device or device.rstrip(b"\0") == self._device
+            if kind.rstrip(b"\0") == b"TRANSFORM" and size == _BODY.size and wanted:
+                found += _pose(body, seconds, fraction)
+        self._rest = buffer[place:]
+        return found
+
+
+def _pose(body: bytes, seconds: int, fraction: int) -> list[Reading]:
+    columns = np.array(_BODY.unpack(body), dtype=np.float64).reshape(4, 3)
+    rotation, position = columns[:3].T, columns[3]
+    if not np.isfinite(columns).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_SLACK:
+        return []
+    w, i, j, k = (float(value) for value in quaternion_from_rotation(rotation))
+    x, y, z = (float(value) for value in position)
+    device_ns = seconds * 1_000_000_000 + (fraction * 1_000_000_000 >> 32)
+    return [PoseReading((x, y, z), (w, i, j, k), device_ns)]
+
+
+def encode_transform(pose: PoseReading, rotation: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bytes:
+    """The message of a pose whose rotation matrix is given too."""
+    body = _BODY.pack(*rotation.T.ravel(), *pose.position_mm)
+    seconds, rest_ns = divmod(pose.device_ns or 0, 1_000_000_000)
+    fraction = -(-(rest_ns << 32) // 1_000_000_000)  # rounded up, so that whole nanoseconds come back
+    return _HEADER.pack(1, b"TRANSFORM", b"Tracker", seconds, fraction, len(body), crc64(body)) + body

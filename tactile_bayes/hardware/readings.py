@@ -1,0 +1,103 @@
+"""What devices say, whatever their protocol: frames, poses, who they are and when they stop."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+CountArray = NDArray[np.uint16]
+MM_PER_INCH = 25.4
+
+
+class FrameReading(NamedTuple):
+    """One frame of the array.
+
+    Parameters
+    ----------
+    counts : (rows, columns) uint16 array
+    device_ns
+        The head's clock.
+    lost
+        Frames missing just before this one, by the sequence numbers.
+    """
+
+    counts: CountArray
+    device_ns: int
+    lost: int = 0
+
+
+class PoseReading(NamedTuple):
+    """One pose of the tracker's sensor in `base`.
+
+    Parameters
+    ----------
+    position_mm
+        Converted from the device's unit.
+    quaternion_wxyz
+        Scalar first, as the device gave it: not normalised, sign free.
+    device_ns
+        The tracker's clock; None when the protocol carries none.
+    flags
+        What the device said against this pose, for example ``"error W"`` or ``"distortion 12"``.
+    station
+        Number of the sensor.
+    """
+
+    position_mm: tuple[float, float, float]
+    quaternion_wxyz: tuple[float, float, float, float]
+    device_ns: int | None = None
+    flags: tuple[str, ...] = ()
+    station: int = 1
+
+
+class HelloReading(NamedTuple):
+    """Who a device is, in its own words."""
+
+    device_id: str
+    rows: int
+    columns: int
+    saturation_count: int
+    rate_hz: float
+
+
+class EndReading(NamedTuple):
+    """The device has stopped by itself, with its own account of what it measured and what it had to drop."""
+
+    sent: int
+    dropped: int
+
+
+Reading = FrameReading | PoseReading | HelloReading | EndReading
+
+
+class Parser(Protocol):
+    """Bytes as they come in, readings out."""
+
+    @property
+    def garbage_bytes(self) -> int:
+        """Bytes so far that belong to no valid record."""
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Readings that are complete with `data`."""
+
+
+class SequenceCheck:
+    """Counts what is missing by a counter of 32 bits that wraps."""
+
+    def __init__(self) -> None:
+        self._expected: int | None = None
+        self.lost = 0
+        self.restarts = 0
+
+    def missing_before(self, sequence: int) -> int:
+        """How many are missing just before `sequence`; a counter that goes back is a restart, not a loss."""
+        expected = sequence if self._expected is None else self._expected
+        gap = (sequence - expected) % 2**32
+        self._expected = (sequence + 1) % 2**32
+        if gap >= 2**31:
+            self.restarts += 1
+            return 0
+        self.lost += gap
+        return gap
