@@ -61,6 +61,7 @@ def size(
     import numpy as np
 
     from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_size_calibration
@@ -73,8 +74,11 @@ def size(
     rows = read_table(table, "size_table.table.json")
     recipe = Recipe(normalise, background, fit_radius_mm, declared=True)
     rng = np.random.default_rng(seed)
-    with progress_bar("effective draws") as progress:
-        calibration = learn_size_calibration(size_table(rows), recipe=recipe, rng=rng, progress=progress)
+    try:
+        with progress_bar("effective draws") as progress:
+            calibration = learn_size_calibration(size_table(rows), recipe=recipe, rng=rng, progress=progress)
+    except BadDataError as error:
+        raise error.at(table) from None
     settings = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm}
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, calibration, provenance=provenance, force=force)

@@ -145,6 +145,9 @@ def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], calibration: Pat
     """Stop before any work is done if an output cannot be written or would destroy an input."""
     from tactile_bayes.files.atomic import refuse_existing
 
+    twice = [path for index, path in enumerate(maps) if path in maps[:index]]
+    if twice:
+        raise UsageError(f"{twice[0]} is given twice; give each map once")
     if outputs and len(maps) > 1:
         raise UsageError("--output and the figures take one map at a time; use --json for several")
     if len({path.absolute() for path in outputs}) < len(outputs):

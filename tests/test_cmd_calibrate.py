@@ -1,0 +1,90 @@
+"""`calibrate size` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import numpy as np
+import pytest
+
+import tactile_bayes
+from tactile_bayes.files.size_json import read_size_calibration
+
+Run = Callable[..., "CompletedProcess[str]"]
+PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
+
+
+def rows(n: int = 12, *, header: str = "d_mm,amplitude,sigma_x_mm") -> str:
+    """A table by Eq 6 with m/e = 2.5, b = 1 mm, f = -0.3 and 3 % of scatter."""
+    rng = np.random.default_rng(95)
+    a, sigma = np.exp(rng.uniform(-3, -0.3, n)), rng.uniform(3, 9, n)
+    d = (2.5 * sigma * a**0.3 + 1.0) * np.exp(0.03 * rng.standard_normal(n))
+    return "\n".join([header, *(f"{x:.6g},{y:.6g},{z:.6g}" for x, y, z in zip(d, a, sigma, strict=True))]) + "\n"
+
+
+def test_phantoms_become_a_calibration(run_cli: Run, tmp_path: Path) -> None:
+    options = ("--normalise", "gain", "--background", "free", "--fit-radius-mm", 15, "--seed", 4)
+    done = run_cli("calibrate", "size", PHANTOMS, "-o", "size.json", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for words in (
+        "Eq 6: d = m sigma / (e a^f) + b",
+        "r2 of ln d",
+        "recipe (declared): normalise gain, background free, fit radius 15 mm",
+        "Research use only",
+    ):
+        assert words in done.stdout
+    path = tmp_path / "size.json"
+    assert path.stat().st_mode & 0o777 == 0o600
+    found = read_size_calibration(path)
+    assert (found.recipe.normalise, found.recipe.background, found.recipe.radius_mm) == ("gain", "free", 15.0)
+    assert found.recipe.declared is True
+    provenance = json.loads(path.read_text())["provenance"]
+    assert provenance["seed"] == 4
+    assert [one["role"] for one in provenance["inputs"]] == ["table"]
+
+
+def test_a_small_table_without_depths_teaches_the_ratio(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(rows(30))
+    done = run_cli("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "e is 1 by convention" in done.stdout
+    m, b, e, f = read_size_calibration(tmp_path / "size.json").x.draws[:, :4].mean(axis=0)
+    assert (m, e) == (pytest.approx(2.5, rel=0.1), 1.0)
+    assert f == pytest.approx(-0.3, abs=0.04)
+    assert b == pytest.approx(1.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (rows(5), "at least 8"),
+        ("d_mm,amplitude\n1,2\n", "sigma_x_mm"),
+        ("", "t.csv"),
+        (rows(3).replace("\n", "\nabc,0.3,5\n", 1), "abc"),
+        (rows(9).replace("\n", "\n-3,0.3,5\n", 1), "-3"),
+        ("d_mm,amplitude,sigma_x_mm\n", "t.csv"),
+        (
+            "d_mm,amplitude,sigma_x_mm,sigma_y_mm\n" + "\n".join(f"{i + 5},0.{i + 1},{i + 3}," for i in range(8)) + "4",
+            "blank in some rows",
+        ),
+    ],
+)
+def test_a_bad_table_is_named_by_its_fault(run_cli: Run, tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    done = run_cli("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert words in done.stderr
+    assert "t.csv" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "size.json").exists()
+
+
+def test_an_existing_calibration_is_left_alone_without_force(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(rows())
+    (tmp_path / "size.json").write_text("mine")
+    done = run_cli("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
+    assert done.returncode == 2
+    assert (tmp_path / "size.json").read_text() == "mine"

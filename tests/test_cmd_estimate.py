@@ -1,0 +1,225 @@
+"""`estimate` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+from posterior_files import write_calibration, write_maps
+
+from tactile_bayes.files.schema import check_document, load_schema
+from tactile_bayes.posterior.size_calibration import Recipe
+
+Run = Callable[..., "CompletedProcess[str]"]
+FAST = ("--method", "laplace")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("estimate")
+    write_maps(place)
+    write_calibration(place / "size.json")
+    write_calibration(place / "other.json", Recipe(normalise="gain", radius_mm=15.0))
+    return place
+
+
+@pytest.fixture(scope="module")
+def alone(run_cli: Run, folder: Path) -> dict[str, str]:
+    """What each map gives by itself, as JSON text."""
+    return {
+        name: run_cli("estimate", f"{name}.nc", *FAST, "--size-calibration", "size.json", "--json", cwd=folder).stdout
+        for name in ("a", "b", "empty")
+    }
+
+
+@pytest.fixture(scope="module")
+def ensemble_run(run_cli: Run, folder: Path) -> CompletedProcess[str]:
+    """One run of the default method, with its draws."""
+    return run_cli("estimate", "a.nc", "--size-calibration", "size.json", "-o", "post.nc", cwd=folder)
+
+
+def test_json_has_every_documented_key_and_passes_its_schema(alone: dict[str, str]) -> None:
+    schema = load_schema("estimate.schema.json")
+    for text in alone.values():
+        document = json.loads(text)
+        assert set(schema["required"]) <= set(document)
+        check_document(document, "estimate.schema.json", path=Path("stdout"))
+    found = json.loads(alone["a"])
+    assert found["status"] == "estimate"
+    for name in ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"):
+        quantity = found[name]
+        assert quantity["low"] < quantity["median"] < quantity["high"], name
+        assert (quantity["probability"], quantity["kind"]) == (0.95, "eti")
+    assert found["sigma_x_mm"]["median"] == pytest.approx(6.0, abs=0.3)
+    assert {one["role"] for one in found["provenance"]["inputs"]} == {"map", "size_calibration"}
+    assert "time" not in json.dumps(found["provenance"])
+
+
+def test_a_document_out_of_order_would_not_pass(alone: dict[str, str]) -> None:
+    document = json.loads(alone["a"])
+    document["amplitude"].pop("kind")
+    with pytest.raises(ValueError, match="amplitude"):
+        check_document(document, "estimate.schema.json", path=Path("stdout"))
+
+
+def test_text_tells_the_size_its_interval_and_what_was_left_out(ensemble_run: CompletedProcess[str]) -> None:
+    assert ensemble_run.returncode == 0, ensemble_run.stderr
+    for words in (
+        "95 % interval (equal-tailed)",
+        "largest size",
+        "Probability of a lump: 1.000.",
+        "Variance of the largest size:",
+        "Method ensemble: R-hat 1.0",
+        "Left out: ",
+        "Research use only",
+    ):
+        assert words in ensemble_run.stdout
+    assert ensemble_run.stderr == ""
+
+
+def test_the_draws_open_in_arviz(ensemble_run: CompletedProcess[str], folder: Path) -> None:
+    assert ensemble_run.returncode == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+    data = arviz.from_netcdf(str(folder / "post.nc"))
+    posterior = data.posterior
+    assert posterior.sizes["chain"] == 4
+    assert posterior.sizes["draw"] >= 1000
+    np.testing.assert_array_equal(
+        posterior["max_size_mm"], np.maximum(posterior["d_x_mm"].values, posterior["d_y_mm"].values)
+    )
+    printed = next(line for line in ensemble_run.stdout.splitlines() if line.startswith("map width sigma_x"))
+    median = float(np.median(posterior["sigma_x_mm"]))
+    assert float(printed.split()[3]) == pytest.approx(median, abs=0.006)
+    assert json.loads(posterior.attrs["provenance"])["seed"] == 1
+    assert "created_at" not in data.attrs
+    assert "created_at" not in posterior.attrs
+    assert (folder / "post.nc").stat().st_mode & 0o777 == 0o600
+    data.close()
+
+
+def test_no_lump_is_an_answer_with_its_reason_and_exit_6(run_cli: Run, folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "p.nc"
+    done = run_cli("estimate", "empty.nc", *FAST, "-o", output, cwd=folder)
+    assert done.returncode == 6
+    assert done.stdout.startswith("No estimate: ")
+    assert "Research use only" in done.stdout
+    assert not output.exists()
+
+
+def test_the_scan_without_a_mass_gives_no_estimate(run_cli: Run, shared_data: Path, tmp_path: Path) -> None:
+    source = shared_data / "scans" / "s08_no_mass.npz"
+    assert run_cli("import", source, "-o", "s.mcap", cwd=tmp_path).returncode == 0
+    assert run_cli("map", "s.mcap", "-o", "m.nc", cwd=tmp_path).returncode == 0
+    done = run_cli("estimate", "m.nc", *FAST, "--json", cwd=tmp_path)
+    assert done.returncode == 6
+    document = json.loads(done.stdout)
+    assert document["status"] == "no_estimate"
+    assert document["reason"]
+    assert document["max_size_mm"] is None
+
+
+def test_several_maps_keep_their_order_and_answers(run_cli: Run, folder: Path, alone: dict[str, str]) -> None:
+    names = ("b", "empty", "a")
+    options = (*FAST, "--size-calibration", "size.json", "--json")
+    one = run_cli("estimate", *(f"{n}.nc" for n in names), *options, cwd=folder)
+    two = run_cli("estimate", *(f"{n}.nc" for n in names), *options, "--workers", 2, cwd=folder)
+    assert json.loads(one.stdout) == [json.loads(alone[name]) for name in names]
+    assert one.returncode == two.returncode == 6
+    assert one.stdout == two.stdout
+
+
+def test_a_broken_map_is_named_and_the_rest_kept(run_cli: Run, folder: Path, alone: dict[str, str]) -> None:
+    options = (*FAST, "--size-calibration", "size.json", "--json")
+    done = run_cli("estimate", "a.nc", "broken.nc", "b.nc", *options, cwd=folder)
+    assert done.returncode == 3
+    assert done.stderr.startswith("error: broken.nc: ")
+    assert done.stderr.count("\n") == 1
+    assert json.loads(done.stdout) == [json.loads(alone["a"]), json.loads(alone["b"])]
+
+
+def test_the_narrower_interval_lies_within_the_wider(run_cli: Run, folder: Path, alone: dict[str, str]) -> None:
+    options = (*FAST, "--size-calibration", "size.json", "--json", "--interval", 0.5)
+    half: dict[str, Any] = json.loads(run_cli("estimate", "a.nc", *options, cwd=folder).stdout)
+    wide: dict[str, Any] = json.loads(alone["a"])
+    for name in ("max_size_mm", "amplitude", "sigma_y_mm"):
+        assert half[name]["probability"] == 0.5
+        assert wide[name]["low"] < half[name]["low"] < half[name]["high"] < wide[name]["high"]
+        assert half[name]["median"] == wide[name]["median"]
+
+
+def test_another_recipe_is_refused_with_the_difference(run_cli: Run, folder: Path) -> None:
+    done = run_cli("estimate", "a.nc", *FAST, "--size-calibration", "other.json", cwd=folder)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr.count("\n") == 1
+    assert "a.nc" in done.stderr
+    assert "normalise mean (the calibration: gain)" in done.stderr
+    # the radius was not given, so it is the calibration's and does not differ
+    assert "fit radius" not in done.stderr
+
+
+def test_not_converged_is_exit_5_with_advice(run_cli: Run, folder: Path) -> None:
+    done = run_cli("estimate", "a.nc", "--max-steps", 150, cwd=folder)
+    assert (done.returncode, done.stdout) == (5, "")
+    assert done.stderr.count("\n") == 1
+    assert "--max-steps" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["none.nc"], 3, "none.nc"),
+        (["size.json"], 3, "size.json"),
+        (["a.nc", "--size-calibration", "none.json"], 3, "none.json"),
+        (["a.nc", "--size-calibration", "a.nc"], 3, "a.nc"),
+        (["a.nc", "b.nc", "-o", "p.nc"], 2, "one map at a time"),
+        (["a.nc", "b.nc", "a.nc"], 2, "a.nc is given twice"),
+        (["a.nc", "-o", "a.nc", "--force"], 2, "is an input"),
+        (["a.nc", "-o", "x", "--figure", "x"], 2, "one name"),
+        (["a.nc", "-o", "no/p.nc"], 2, "not a directory"),
+        (["a.nc", "--interval", "1"], 2, "--interval"),
+        (["a.nc", "--fit-radius-mm", "0"], 2, "--fit-radius-mm"),
+        (["a.nc", "--figure", "f.png"], 2, "--size-calibration"),
+        ([], 2, "MAP.nc"),
+    ],
+)
+def test_mistakes_end_in_their_code_and_leave_nothing(
+    run_cli: Run, folder: Path, arguments: list[str], code: int, words: str
+) -> None:
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    done = run_cli("estimate", *arguments, *FAST, cwd=folder)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("option", ["-o", "--figure", "--map-figure"])
+def test_existing_outputs_are_left_alone_without_force(run_cli: Run, folder: Path, tmp_path: Path, option: str) -> None:
+    output = tmp_path / "mine.png"
+    output.write_text("mine")
+    done = run_cli("estimate", "a.nc", *FAST, "--size-calibration", "size.json", option, output, cwd=folder)
+    assert done.returncode == 2
+    assert "--force" in done.stderr
+    assert output.read_text() == "mine"
+
+
+def test_a_camera_image_can_be_estimated(run_cli: Run, shared_data: Path, tmp_path: Path) -> None:
+    """The way for a picture: import it as a map, fit a free background within a radius that holds the beam."""
+    picture = shared_data / "laserbeam" / "laserbeam_astigmatic.tif"
+    made = run_cli("import", picture, "--as", "map", "--spacing-mm", 0.1, "-o", "beam.nc", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    options = ("--background", "free", "--fit-radius-mm", 10, "--rotation", "on", "--json")
+    done = run_cli("estimate", "beam.nc", *FAST, *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["sigma_x_mm"]["median"] == pytest.approx(3.30, abs=0.05)
+    assert found["sigma_y_mm"]["median"] == pytest.approx(2.62, abs=0.05)
+    assert found["angle_deg"]["median"] == pytest.approx(9.1, abs=2.0)

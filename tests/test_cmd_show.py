@@ -1,0 +1,104 @@
+"""`show` on every kind of file, as text and as JSON."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import pytest
+from posterior_files import write_calibration, write_maps
+
+import tactile_bayes
+
+Run = Callable[..., "CompletedProcess[str]"]
+DEMO = Path(tactile_bayes.__file__).parent / "demo"
+
+# file: schema, kind, words of the text
+KINDS = {
+    "scan.mcap": ("tactile-bayes/scan/1", "scan", "frame_rate_hz"),
+    "a.nc": ("tactile-bayes/map/1", "map", "covered_cells"),
+    "post.nc": ("tactile-bayes/posterior/1", "posterior", "sigma_x_mm"),
+    "size.json": ("tactile-bayes/size-calibration/1", "size calibration", "residual_correlation"),
+    "one.json": ("tactile-bayes/estimate/1", "estimate", "detected_probability"),
+    "many.json": ("tactile-bayes/estimate/1", "list", "length"),
+    "report.json": ("tactile-bayes/validate/1", "validate", "provenance"),
+    "trial.csv": (None, "table: trial", "rows"),
+    "excision.csv": (None, "table: excision", "rows"),
+    "phantoms.csv": ("tactile-bayes/size_table/1", "table: size table", "rows"),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(run_cli: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("show")
+    write_maps(place)
+    write_calibration(place / "size.json")
+    for name in ("scan.mcap", "trial.csv", "excision.csv", "phantoms.csv"):
+        shutil.copyfile(DEMO / name, place / name)
+    fast = ("--method", "laplace", "--size-calibration", "size.json", "--json")
+    one = run_cli("estimate", "a.nc", *fast, "-o", "post.nc", cwd=place)
+    many = run_cli("estimate", "a.nc", "b.nc", *fast, cwd=place)
+    (place / "one.json").write_text(one.stdout)
+    (place / "many.json").write_text(many.stdout)
+    report = run_cli("validate", "trial.csv", "--excision", "excision.csv", "-o", "report.json", cwd=place)
+    assert (one.returncode, many.returncode, report.returncode) == (0, 0, 0), report.stderr
+    return place
+
+
+@pytest.mark.parametrize("name", list(KINDS))
+def test_every_kind_of_file_is_known(run_cli: Run, folder: Path, name: str) -> None:
+    schema, kind, words = KINDS[name]
+    text = run_cli("show", name, cwd=folder)
+    plain = run_cli("show", name, "--json", cwd=folder)
+    assert (text.returncode, plain.returncode) == (0, 0), text.stderr + plain.stderr
+    assert words in text.stdout
+    assert text.stdout.rstrip().endswith("Research use only: not a diagnostic device.")
+    found = json.loads(plain.stdout)
+    assert found["kind"] == kind
+    if schema is not None:
+        assert found["schema"] == schema
+    assert text.stderr == plain.stderr == ""
+
+
+def test_a_map_tells_its_shape_and_recipe(run_cli: Run, folder: Path) -> None:
+    found = json.loads(run_cli("show", "a.nc", "--json", cwd=folder).stdout)
+    assert found["shape"] == {"ny": 51, "nx": 51}
+    assert found["extent_mm"] == {"x": 51.0, "y": 51.0}
+    assert found["covered_cells"] == 2601
+    assert found["recipe"]["normalise"] == "mean"
+
+
+def test_a_posterior_tells_its_method_draws_and_origin(run_cli: Run, folder: Path) -> None:
+    found = json.loads(run_cli("show", "post.nc", "--json", cwd=folder).stdout)
+    assert (found["method"], found["chains"], found["draws"]) == ("laplace", 1, 4000)
+    assert {"amplitude", "max_size_mm", "noise_sd"} <= set(found["variables"])
+    assert found["provenance"]["command"] == "estimate"
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("none", None),
+        ("empty", b""),
+        ("noise", bytes(range(256))),
+        ("cut.nc", b"\x89HDF\r\n\x1a\n"),
+        ("other.json", b'{"a": 1}'),
+        ("cut.json", b'{"schema": "tactile-bayes/est'),
+        ("list.json", b"[1, 2]"),
+        ("nothing.json", b"[]"),
+        ("other.csv", b"a,b\n1,2\n"),
+        ("cut.mcap", b"\x89MCAP0\r\n"),
+    ],
+)
+def test_what_is_none_of_ours_is_one_line_and_exit_3(
+    run_cli: Run, tmp_path: Path, name: str, data: bytes | None
+) -> None:
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    done = run_cli("show", name, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"error: {name}: ")
