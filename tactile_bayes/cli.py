@@ -19,6 +19,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("calibrate", "Learn a calibration: `calibrate size`."),
     "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
     "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
+    "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
+    "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
     "simulate": ("simulate", "Make a scan with known truth from a scene."),
     "show": ("show", "Say what any of our files is and how good it is."),
 }

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.condense import SurfaceCompliance
+from tactile_bayes.forward.body import Layers
+from tactile_bayes.forward.condense import CELL_MM, SurfaceCompliance
 from tactile_bayes.forward.contact import Head, solve_contact
+from tactile_bayes.forward.plane_layers import surface_compliance
 from tactile_bayes.geometry import FloatArray
 
 MEAN_KPA = 9.5
@@ -126,15 +128,29 @@ def press(
         )
     matrix = surface.without_lump() if stiffness_ratio is None else surface.with_lump(stiffness_ratio)
     total = mean_kpa * len(profile)
-    alone = solve_contact(surface.without_lump()[None, : len(profile), : len(profile)], profile, total_kpa=total)
+    touching = press_layers(surface.body.layers, head=head, mean_kpa=mean_kpa, cell_mm=cell).pressure_kpa[0] > 0
     pressure = np.empty((len(first), len(profile)))
     for chunk in np.array_split(np.arange(len(first)), int(np.ceil(len(first) / 64))):
         windows = _windows(matrix, first[chunk], len(profile))
-        pressure[chunk] = solve_contact(
-            windows, profile, total_kpa=total, touching=alone.pressure_kpa[0] > 0
-        ).pressure_kpa
-    s: FloatArray = cell * (np.arange(float(len(profile))) - 0.5 * (len(profile) - 1))
-    return LineFrames(np.asarray(x_c_mm, dtype=np.float64), s, pressure)
+        pressure[chunk] = solve_contact(windows, profile, total_kpa=total, touching=touching).pressure_kpa
+    return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(len(profile), cell), pressure)
+
+
+def press_layers(
+    layers: Layers, *, head: Head = _NOMINAL_HEAD, mean_kpa: float = MEAN_KPA, cell_mm: float = CELL_MM
+) -> LineFrames:
+    """The one frame of a body without a lump, the same wherever the head stands (at 0 here): P1."""
+    profile = head.cell_profile_mm(cell_mm)
+    index = np.arange(len(profile))
+    row = surface_compliance(np.asarray(cell_mm * index), cell_mm=cell_mm, layers=layers)
+    matrix = row[np.abs(index[:, None] - index[None, :])]
+    found = solve_contact(matrix[None], profile, total_kpa=mean_kpa * len(profile))
+    return LineFrames(np.zeros(1), _cell_centres(len(profile), cell_mm), found.pressure_kpa)
+
+
+def _cell_centres(count: int, cell_mm: float) -> FloatArray:
+    """(count,) centres of the head's cells from its own centre."""
+    return np.asarray(cell_mm * (np.arange(count) - 0.5 * (count - 1)), dtype=np.float64)
 
 
 def _windows(matrix: FloatArray, first: FloatArray, n: int) -> FloatArray:

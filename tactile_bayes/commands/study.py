@@ -1,0 +1,277 @@
+"""`study`: the Gaussian that the map of each lump shows, from the forward model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from tactile_bayes.batch import BatchStore
+    from tactile_bayes.forward.study import Geometry, LineFit, StudyRow, StudySettings
+    from tactile_bayes.forward.tactile_line import TactileLine
+    from tactile_bayes.geometry import FloatArray
+
+_FILE = click.Path(path_type=Path)
+_ABOVE_0 = click.FloatRange(min=0.0, min_open=True)
+# The line is a map that does not change in y: a bump of this width there.
+_NO_CHANGE_MM = 1e6
+_GRID_SCHEMA = "study_grid.table.json"
+
+
+@click.command("study")
+@click.option(
+    "--model",
+    type=click.Choice(["plane-strain"]),
+    default="plane-strain",
+    show_default=True,
+    help="Forward model: the paper's two-dimensional body.",
+)
+@click.option("--grid", default="paper", show_default=True, metavar="paper|FILE", help="150 cases, or a table of them.")
+@click.option(
+    "--seat",
+    default="centred",
+    show_default=True,
+    metavar="centred|resting|0..1",
+    help="How far the lump stands out of the gland, where the grid does not say.",
+)
+@click.option("-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write the table; else it is printed.")
+@click.option("--figures", metavar="DIR", type=_FILE, help="Draw figures 5 to 8 of the paper into this directory.")
+@click.option("--head-radius-mm", type=_ABOVE_0, default=35.0, show_default=True, help="Radius of the head's arc.")
+@click.option("--shoulder-mm", type=float, default=3.0, show_default=True, help="Radius of the head's shoulders.")
+@click.option("--mean-kpa", type=_ABOVE_0, default=9.5, show_default=True, help="Force over the head's area.")
+@click.option("--poisson", type=float, default=0.495, show_default=True, help="Poisson's ratio of the tissues.")
+@click.option("--gland-ratio", type=_ABOVE_0, default=10.0, show_default=True, help="Modulus of gland over fat.")
+@click.option("--thickness-mm", type=_ABOVE_0, help="Depth of the chest wall; 70, or deeper where the lump needs it.")
+@click.option("--fineness", type=click.IntRange(1, 8), default=2, show_default=True, help="Of the mesh; twice is half.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
+@click.option("--scheduler", metavar="ADDR", help="Send the geometries to a dask scheduler (extra [cluster]).")
+@click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+def command(
+    *,
+    model: str,
+    grid: str,
+    seat: str,
+    output: Path | None,
+    figures: Path | None,
+    workers: int,
+    scheduler: str | None,
+    force: bool,
+    **options: Any,
+) -> None:
+    """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses.
+
+    A head slides over each lump in a layered, two-dimensional body; its frames become a map, and Eq 5 is fitted to it
+    with the background at 1. Cases with an amplitude below 0.02 are marked as not detectable. With -o an interrupted
+    study goes on where it stopped.
+
+    A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
+    lump's centre on the fat-gland boundary, 1 (resting) its lowest point.
+
+    Example: tactile-bayes study -o study.csv, then calibrate size study.csv -o size.json
+    """
+    from tactile_bayes.batch import open_executor
+    from tactile_bayes.files.atomic import refuse_existing, write_text
+    from tactile_bayes.forward.body import parse_seat
+    from tactile_bayes.forward.study import paper_grid
+    from tactile_bayes.presets import RESEARCH_USE
+
+    del model  # there is one so far
+    chosen = parse_seat(seat)
+    settings = study_settings(**options)
+    geometries = paper_grid(chosen) if grid == "paper" else read_grid(Path(grid), seat=chosen)
+    if output is not None:
+        refuse_existing(output, force=force)
+    with open_executor(workers=workers, cluster=scheduler) as executor:
+        rows = run_study(geometries, settings=settings, executor=executor, output=output)
+    if output is None:
+        click.echo(table_text(rows), nl=False)
+    else:
+        write_text(output, table_text(rows), force=force)
+        store_path(output).unlink(missing_ok=True)
+    click.echo(summary(rows), err=output is None)
+    if figures is not None:
+        draw_figures(rows, settings, figures, seat=chosen, force=force)
+        click.echo(f"figures 5 to 8 are in {figures}", err=output is None)
+    click.echo(RESEARCH_USE, err=output is None)
+
+
+def study_settings(
+    *,
+    head_radius_mm: float,
+    shoulder_mm: float,
+    mean_kpa: float,
+    poisson: float,
+    gland_ratio: float,
+    thickness_mm: float | None,
+    fineness: int,
+) -> StudySettings:
+    """The study's settings from the options of the command line."""
+    from tactile_bayes.forward.contact import Head
+    from tactile_bayes.forward.study import StudySettings
+
+    return StudySettings(
+        head=Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm),
+        mean_kpa=mean_kpa,
+        poisson=poisson,
+        gland_ratio=gland_ratio,
+        thickness_mm=thickness_mm,
+        fineness=fineness,
+    )
+
+
+def read_grid(path: Path, *, seat: float) -> list[Geometry]:
+    """The cases of a table; `seat` where it does not say."""
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.forward.body import parse_seat
+    from tactile_bayes.forward.study import group_cases
+
+    table = read_table(path, _GRID_SCHEMA)
+    seats = [seat if text is None else parse_seat(text) for text in table.columns["seat"]]
+    names = ("d_mm", "depth_ratio", "stiffness_ratio")
+    try:
+        return group_cases(zip(seats, *(table.columns[name] for name in names), strict=True))
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def run_study(
+    geometries: list[Geometry], *, settings: StudySettings, executor: Executor, output: Path | None = None
+) -> list[StudyRow]:
+    """All rows, in the order of the geometries; kept beside `output` as they come.
+
+    Raises
+    ------
+    BadDataError
+        When a geometry cannot be, before any is computed.
+    """
+    from contextlib import nullcontext
+
+    from tactile_bayes.batch import open_store
+
+    for geometry in geometries:
+        settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
+    opened = (
+        nullcontext(None)
+        if output is None
+        else open_store(store_path(output), settings=settings.as_dict(), encode=_encode, decode=_decode)
+    )
+    with opened as store:
+        return _run_all(geometries, settings=settings, executor=executor, store=store)
+
+
+def _run_all(
+    geometries: list[Geometry], *, settings: StudySettings, executor: Executor, store: BatchStore | None
+) -> list[StudyRow]:
+    from functools import partial
+
+    from tactile_bayes.batch import run_batch
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import TactileBayesError
+    from tactile_bayes.forward.study import run_geometry
+
+    with progress_bar("geometries") as progress:
+        outcomes = run_batch(
+            partial(run_geometry, settings=settings, fit=fit_line),
+            geometries,
+            key=lambda geometry: geometry.key,
+            executor=executor,
+            store=store,
+            progress=progress,
+        )
+    failed = [outcome for outcome in outcomes if not outcome.ok]
+    if failed:
+        raise TactileBayesError(
+            f"{len(failed)} of {len(outcomes)} geometries failed, the first ({failed[0].key}): {failed[0].error}"
+        )
+    return [row for outcome in outcomes for row in outcome.value or []]
+
+
+def store_path(output: Path) -> Path:
+    """Where an unfinished study keeps what it has."""
+    return output.with_name(f"{output.name}.unfinished")
+
+
+def _encode(rows: list[StudyRow]) -> list[dict[str, Any]]:
+    from dataclasses import asdict
+
+    return [asdict(row) for row in rows]
+
+
+def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:
+    from tactile_bayes.forward.study import StudyRow
+
+    return [StudyRow(**row) for row in rows]
+
+
+def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
+    """Eq 5 with a background of 1 and the bump on the lump's axis, averaged over the cells as for a patient's map.
+
+    Notes
+    -----
+    Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs
+    to either end is reported there.
+    """
+    import numpy as np
+
+    from tactile_bayes.forward.empirical import fit_shape
+    from tactile_bayes.forward.gaussian import cell_mean_gaussian
+    from tactile_bayes.forward.study import LineFit
+    from tactile_bayes.posterior.fit import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
+
+    inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
+    x, excess = line.x_mm[inside], line.mean[inside] - 1.0
+
+    def bump(log_width: float) -> FloatArray:
+        covariance = np.diag([np.exp(2 * log_width), _NO_CHANGE_MM**2])
+        return cell_mean_gaussian(x, np.zeros_like(x), covariance_mm2=covariance, cell_mm=line.cell_mm)
+
+    ends = np.log([LEAST_WIDTH_IN_CELLS * line.cell_mm, WIDEST_IN_RADII * radius_mm])
+    found = fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
+    return LineFit(found.height, float(np.exp(found.parameter)), float(np.sqrt(found.sse / len(x))))
+
+
+def table_text(rows: list[StudyRow]) -> str:
+    """The study as a size table that `calibrate size` reads."""
+    from dataclasses import fields
+
+    from tactile_bayes.forward.study import StudyRow
+
+    names = [field.name for field in fields(StudyRow)]
+    lines = [",".join(names)]
+    lines += [",".join(_cell(getattr(row, name)) for name in names) for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return value if isinstance(value, str) else f"{value:.6g}"
+
+
+def summary(rows: list[StudyRow]) -> str:
+    """How many cases show, and Eq 6 in two stages for each seat."""
+    from tactile_bayes.forward.study import DETECTABLE, learn_as_printed
+
+    shown = sum(row.detectable for row in rows)
+    lines = [f"{len(rows)} cases, {len(rows) - shown} not detectable (amplitude below {DETECTABLE:g})"]
+    for seat in dict.fromkeys(row.seat for row in rows):
+        learned = learn_as_printed([row for row in rows if row.seat == seat])
+        if learned is not None:
+            lines.append(
+                f"{seat}, E2/E1 = 100: d = {learned.m:.2f} (sigma / delta) {learned.b_mm:+.2f} mm, "
+                f"delta = {learned.e:.3f} a^{learned.f:.3f} from {learned.cases} cases (Eq 6 in two stages, as printed)"
+            )
+    return "\n".join(lines)
+
+
+def draw_figures(rows: list[StudyRow], settings: StudySettings, folder: Path, *, seat: float, force: bool) -> None:
+    """Figures 5 to 8 of the paper."""
+    from tactile_bayes.report.study_figures import study_figures
+
+    folder.mkdir(parents=True, exist_ok=True)
+    study_figures(rows, settings, folder, seat=seat, fit=fit_line, force=force)
