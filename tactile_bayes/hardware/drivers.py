@@ -1,0 +1,163 @@
+"""How to talk to each device: what sets it up, what starts and stops it, and how to tell that it is there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from tactile_bayes.errors import DeviceError
+from tactile_bayes.hardware import head, polhemus
+from tactile_bayes.hardware.bird import BirdParser
+from tactile_bayes.hardware.head import HeadParser, encode_command
+from tactile_bayes.hardware.igtlink import IgtlinkParser
+from tactile_bayes.hardware.polhemus import FastrakParser, LibertyAsciiParser, LibertyParser
+from tactile_bayes.hardware.ports import ANSWER_S, Port, shown
+from tactile_bayes.hardware.readings import HelloReading, Parser, PoseReading
+
+_BETWEEN_COMMANDS_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerDriver:
+    """One tracker protocol.
+
+    Parameters
+    ----------
+    title
+        The makers' name, for messages.
+    baud
+        Line rate it runs at unless told.
+    parser
+        Makes a fresh parser.
+    configure
+        Commands that set records and units, sent one by one.
+    single, start, stop
+        Commands for one record, for a stream of them, and for its end.
+    has_clock
+        Its records carry the tracker's own time.
+    hint
+        What to try when nothing comes.
+    """
+
+    title: str
+    baud: int
+    parser: Callable[[], Parser]
+    configure: tuple[bytes, ...] = ()
+    single: bytes = b""
+    start: bytes = b""
+    stop: bytes = b""
+    has_clock: bool = False
+    hint: str = "check its power, cable and line rate, or give another --tracker-protocol"
+
+    def check(self, port: Port) -> PoseReading | HelloReading:
+        """Set the tracker up and ask for one record.
+
+        Raises
+        ------
+        DeviceError
+            When none comes that fits the protocol.
+        """
+        if self.stop:
+            port.write(self.stop)
+            port.drain()
+        for command in self.configure:
+            port.write(command)
+            time.sleep(_BETWEEN_COMMANDS_S)
+        if self.configure:
+            port.drain()
+        if self.single:
+            port.write(self.single)
+        parser, came = self.parser(), b""
+        end = time.monotonic() + ANSWER_S
+        while time.monotonic() < end:
+            data = port.read_some(0.1)
+            came += data
+            for reading in parser.feed(data):
+                if isinstance(reading, PoseReading | HelloReading):
+                    return reading
+        raise DeviceError(
+            f"{port.name}: a record of a {self.title} was expected, {shown(came)} came ({len(came)} bytes); {self.hint}"
+        )
+
+
+TRACKERS: Final[dict[str, TrackerDriver]] = {
+    "fastrak": TrackerDriver(
+        "Polhemus FASTRAK (binary)", 115_200, FastrakParser, (b"U", b"O1,2,11,0\r", b"f"), b"P", b"C", b"c"
+    ),
+    "fastrak-ascii": TrackerDriver(
+        "Polhemus FASTRAK (ASCII)",
+        115_200,
+        lambda: FastrakParser(polhemus.FASTRAK_ASCII, binary=False),
+        (b"U", b"O1,2,11,1\r", b"F"),
+        b"P",
+        b"C",
+        b"c",
+    ),
+    "liberty": TrackerDriver(
+        "Polhemus LIBERTY or PATRIOT (binary)",
+        115_200,
+        LibertyParser,
+        (b"U0\r", b"F1\r", b"O1,2,7,8,11,0\r", b"Q0\r"),
+        b"P",
+        b"C\r",
+        b"P",
+        has_clock=True,
+    ),
+    "liberty-ascii": TrackerDriver(
+        "Polhemus LIBERTY or PATRIOT (ASCII)",
+        115_200,
+        LibertyAsciiParser,
+        (b"U0\r", b"F0\r", b"O1,2,7,8,11,1\r", b"Q0\r"),
+        b"P",
+        b"C\r",
+        b"P",
+        has_clock=True,
+    ),
+    "bird": TrackerDriver("Ascension Flock of Birds", 115_200, BirdParser, (b"]",), b"B", b"@", b"B"),
+    "open": TrackerDriver(
+        "tracker in the open framing",
+        head.DEFAULT_BAUD,
+        HeadParser,
+        (),
+        encode_command(head.ASK),
+        encode_command(head.START),
+        encode_command(head.STOP),
+        has_clock=True,
+    ),
+    "igtlink": TrackerDriver(
+        "OpenIGTLink server (PLUS, 3D Slicer)",
+        0,
+        IgtlinkParser,
+        has_clock=True,
+        hint="give socket://HOST:18944 and start its stream",
+    ),
+}
+
+
+def check_head(port: Port, *, every: int = 1) -> HelloReading:
+    """Ask a head who it is, and refuse a line that is too slow for it.
+
+    Raises
+    ------
+    DeviceError
+        When no HELLO comes, or when the line rate is too low.
+    """
+    port.write(encode_command(head.STOP))
+    port.drain()
+    port.write(encode_command(head.ASK))
+    parser, came = HeadParser(), b""
+    end = time.monotonic() + ANSWER_S
+    while time.monotonic() < end and parser.hello is None:
+        data = port.read_some(0.1)
+        came += data
+        parser.feed(data)
+    if parser.hello is None:
+        raise DeviceError(
+            f"{port.name}: a HELLO packet was expected, {shown(came)} came ({len(came)} bytes); check its power and "
+            "cable, and the layout in docs/scan-head-protocol.md"
+        )
+    if port.has_line_rate:
+        head.check_link_rate(parser.hello, baud=port.baud, every=every, port=port.name)
+    return parser.hello

@@ -1,0 +1,153 @@
+"""Ports by URL: a serial device, a socket, another program's terminal.
+
+A `DeviceError` from here is one line: which port, what was expected, what came, what to try.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, Final
+
+import serial
+
+from tactile_bayes.errors import DeviceError
+
+# How long a device may take to answer.
+ANSWER_S: Final = 1.5
+_SHOWN_BYTES: Final = 12
+
+
+class Port:
+    """One open port.
+
+    Parameters
+    ----------
+    url
+        ``/dev/ttyUSB0``, ``socket://host:port``, ``rfc2217://host:port`` or ``loop://``; the pyserial URLs.
+    baud
+        Line rate; sockets and pseudo-terminals have none.
+    role
+        ``head`` or ``tracker``, for messages.
+    """
+
+    def __init__(self, url: str, *, baud: int, role: str) -> None:
+        self.url = url
+        self.baud = baud
+        self.role = role
+        self._serial = _open(url, baud, role)
+        self._relayed: socket.socket | None = None
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"{self.role} {self.url}"
+
+    @property
+    def has_line_rate(self) -> bool:
+        """Whether bytes pass at the line rate: not over sockets."""
+        return not self.url.startswith(("socket://", "rfc2217://", "loop://"))
+
+    def write(self, data: bytes) -> None:
+        """Send; a device that went away is told in one line."""
+        try:
+            self._serial.write(data)
+            self._serial.flush()
+        except (OSError, serial.SerialException) as error:
+            raise DeviceError(f"{self.name}: cannot be written to ({_reason(error)}); check its cable") from None
+
+    def read_some(self, timeout_s: float) -> bytes:
+        """What comes within the time, as soon as anything does; empty when nothing did."""
+        self._serial.timeout = timeout_s
+        try:
+            first: bytes = self._serial.read(1)
+            return first + bytes(self._serial.read(self._serial.in_waiting) if first else b"")
+        except (OSError, serial.SerialException) as error:
+            raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); check its cable") from None
+
+    def drain(self, quiet_s: float = 0.05) -> int:
+        """Read until nothing comes for a while (at most 2 s); how many bytes that was."""
+        count, end = 0, time.monotonic() + 2.0
+        while time.monotonic() < end:
+            data = self.read_some(quiet_s)
+            if not data:
+                break
+            count += len(data)
+        return count
+
+    @contextlib.contextmanager
+    def descriptor(self) -> Iterator[int]:
+        """A file descriptor that a reading process can inherit.
+
+        A port without one (rfc2217, loop) is read by a thread here that passes its bytes on; under load a thread is
+        less sure to be in time than a process.
+        """
+        number = _descriptor_of(self._serial)
+        if number is not None:
+            yield number
+            return
+        self._relayed, far = socket.socketpair()
+        threading.Thread(target=_relay, args=(self._serial, self._relayed), daemon=True).start()
+        with far:
+            yield far.fileno()
+
+    def close(self) -> None:
+        """Close; nothing is wrong if it has gone already."""
+        with contextlib.suppress(OSError, serial.SerialException):
+            self._serial.close()
+        if self._relayed is not None:
+            self._relayed.close()
+
+
+def _open(url: str, baud: int, role: str) -> Any:
+    try:
+        port = serial.serial_for_url(url, baudrate=baud, timeout=0, do_not_open=True)
+        if not url.startswith(("socket://", "loop://")):
+            port.rts = False  # high holds a Flock of Birds in reset
+        port.open()
+    except ValueError as error:
+        raise DeviceError(
+            f"{role} {url}: not a port ({error}); give /dev/ttyUSB0, socket://HOST:PORT or rfc2217://HOST:PORT"
+        ) from None
+    except (OSError, serial.SerialException) as error:
+        raise DeviceError(
+            f"{role} {url}: cannot be opened ({_reason(error)}); `tactile-bayes devices` lists what is there"
+        ) from None
+    return port
+
+
+def _descriptor_of(port: Any) -> int | None:
+    try:
+        return int(port.fileno())
+    except (AttributeError, OSError, TypeError):
+        return None
+
+
+def _relay(port: Any, sink: socket.socket) -> None:
+    with contextlib.suppress(OSError, serial.SerialException, TypeError):
+        port.timeout = 0.1
+        while True:
+            data = port.read(1)
+            if data:
+                sink.sendall(data + port.read(port.in_waiting))
+
+
+def _reason(error: Exception) -> str:
+    """The system's words without pyserial's around them."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if isinstance(number, int) else str(error).split(": ")[-1].strip("[]'\" ")
+
+
+def shown(data: bytes) -> str:
+    """The start of what came, for a message: as text if it is, as hex if not."""
+    if not data:
+        return "nothing"
+    part = data[:_SHOWN_BYTES]
+    more = "..." if len(data) > _SHOWN_BYTES else ""
+    if all(0x20 <= byte < 0x7F or byte in b"\r\n" for byte in part):
+        return repr(part.decode()) + more
+    return part.hex(" ") + more

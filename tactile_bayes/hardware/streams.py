@@ -1,0 +1,109 @@
+"""The recorder's end of a reading process: its pipe, its bytes with their times, what was lost on the way."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from tactile_bayes.hardware import reading
+from tactile_bayes.hardware.ports import Port
+
+# Room for six seconds of a head at 200 Hz while the writer waits for the disk.
+PIPE_BYTES: Final = 1 << 20
+
+
+class Piece(NamedTuple):
+    """Bytes of a device with the host's time (monotonic ns) at which they were read."""
+
+    host_ns: int
+    data: bytes
+
+
+@dataclass(slots=True)
+class Stream:
+    """One device being read by a process of its own.
+
+    Parameters
+    ----------
+    process
+        The reader.
+    pipe
+        Where its records come out; not blocking.
+    overrun_bytes
+        Bytes that the reader had to drop because the pipe was full.
+    ended
+        The device has gone, or the reader has.
+    """
+
+    process: subprocess.Popen[bytes]
+    pipe: int
+    overrun_bytes: int = 0
+    ended: bool = False
+    cpu_s: float = 0.0
+    _rest: bytes = field(default=b"", repr=False)
+
+    def fileno(self) -> int:
+        """For `select`."""
+        return self.pipe
+
+    def read(self) -> list[Piece]:
+        """What has come since; sets `ended` after the last of it."""
+        try:
+            data = os.read(self.pipe, PIPE_BYTES)
+        except BlockingIOError:
+            return []
+        if not data:
+            self.ended = True
+            return []
+        pieces, place, buffer = [], 0, self._rest + data
+        size = reading.RECORD.size
+        while len(buffer) - place >= size:
+            host_ns, lost, length = reading.RECORD.unpack_from(buffer, place)
+            if len(buffer) - place - size < length:
+                break
+            self.overrun_bytes = lost
+            start = place + size
+            place = start + length
+            if length:
+                pieces.append(Piece(host_ns, buffer[start:place]))
+            else:
+                self.ended = True
+        self._rest = buffer[place:]
+        return pieces
+
+    def stop(self) -> None:
+        """End the reader; what it has handed over can still be read."""
+        with contextlib.suppress(ProcessLookupError):
+            self.process.terminate()
+
+    def close(self) -> None:
+        """End the reader, account for its CPU time, and let go of the pipe."""
+        self.stop()
+        if self.process.returncode is None:
+            _, status, usage = os.wait4(self.process.pid, 0)
+            self.process.returncode = os.waitstatus_to_exitcode(status)
+            self.cpu_s = usage.ru_utime + usage.ru_stime
+        os.close(self.pipe)
+
+
+def read_in_process(port: Port) -> Stream:
+    """Start to read a port in a process of its own."""
+    ours, theirs = os.pipe()
+    os.set_blocking(ours, False)
+    if hasattr(fcntl, "F_SETPIPE_SZ"):
+        with contextlib.suppress(OSError):  # a user's pipes may be limited; the rest is only shorter
+            fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    with port.descriptor() as device:
+        process = subprocess.Popen(
+            [sys.executable, "-I", "-S", str(Path(reading.__file__)), str(device), str(theirs)],
+            pass_fds=(device, theirs),
+            stdin=subprocess.DEVNULL,
+        )
+    os.close(theirs)
+    return Stream(process, ours)
