@@ -9,6 +9,7 @@ from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
+from in_process import run_here
 
 import tactile_bayes
 from tactile_bayes.files.size_json import read_size_calibration
@@ -46,9 +47,9 @@ def test_phantoms_become_a_calibration(run_cli: Run, tmp_path: Path) -> None:
     assert [one["role"] for one in provenance["inputs"]] == ["table"]
 
 
-def test_a_small_table_without_depths_teaches_the_ratio(run_cli: Run, tmp_path: Path) -> None:
+def test_a_small_table_without_depths_teaches_the_ratio(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(rows(30))
-    done = run_cli("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
+    done = run_here("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "e is 1 by convention" in done.stdout
     m, b, e, f = read_size_calibration(tmp_path / "size.json").x.draws[:, :4].mean(axis=0)
@@ -72,9 +73,9 @@ def test_a_small_table_without_depths_teaches_the_ratio(run_cli: Run, tmp_path: 
         ),
     ],
 )
-def test_a_bad_table_is_named_by_its_fault(run_cli: Run, tmp_path: Path, text: str, words: str) -> None:
+def test_a_bad_table_is_named_by_its_fault(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "t.csv").write_text(text)
-    done = run_cli("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
+    done = run_here("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (3, "")
     assert words in done.stderr
     assert "t.csv" in done.stderr
@@ -82,9 +83,9 @@ def test_a_bad_table_is_named_by_its_fault(run_cli: Run, tmp_path: Path, text: s
     assert not (tmp_path / "size.json").exists()
 
 
-def test_an_existing_calibration_is_left_alone_without_force(run_cli: Run, tmp_path: Path) -> None:
+def test_an_existing_calibration_is_left_alone_without_force(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(rows())
     (tmp_path / "size.json").write_text("mine")
-    done = run_cli("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
+    done = run_here("calibrate", "size", "t.csv", "-o", "size.json", cwd=tmp_path)
     assert done.returncode == 2
     assert (tmp_path / "size.json").read_text() == "mine"

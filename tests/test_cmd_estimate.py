@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from in_process import run_here
 from posterior_files import write_calibration, write_maps
 
 from tactile_bayes.files.schema import check_document, load_schema
@@ -30,10 +31,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def alone(run_cli: Run, folder: Path) -> dict[str, str]:
+def alone(folder: Path) -> dict[str, str]:
     """What each map gives by itself, as JSON text."""
     return {
-        name: run_cli("estimate", f"{name}.nc", *FAST, "--size-calibration", "size.json", "--json", cwd=folder).stdout
+        name: run_here("estimate", f"{name}.nc", *FAST, "--size-calibration", "size.json", "--json", cwd=folder).stdout
         for name in ("a", "b", "empty")
     }
 
@@ -105,9 +106,9 @@ def test_the_draws_open_in_arviz(ensemble_run: CompletedProcess[str], folder: Pa
     data.close()
 
 
-def test_no_lump_is_an_answer_with_its_reason_and_exit_6(run_cli: Run, folder: Path, tmp_path: Path) -> None:
+def test_no_lump_is_an_answer_with_its_reason_and_exit_6(folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "p.nc"
-    done = run_cli("estimate", "empty.nc", *FAST, "-o", output, cwd=folder)
+    done = run_here("estimate", "empty.nc", *FAST, "-o", output, cwd=folder)
     assert done.returncode == 6
     assert done.stdout.startswith("No estimate: ")
     assert "Research use only" in done.stdout
@@ -136,18 +137,18 @@ def test_several_maps_keep_their_order_and_answers(run_cli: Run, folder: Path, a
     assert one.stdout == two.stdout
 
 
-def test_a_broken_map_is_named_and_the_rest_kept(run_cli: Run, folder: Path, alone: dict[str, str]) -> None:
+def test_a_broken_map_is_named_and_the_rest_kept(folder: Path, alone: dict[str, str]) -> None:
     options = (*FAST, "--size-calibration", "size.json", "--json")
-    done = run_cli("estimate", "a.nc", "broken.nc", "b.nc", *options, cwd=folder)
+    done = run_here("estimate", "a.nc", "broken.nc", "b.nc", *options, cwd=folder)
     assert done.returncode == 3
     assert done.stderr.startswith("error: broken.nc: ")
     assert done.stderr.count("\n") == 1
     assert json.loads(done.stdout) == [json.loads(alone["a"]), json.loads(alone["b"])]
 
 
-def test_the_narrower_interval_lies_within_the_wider(run_cli: Run, folder: Path, alone: dict[str, str]) -> None:
+def test_the_narrower_interval_lies_within_the_wider(folder: Path, alone: dict[str, str]) -> None:
     options = (*FAST, "--size-calibration", "size.json", "--json", "--interval", 0.5)
-    half: dict[str, Any] = json.loads(run_cli("estimate", "a.nc", *options, cwd=folder).stdout)
+    half: dict[str, Any] = json.loads(run_here("estimate", "a.nc", *options, cwd=folder).stdout)
     wide: dict[str, Any] = json.loads(alone["a"])
     for name in ("max_size_mm", "amplitude", "sigma_y_mm"):
         assert half[name]["probability"] == 0.5
@@ -155,8 +156,8 @@ def test_the_narrower_interval_lies_within_the_wider(run_cli: Run, folder: Path,
         assert half[name]["median"] == wide[name]["median"]
 
 
-def test_another_recipe_is_refused_with_the_difference(run_cli: Run, folder: Path) -> None:
-    done = run_cli("estimate", "a.nc", *FAST, "--size-calibration", "other.json", cwd=folder)
+def test_another_recipe_is_refused_with_the_difference(folder: Path) -> None:
+    done = run_here("estimate", "a.nc", *FAST, "--size-calibration", "other.json", cwd=folder)
     assert (done.returncode, done.stdout) == (3, "")
     assert done.stderr.count("\n") == 1
     assert "a.nc" in done.stderr
@@ -165,8 +166,8 @@ def test_another_recipe_is_refused_with_the_difference(run_cli: Run, folder: Pat
     assert "fit radius" not in done.stderr
 
 
-def test_not_converged_is_exit_5_with_advice(run_cli: Run, folder: Path) -> None:
-    done = run_cli("estimate", "a.nc", "--max-steps", 150, cwd=folder)
+def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
+    done = run_here("estimate", "a.nc", "--max-steps", 150, cwd=folder)
     assert (done.returncode, done.stdout) == (5, "")
     assert done.stderr.count("\n") == 1
     assert "--max-steps" in done.stderr
@@ -191,10 +192,10 @@ def test_not_converged_is_exit_5_with_advice(run_cli: Run, folder: Path) -> None
     ],
 )
 def test_mistakes_end_in_their_code_and_leave_nothing(
-    run_cli: Run, folder: Path, arguments: list[str], code: int, words: str
+    folder: Path, arguments: list[str], code: int, words: str
 ) -> None:
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    done = run_cli("estimate", *arguments, *FAST, cwd=folder)
+    done = run_here("estimate", *arguments, *FAST, cwd=folder)
     assert (done.returncode, done.stdout) == (code, "")
     assert words in done.stderr
     assert "Traceback" not in done.stderr
@@ -202,22 +203,22 @@ def test_mistakes_end_in_their_code_and_leave_nothing(
 
 
 @pytest.mark.parametrize("option", ["-o", "--figure", "--map-figure"])
-def test_existing_outputs_are_left_alone_without_force(run_cli: Run, folder: Path, tmp_path: Path, option: str) -> None:
+def test_existing_outputs_are_left_alone_without_force(folder: Path, tmp_path: Path, option: str) -> None:
     output = tmp_path / "mine.png"
     output.write_text("mine")
-    done = run_cli("estimate", "a.nc", *FAST, "--size-calibration", "size.json", option, output, cwd=folder)
+    done = run_here("estimate", "a.nc", *FAST, "--size-calibration", "size.json", option, output, cwd=folder)
     assert done.returncode == 2
     assert "--force" in done.stderr
     assert output.read_text() == "mine"
 
 
-def test_a_camera_image_can_be_estimated(run_cli: Run, shared_data: Path, tmp_path: Path) -> None:
+def test_a_camera_image_can_be_estimated(shared_data: Path, tmp_path: Path) -> None:
     """The way for a picture: import it as a map, fit a free background within a radius that holds the beam."""
     picture = shared_data / "laserbeam" / "laserbeam_astigmatic.tif"
-    made = run_cli("import", picture, "--as", "map", "--spacing-mm", 0.1, "-o", "beam.nc", cwd=tmp_path)
+    made = run_here("import", picture, "--as", "map", "--spacing-mm", 0.1, "-o", "beam.nc", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
     options = ("--background", "free", "--fit-radius-mm", 10, "--rotation", "on", "--json")
-    done = run_cli("estimate", "beam.nc", *FAST, *options, cwd=tmp_path)
+    done = run_here("estimate", "beam.nc", *FAST, *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["sigma_x_mm"]["median"] == pytest.approx(3.30, abs=0.05)

@@ -9,6 +9,7 @@ from pathlib import Path
 from subprocess import CompletedProcess
 
 import pytest
+from in_process import run_here
 from posterior_files import write_calibration, write_maps
 
 import tactile_bayes
@@ -32,27 +33,27 @@ KINDS = {
 
 
 @pytest.fixture(scope="module")
-def folder(run_cli: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("show")
     write_maps(place)
     write_calibration(place / "size.json")
     for name in ("scan.mcap", "trial.csv", "excision.csv", "phantoms.csv"):
         shutil.copyfile(DEMO / name, place / name)
     fast = ("--method", "laplace", "--size-calibration", "size.json", "--json")
-    one = run_cli("estimate", "a.nc", *fast, "-o", "post.nc", cwd=place)
-    many = run_cli("estimate", "a.nc", "b.nc", *fast, cwd=place)
+    one = run_here("estimate", "a.nc", *fast, "-o", "post.nc", cwd=place)
+    many = run_here("estimate", "a.nc", "b.nc", *fast, cwd=place)
     (place / "one.json").write_text(one.stdout)
     (place / "many.json").write_text(many.stdout)
-    report = run_cli("validate", "trial.csv", "--excision", "excision.csv", "-o", "report.json", cwd=place)
+    report = run_here("validate", "trial.csv", "--excision", "excision.csv", "-o", "report.json", cwd=place)
     assert (one.returncode, many.returncode, report.returncode) == (0, 0, 0), report.stderr
     return place
 
 
 @pytest.mark.parametrize("name", list(KINDS))
-def test_every_kind_of_file_is_known(run_cli: Run, folder: Path, name: str) -> None:
+def test_every_kind_of_file_is_known(folder: Path, name: str) -> None:
     schema, kind, words = KINDS[name]
-    text = run_cli("show", name, cwd=folder)
-    plain = run_cli("show", name, "--json", cwd=folder)
+    text = run_here("show", name, cwd=folder)
+    plain = run_here("show", name, "--json", cwd=folder)
     assert (text.returncode, plain.returncode) == (0, 0), text.stderr + plain.stderr
     assert words in text.stdout
     assert text.stdout.rstrip().endswith("Research use only: not a diagnostic device.")
@@ -63,16 +64,16 @@ def test_every_kind_of_file_is_known(run_cli: Run, folder: Path, name: str) -> N
     assert text.stderr == plain.stderr == ""
 
 
-def test_a_map_tells_its_shape_and_recipe(run_cli: Run, folder: Path) -> None:
-    found = json.loads(run_cli("show", "a.nc", "--json", cwd=folder).stdout)
+def test_a_map_tells_its_shape_and_recipe(folder: Path) -> None:
+    found = json.loads(run_here("show", "a.nc", "--json", cwd=folder).stdout)
     assert found["shape"] == {"ny": 51, "nx": 51}
     assert found["extent_mm"] == {"x": 51.0, "y": 51.0}
     assert found["covered_cells"] == 2601
     assert found["recipe"]["normalise"] == "mean"
 
 
-def test_a_posterior_tells_its_method_draws_and_origin(run_cli: Run, folder: Path) -> None:
-    found = json.loads(run_cli("show", "post.nc", "--json", cwd=folder).stdout)
+def test_a_posterior_tells_its_method_draws_and_origin(folder: Path) -> None:
+    found = json.loads(run_here("show", "post.nc", "--json", cwd=folder).stdout)
     assert (found["method"], found["chains"], found["draws"]) == ("laplace", 1, 4000)
     assert {"amplitude", "max_size_mm", "noise_sd"} <= set(found["variables"])
     assert found["provenance"]["command"] == "estimate"
@@ -93,12 +94,10 @@ def test_a_posterior_tells_its_method_draws_and_origin(run_cli: Run, folder: Pat
         ("cut.mcap", b"\x89MCAP0\r\n"),
     ],
 )
-def test_what_is_none_of_ours_is_one_line_and_exit_3(
-    run_cli: Run, tmp_path: Path, name: str, data: bytes | None
-) -> None:
+def test_what_is_none_of_ours_is_one_line_and_exit_3(tmp_path: Path, name: str, data: bytes | None) -> None:
     if data is not None:
         (tmp_path / name).write_bytes(data)
-    done = run_cli("show", name, cwd=tmp_path)
+    done = run_here("show", name, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (3, "")
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"error: {name}: ")
