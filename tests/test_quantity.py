@@ -61,7 +61,8 @@ def test_numbers_are_written_with_nine_digits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "places"), [(0.0, 3), (1e-9, 3), (0.004, 3), (0.006, 2), (0.04, 2), (0.06, 1), (0.4, 1), (0.6, 0), (30, 0)]
+    ("error", "places"),
+    [(0.0, 3), (1e-9, 3), (0.004, 3), (0.006, 2), (0.04, 2), (0.06, 1), (0.4, 1), (0.6, 0), (30, 0)],
 )
 def test_the_last_printed_digit_is_the_first_of_twice_the_error(error: float, places: int) -> None:
     assert decimals(error) == places
