@@ -6,20 +6,24 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_base
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.geometry import FloatArray, Plane, inverse, patient_from_base
 from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress, sources_of
+from tactile_bayes.mapping.convention import hint
 from tactile_bayes.mapping.engine import choose_engine
+from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
+from tactile_bayes.mapping.latency import estimate_latency
+from tactile_bayes.mapping.neighbourhood import local_plane
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
-from tactile_bayes.mapping.project import yaw_deg
+from tactile_bayes.mapping.quality import cell_figures, frame_figures, plane_figures, stroke_figures
+from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.timing import timing_figures
 from tactile_bayes.presets import CELL_MM, NORMALISE, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import Scan
 
-# A cell with this many readings or more counts as covered in the report.
-COVERED_READINGS = 10
 # Landmarks of one examination further apart than this (mm) mean that the patient or the tracker was moved.
 MAX_LANDMARK_SHIFT_MM = 20.0
 
@@ -33,8 +37,11 @@ def build_map(
     cell_mm: float = CELL_MM,
     pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA,
     normalise: str = "mean",
-    latency_ms: float = 0.0,
+    latency_ms: float | str = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
+    plane_radius_mm: float | str | None = None,
+    flat_field: bool = False,
+    register_strokes: bool = False,
     engine: str = "auto",
     progress: Progress = no_progress,
 ) -> TactileMap:
@@ -51,9 +58,16 @@ def build_map(
     normalise
         ``"mean"`` (the paper), ``"gain"`` or ``"none"``; see `tactile_bayes.mapping.accumulate.accumulate`.
     latency_ms
-        By how much a pose's stamp is late against the frames.
+        By how much a pose's stamp is late against the frames; ``"auto"`` finds it from the scans.
     max_pose_gap_ms
         Frames between two distinct poses further apart than this are left out.
+    plane_radius_mm
+        Fit the plane to the frames within this distance of the mass, ``"auto"`` to those whose array can reach it;
+        None to all frames used.
+    flat_field
+        Take off the head's own response, found from the frames that saw no lump.
+    register_strokes
+        Shift the strokes onto each other before they are averaged, for a lump that follows the head.
     engine
         ``"numpy"``, ``"fast"`` (compiled; needs the extra ``[fast]``) or ``"auto"``: the same map, bit for bit.
     progress
@@ -71,28 +85,74 @@ def build_map(
     not change a bit of the map.
     """
     parts = [scans] if isinstance(scans, Scan) else list(scans)
-    _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms)
+    _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms, plane_radius_mm)
+    if latency_ms == "auto" and register_strokes:
+        raise UsageError(
+            "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
+        )
     _check_same_examination(parts)
     loops = choose_engine(engine, readings=sum(scan.frames.counts.size for scan in parts))
-    selections = [
-        select_frames(
-            scan,
-            pressure_window_kpa=pressure_window_kpa,
-            latency_ms=latency_ms,
-            max_pose_gap_ms=max_pose_gap_ms,
-            engine=loops,
+
+    def select(chosen: list[Scan], late_ms: float) -> list[SelectedFrames]:
+        found = [
+            select_frames(
+                scan,
+                pressure_window_kpa=pressure_window_kpa,
+                latency_ms=late_ms,
+                max_pose_gap_ms=max_pose_gap_ms,
+                engine=loops,
+            )
+            for scan in chosen
+        ]
+        refuse_without_frames(found, pressure_window_kpa=pressure_window_kpa)
+        return found
+
+    figures: dict[str, float] = {}
+    late_ms = 0.0 if isinstance(latency_ms, str) else float(latency_ms)
+    selections = select(parts, late_ms)
+    if flat_field:
+        flats = [find_flat_field(part) for part in selections if part.used.any()]
+        figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
+        figures["flat_field_sd"] = float(np.mean([flat.spread for flat in flats]))
+        used = [scan for scan, part in zip(parts, selections, strict=True) if part.used.any()]
+        parts = [flat.applied(scan) for flat, scan in zip(flats, used, strict=True)]
+        selections = select(parts, late_ms)
+    plane = _plane(selections)
+    if isinstance(latency_ms, str):
+        found = estimate_latency(
+            selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm, max_pose_gap_ms=max_pose_gap_ms
         )
-        for scan in parts
-    ]
-    refuse_without_frames(selections, pressure_window_kpa=pressure_window_kpa)
+        late_ms = found.latency_ms
+        figures |= {"latency_sd_ms": found.sd_ms, "latency_frames": float(found.frames)}
+        selections = select(parts, late_ms)
+        plane = _plane(selections)
+    if plane_radius_mm is not None:
+        radius = None if isinstance(plane_radius_mm, str) else plane_radius_mm
+        plane, more = local_plane(selections, plane, radius_mm=radius, engine=loops)
+        figures |= more
+    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
+    if register_strokes:
+        levels = [source.selection.level_kpa[source.selection.used] for source in sources]
+        sources, strokes = find_shifts(sources, levels, cell_mm=cell_mm, engine=loops)
+        figures |= stroke_figures(strokes)
+    done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
+    recipe = MapRecipe(
+        "scan", normalise, float(cell_mm), _window(pressure_window_kpa), late_ms, flat_field, register_strokes
+    )
+    return _as_map(done, selections, plane, recipe, figures)
+
+
+def _plane(selections: list[SelectedFrames]) -> Plane:
+    """Best-fit plane of all frames used; a refusal names the rotation convention that would fit."""
     moments = HeadMoments.none()
     for part in selections:
         moments = moments + head_moments(part.scan.head, part.used_poses)
-    plane = moments.plane()
-    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
-    done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
-    recipe = MapRecipe("scan", normalise, float(cell_mm), _window(pressure_window_kpa), float(latency_ms))
-    return _as_map(done, selections, plane, recipe)
+    try:
+        return moments.plane()
+    except BadDataError as error:
+        if "quaternion order" not in error.way_out:
+            raise
+        raise BadDataError(error.what, way_out=hint(selections)) from None
 
 
 def _window(window: tuple[float, float]) -> tuple[float, float]:
@@ -110,7 +170,13 @@ def _check_same_examination(scans: list[Scan]) -> None:
             )
 
 
-def _check_options(cell_mm: float, window: tuple[float, float], normalise: str, latency_ms: float) -> None:
+def _check_options(
+    cell_mm: float,
+    window: tuple[float, float],
+    normalise: str,
+    latency_ms: float | str,
+    plane_radius_mm: float | str | None,
+) -> None:
     if not (np.isfinite(cell_mm) and cell_mm > 0):
         raise BadDataError(f"cell_mm is {cell_mm}", way_out="it must be positive, in mm")
     if not (np.isfinite(window).all() and 0 <= window[0] < window[1]):
@@ -119,19 +185,28 @@ def _check_options(cell_mm: float, window: tuple[float, float], normalise: str, 
         raise BadDataError(f"normalise is {normalise!r}", way_out=f"choose one of {', '.join(NORMALISE)}")
     if normalise != "none" and not window[0] > 0:
         raise BadDataError(f"pressure_window_kpa starts at {window[0]:g}", way_out="frames are divided by their mean")
-    if not np.isfinite(latency_ms):
-        raise BadDataError(f"latency_ms is {latency_ms}", way_out="give a finite time in ms")
+    if latency_ms != "auto" and (isinstance(latency_ms, str) or not np.isfinite(latency_ms)):
+        raise BadDataError(f"latency_ms is {latency_ms}", way_out="give a finite time in ms, or auto")
+    if plane_radius_mm not in (None, "auto") and (isinstance(plane_radius_mm, str) or not plane_radius_mm > 0):
+        raise BadDataError(f"plane_radius_mm is {plane_radius_mm}", way_out="give a distance above 0 mm, or auto")
 
 
-def _as_map(done: Accumulated, selections: list[SelectedFrames], plane: Plane, recipe: MapRecipe) -> TactileMap:
-    sums = done.sums.trimmed()
+def _as_map(
+    done: Accumulated,
+    selections: list[SelectedFrames],
+    plane: Plane,
+    recipe: MapRecipe,
+    figures: dict[str, float],
+) -> TactileMap:
+    sums, scans = done.sums.trimmed(), [part.scan for part in selections]
+    patient, spread = _patient_from_plane(scans, plane)
     quality = {
-        **_frame_figures(selections),
-        **_plane_figures(selections, plane),
-        "coverage": float((sums.count >= COVERED_READINGS).mean()),
-        "median_count": float(np.median(sums.count[sums.count > 0])),
-        "clipped_values": float(sums.clipped),
-        "negative_readings": float(sums.negative),
+        **frame_figures(selections),
+        **timing_figures(scans),
+        **plane_figures(selections, plane),
+        **cell_figures(sums),
+        **spread,
+        **figures,
         "gain_passes": float(done.passes),
         "gain_last_change": done.last_change,
         "gain_unsettled": float(not done.settled),
@@ -144,7 +219,7 @@ def _as_map(done: Accumulated, selections: list[SelectedFrames], plane: Plane, r
         y_mm=sums.y_mm(),
         recipe=recipe,
         plane_from_base=plane.plane_from_base,
-        patient_from_plane=_patient_from_plane([part.scan for part in selections], plane),
+        patient_from_plane=patient,
         background=None if recipe.normalise == "none" else 1.0,
         frame_count=int(quality["frames_used"]),
         quality=quality,
@@ -162,60 +237,11 @@ def _masked(selections: list[SelectedFrames]) -> tuple[str, ...]:
     )
 
 
-def _frame_figures(selections: list[SelectedFrames]) -> dict[str, float]:
-    """Frames used and left out, summed over the scans."""
-    figures = {
-        "scans": len(selections),
-        "frames_total": sum(len(part.used) for part in selections),
-        "frames_used": sum(int(part.used.sum()) for part in selections),
-        "dropped_no_pose": sum(part.dropped_no_pose for part in selections),
-        "dropped_elements": sum(part.dropped_elements for part in selections),
-        "dropped_low": sum(int(part.low.sum()) for part in selections),
-        "dropped_high": sum(int(part.high.sum()) for part in selections),
-        "masked_taxels": sum(len(part.faults) for part in selections),
-    }
-    levels = np.concatenate([part.level_kpa[part.used] for part in selections])
-    return {
-        **{name: float(value) for name, value in figures.items()},
-        "saturated_readings": float(sum(_saturated(part) for part in selections)),
-        "mean_pressure_kpa": float(levels.mean()),
-    }
-
-
-def _saturated(part: SelectedFrames) -> int:
-    """Readings of good taxels in used frames that were at full scale."""
-    good = int(part.good_taxels.sum())
-    taxels = part.good_taxels.size
-    return int(np.rint((good - part.valid_share[part.used] * taxels).sum()))
-
-
-def _plane_figures(selections: list[SelectedFrames], plane: Plane) -> dict[str, float]:
-    """How the head moved on the plane: tilt, yaw and the reach of the strokes."""
-    transform = plane.plane_from_base
-    normals, yaws, centres = [], [], []
-    for part in selections:
-        rotation, tracker_from_head = part.poses.rotation[part.used], inverse(part.scan.head.scanhead_from_tracker)
-        normals.append((rotation * tracker_from_head[:3, 2]).sum(axis=2).sum(axis=0))
-        yaws.append(yaw_deg(part.scan.head, rotation, plane_from_base=transform))
-        apex = part.poses.position_mm[part.used] + (rotation * tracker_from_head[:3, 3]).sum(axis=2)
-        centres.append(apply(transform, apex))
-    normal = np.sum(normals, axis=0)
-    tilt = np.arctan2(np.linalg.norm(np.cross(transform[2, :3], normal)), transform[2, :3] @ normal)
-    span = np.ptp(np.concatenate(centres), axis=0)
-    return {
-        "plane_rms_mm": plane.rms_mm,
-        "tilt_deg": float(np.degrees(tilt)),
-        "yaw_sd_deg": float(np.concatenate(yaws).std()),
-        "span_x_mm": float(span[0]),
-        "span_y_mm": float(span[1]),
-    }
-
-
-def _patient_from_plane(scans: list[Scan], plane: Plane) -> FloatArray | None:
-    """Patient frame from the landmarks, averaged over the scans that have them."""
+def _patient_from_plane(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, dict[str, float]]:
+    """Patient frame from the landmarks, averaged over the scans that have them, and how far repeats lie apart."""
     touched = [scan.landmarks for scan in scans if scan.landmarks is not None]
     if not touched:
-        return None
+        return None, {}
     pairs = np.stack([[marks.sternal_notch_mm, marks.xiphoid_mm] for marks in touched])
     mean = np.sort(pairs, axis=0).mean(axis=0)  # sorted, so that the order of the scans leaves no trace
     shift = float(np.linalg.norm(pairs - mean, axis=2).max())
@@ -226,4 +252,4 @@ def _patient_from_plane(scans: list[Scan], plane: Plane) -> FloatArray | None:
         )
     base = patient_from_base(mean[0], mean[1], normal=plane.plane_from_base[2, :3])
     transform: FloatArray = base @ inverse(plane.plane_from_base)
-    return transform
+    return transform, {"landmark_spread_mm": shift} if len(touched) > 1 else {}

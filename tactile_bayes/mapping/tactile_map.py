@@ -10,6 +10,9 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 
+# A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
+FEW_READINGS = 10
+
 
 @dataclass(frozen=True, slots=True)
 class MapRecipe:
@@ -27,6 +30,10 @@ class MapRecipe:
         The gate on the frame's mean; None for an imported grid.
     latency_ms
         By how much a pose's stamp is late against the frames.
+    flat_field
+        Whether the head's own response was taken off.
+    registered
+        Whether the strokes were shifted onto each other.
     """
 
     source: str
@@ -34,6 +41,8 @@ class MapRecipe:
     cell_mm: float
     pressure_window_kpa: tuple[float, float] | None = None
     latency_ms: float = 0.0
+    flat_field: bool = False
+    registered: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,3 +111,9 @@ class TactileMap:
         """(ny, nx) True where the map has data."""
         covered: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & np.isfinite(self.mean)
         return covered
+
+    @property
+    def few(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """(ny, nx) True for cells with data from fewer than `FEW_READINGS` readings."""
+        few: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & (self.count < FEW_READINGS)
+        return few
