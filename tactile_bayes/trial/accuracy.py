@@ -7,6 +7,7 @@ import numpy as np
 from tactile_bayes.trial.figures import Figure, figure
 from tactile_bayes.trial.jackknife import UndefinedError
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
 
 def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
@@ -23,26 +24,41 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     }
 
 
-def mape_percent(sizes: ModalitySizes) -> float:
-    r"""Mean absolute error in percent of the ex-vivo size; a mass not found has size 0, an error of 100 %.
-
-    Notes
-    -----
-    .. math:: \frac{100}{n}\sum_i \frac{|y_i - e_i|}{e_i}
-
-    Wellman & Howe (1999), section 4, call it "percent mean absolute error (MAE)".
-    """
-    return 100 * float(np.mean(np.abs(sizes.size_mm / some(sizes.ex_vivo_mm) - 1)))
+def _percent_errors(sizes: ModalitySizes) -> FloatArray:
+    return columns(np.abs(sizes.size_mm / some(sizes.ex_vivo_mm) - 1), 1.0)
 
 
-def mae_mm(sizes: ModalitySizes) -> float:
-    """Mean absolute error in mm."""
-    return float(np.mean(np.abs(sizes.size_mm - some(sizes.ex_vivo_mm))))
+def _mm_errors(sizes: ModalitySizes) -> FloatArray:
+    return columns(np.abs(sizes.size_mm - some(sizes.ex_vivo_mm)), 1.0, sizes.ex_vivo_mm)
 
 
-def geometric_ratio(sizes: ModalitySizes) -> float:
-    """Geometric mean of size over ex-vivo size; 1 without bias, and twofold up cancels twofold down."""
-    return float(np.exp(np.mean(np.log(sizes.size_mm) - np.log(some(sizes.ex_vivo_mm)))))
+def _log_ratios(sizes: ModalitySizes) -> FloatArray:
+    return columns(np.log(sizes.size_mm) - np.log(some(sizes.ex_vivo_mm)), 1.0)
+
+
+def _mean(sums: FloatArray) -> FloatArray:
+    return ratio(sums[..., 0], sums[..., 1])
+
+
+# Mean absolute error in percent of the ex-vivo size, each mass alike; a mass not found has size 0, an error of 100 %:
+# 100/n sum |y - e| / e. Wellman & Howe (1999), section 3, call it "percent mean absolute error (MAE)".
+mape_percent = SumStatistic(_percent_errors, lambda sums: 100 * _mean(sums), "no mass to average over")
+
+# The same weighted by ex-vivo size: the sum of absolute errors over the sum of the sizes, in percent.
+weighted_mape_percent = SumStatistic(
+    _mm_errors, lambda sums: 100 * ratio(sums[..., 0], sums[..., 2]), "no mass to average over"
+)
+
+# Mean absolute error in mm.
+mae_mm = SumStatistic(_mm_errors, _mean, "no mass to average over")
+
+# Geometric mean of size over ex-vivo size; 1 without bias, and twofold up cancels twofold down.
+geometric_ratio = SumStatistic(_log_ratios, lambda sums: np.exp(_mean(sums)), "no mass to average over")
+
+
+def median_percent(sizes: ModalitySizes) -> float:
+    """Median absolute error in percent of the ex-vivo size."""
+    return 100 * float(np.median(np.abs(sizes.size_mm / some(sizes.ex_vivo_mm) - 1)))
 
 
 def some(values: FloatArray) -> FloatArray:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
 
 from tactile_bayes.trial.accuracy import mape_percent
-from tactile_bayes.trial.figures import Figure, finite, jackknifed
+from tactile_bayes.trial.figures import Figure, Sample, resampled
 from tactile_bayes.trial.jackknife import UndefinedError
-from tactile_bayes.trial.readings import ModalitySizes
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.sums import ratio
 
 REFERENCE = "tactile"
 
@@ -35,13 +40,47 @@ def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: fl
 
     The interval leaves each patient out of both at once, so that patients hard for both do not widen it.
     """
+    return resampled(Pair(sizes, reference, _quotient), scale="log", confidence=confidence)
 
-    def compute(left_out: int | None) -> float:
-        one, other = (sizes, reference) if left_out is None else (sizes.without(left_out), reference.without(left_out))
-        below = finite(mape_percent, other)
-        if below == 0:
-            raise UndefinedError(f"the error of {other.name} is 0")
-        return finite(mape_percent, one) / below
 
-    patients = sorted({*sizes.patients.tolist(), *reference.patients.tolist()})
-    return jackknifed(compute, patients, scale="log", confidence=confidence)
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A number made from the percent errors of two modalities, ready to be resampled by patients of either."""
+
+    sizes: ModalitySizes
+    reference: ModalitySizes
+    combine: Callable[[FloatArray, FloatArray], FloatArray]
+
+    @property
+    def patients(self) -> npt.NDArray[np.int64]:
+        """Patients with a mass in either modality."""
+        return np.union1d(self.sizes.patients, self.reference.patients)
+
+    def _samples(self) -> tuple[Sample, Sample]:
+        among = self.patients
+        return Sample(mape_percent, self.sizes, among), Sample(mape_percent, self.reference, among)
+
+    def value(self) -> float:
+        """From all patients."""
+        one, other = (sample.value() for sample in self._samples())
+        return self._combined(np.array(one), np.array(other)).item()
+
+    def left_out(self) -> FloatArray:
+        """(g,) without each patient."""
+        one, other = (sample.left_out() for sample in self._samples())
+        return self._combined(one, other)
+
+    def redrawn(self, draws: FloatArray) -> FloatArray:
+        """(b,) from patients drawn anew."""
+        one, other = (sample.redrawn(draws) for sample in self._samples())
+        return self.combine(one, other)
+
+    def _combined(self, one: FloatArray, other: FloatArray) -> FloatArray:
+        values = self.combine(one, other)
+        if np.any(np.isnan(values)):
+            raise UndefinedError(f"the error of {self.reference.name} is 0")
+        return values
+
+
+def _quotient(one: FloatArray, other: FloatArray) -> FloatArray:
+    return ratio(one, other)

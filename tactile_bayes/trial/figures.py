@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from tactile_bayes.trial.jackknife import Scale, UndefinedError, jackknife_interval
-from tactile_bayes.trial.readings import ModalitySizes
+from tactile_bayes.trial.bootstrap import Intervals, bca_interval, draw_patients, percentile_interval
+from tactile_bayes.trial.jackknife import Scale, UndefinedError, interval_from_values, need_patients
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.sums import SumStatistic
 
 # Room above for percent and squares; NaN fails the comparison too.
 LARGEST = 1e150
@@ -50,52 +55,107 @@ class Figure:
 def figure(
     statistic: Statistic, sizes: ModalitySizes, *, scale: Scale | None = None, confidence: float | None = None
 ) -> Figure:
-    """The statistic of these masses, with a jackknife interval over patients when `scale` and `confidence` are given.
+    """The statistic of these masses, with an interval over patients when `scale` and `confidence` are given.
 
     Parameters
     ----------
     statistic
-        Returns a number or raises `UndefinedError` with the reason.
+        Returns a number or raises `UndefinedError` with the reason. A `SumStatistic` is left out in one step.
     scale
         ``log`` for a figure above 0, ``linear`` for one of either sign.
     confidence
-        Probability of the interval, two-sided.
+        Probability of the interval, two-sided; or `Intervals`, to choose how it is made.
     """
-
-    def compute(left_out: int | None) -> float:
-        return finite(statistic, sizes if left_out is None else sizes.without(left_out))
-
     if scale is None or confidence is None:
-        return _plain(compute)
-    return jackknifed(compute, sizes.patients.tolist(), scale=scale, confidence=confidence)
+        return _plain(partial(finite, statistic, sizes))
+    return resampled(Sample(statistic, sizes), scale=scale, confidence=confidence)
 
 
-def jackknifed(
-    compute: Callable[[int | None], float], patients: Sequence[int], *, scale: Scale, confidence: float
-) -> Figure:
-    """A figure with its jackknife interval.
+class Resampled(Protocol):
+    """A number that can be had without one patient, or from patients drawn anew."""
 
-    Parameters
-    ----------
-    compute
-        The number without the given patient, or with all of them for None; raises `UndefinedError`.
-    patients
-        Those to leave out in turn.
-    """
-    plain = _plain(compute)
+    @property
+    def patients(self) -> npt.NDArray[np.int64]:
+        """Those to leave out in turn."""
+        ...
+
+    def value(self) -> float:
+        """With all patients; raises `UndefinedError`."""
+        ...
+
+    def left_out(self) -> FloatArray:
+        """(g,) without each patient; raises `UndefinedError`."""
+        ...
+
+    def redrawn(self, draws: FloatArray) -> FloatArray:
+        """(b,) for each row of (b, g) counts of patients; NaN where there is none."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One statistic of one modality, ready to be resampled."""
+
+    statistic: Statistic
+    sizes: ModalitySizes
+    among: npt.NDArray[np.int64] | None = None
+
+    @property
+    def patients(self) -> npt.NDArray[np.int64]:
+        return self.sizes.patients if self.among is None else self.among
+
+    def value(self) -> float:
+        return finite(self.statistic, self.sizes)
+
+    def left_out(self) -> FloatArray:
+        if isinstance(self.statistic, SumStatistic):
+            with np.errstate(all="ignore"):
+                values = self.statistic.left_out(self.sizes, self.patients)
+            if np.all(np.abs(values) < LARGEST):
+                return values
+        return np.array([finite(self.statistic, self.sizes.without(one)) for one in self.patients.tolist()])
+
+    def redrawn(self, draws: FloatArray) -> FloatArray:
+        if isinstance(self.statistic, SumStatistic):
+            with np.errstate(all="ignore"):
+                return self.statistic.redrawn(self.sizes, self.patients, draws)
+        return np.array([self._redrawn_once(row) for row in draws])
+
+    def _redrawn_once(self, counts: FloatArray) -> float:
+        of_mass = counts[np.searchsorted(self.patients, self.sizes.patient)].astype(np.int64)
+        try:
+            return finite(self.statistic, self.sizes.take(np.repeat(np.arange(len(of_mass)), of_mass)))
+        except UndefinedError:
+            return math.nan
+
+
+def resampled(sample: Resampled, *, scale: Scale, confidence: float) -> Figure:
+    """A figure with its interval over patients."""
+    plain = _plain(sample.value)
     if plain.value is None:
         return replace(plain, has_interval=True, interval_reason=plain.reason)
     try:
-        left_out = [partial(compute, patient) for patient in patients]
-        interval = jackknife_interval(plain.value, left_out, scale=scale, confidence=confidence)
+        need_patients(len(sample.patients))
+        interval = _interval(sample, plain.value, scale=scale, confidence=confidence)
     except UndefinedError as undefined:
         return replace(plain, has_interval=True, interval_reason=str(undefined))
     return replace(plain, has_interval=True, interval=interval)
 
 
-def _plain(compute: Callable[[int | None], float]) -> Figure:
+def _interval(sample: Resampled, value: float, *, scale: Scale, confidence: float) -> tuple[float, float]:
+    chosen = confidence if isinstance(confidence, Intervals) else Intervals(confidence)
+    if chosen.method == "jackknife":
+        return interval_from_values(value, sample.left_out(), scale=scale, confidence=float(chosen))
+    draws = draw_patients(len(sample.patients), resamples=chosen.resamples, seed=chosen.seed)
+    drawn = sample.redrawn(draws)
+    if chosen.method == "percentile":
+        return percentile_interval(drawn, confidence=float(chosen))
+    return bca_interval(value, drawn, sample.left_out(), confidence=float(chosen))
+
+
+def _plain(compute: Callable[[], float]) -> Figure:
     try:
-        return Figure(compute(None))
+        return Figure(compute())
     except UndefinedError as undefined:
         return Figure(None, reason=str(undefined))
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 Scale = Literal["log", "linear"]
+Values = TypeVar("Values", float, npt.NDArray[np.float64])
 
 # Below this the spread of so few leave-one-out values says little; a Student t with 6 degrees of freedom would hide it.
 MIN_PATIENTS = 8
@@ -45,13 +47,26 @@ def jackknife_interval(
 
     for G patients: Tukey (1958), Ann. Math. Statist. 29, 614; Efron & Tibshirani (1993), ch. 11.
     """
-    from scipy.special import stdtrit
+    need_patients(len(left_out))
+    return interval_from_values(value, [one() for one in left_out], scale=scale, confidence=confidence)
 
-    groups = len(left_out)
+
+def need_patients(groups: int) -> None:
+    """Raise `UndefinedError` with fewer than `MIN_PATIENTS`."""
     if groups < MIN_PATIENTS:
         raise UndefinedError(f"an interval needs at least {MIN_PATIENTS} patients (found {groups})")
-    everything = _on_scale(value, scale)
-    others = np.array([_on_scale(one(), scale) for one in left_out])
+
+
+def interval_from_values(
+    value: float, values: Sequence[float] | npt.NDArray[np.float64], *, scale: Scale, confidence: float
+) -> tuple[float, float]:
+    """The interval of `jackknife_interval` from the leave-one-out values themselves."""
+    from scipy.special import stdtrit
+
+    groups = len(values)
+    need_patients(groups)
+    everything = on_scale(value, scale)
+    others = on_scale(np.asarray(values, dtype=np.float64), scale)
     variance = (groups - 1) / groups * float(np.sum((others - others.mean()) ** 2))
     if variance <= (1e-12 * max(1.0, abs(everything))) ** 2:
         raise UndefinedError("the figure is the same whichever patient is left out, so its error cannot be estimated")
@@ -64,9 +79,11 @@ def jackknife_interval(
     return math.exp(low), math.exp(high)
 
 
-def _on_scale(value: float, scale: Scale) -> float:
+def on_scale(values: Values, scale: Scale) -> Values:
+    """The values as they are, or their logarithms; `UndefinedError` where one has none."""
     if scale == "linear":
-        return value
-    if value <= 0:
+        return values
+    if np.any(np.asarray(values) <= 0):
         raise UndefinedError("the figure is 0, or becomes 0 without one patient, and has no logarithm")
-    return math.log(value)
+    logarithms: Values = np.log(values)
+    return logarithms

@@ -12,6 +12,7 @@ from tactile_bayes.trial.accuracy import some
 from tactile_bayes.trial.figures import Figure, figure
 from tactile_bayes.trial.jackknife import UndefinedError
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
 # Replicates averaged in floating point differ by this much, relatively, when they are equal.
 _EQUAL = 1e-12
@@ -29,47 +30,59 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     return result
 
 
-def slope(sizes: ModalitySizes) -> float:
-    r"""Least-squares slope of sizes on ex-vivo sizes without an intercept, :math:`\sum e y / \sum e^2`."""
+def _terms(sizes: ModalitySizes) -> FloatArray:
+    """Products of sizes, then of sizes about their means: e e, e y, y y, 1, e', y', e'e', e'y', y'y'."""
     e, y = _scaled(sizes)
-    return float(e @ y / (e @ e))
+    de, dy = e - e.mean(), y - y.mean()
+    return columns(e * e, e * y, y * y, 1.0, de, dy, de * de, de * dy, dy * dy)
 
 
-def r2_centred(sizes: ModalitySizes) -> float:
-    r"""Share of the variance about the mean that the line through zero explains, :math:`1 - SSE_0/SST`.
-
-    Below 0 when the mean of the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it.
-    """
-    e, y = _scaled(sizes)
-    _need_spread(y, f"all {len(y)} sizes are equal")
-    centred = y - y.mean()
-    return 1 - _sse(e, y) / float(centred @ centred)
+def _terms_of_varied_sizes(sizes: ModalitySizes) -> FloatArray:
+    _need_spread(sizes.size_mm, f"all {len(sizes.size_mm)} sizes are equal")
+    return _terms(sizes)
 
 
-def r2_uncentred(sizes: ModalitySizes) -> float:
-    r"""Share of the sum of squares about zero that the line explains, :math:`1 - SSE_0/\sum y^2`.
-
-    What R prints for ``lm(y ~ 0 + x)``; it flatters: any line through a cloud far from zero explains most of it.
-    """
-    e, y = _scaled(sizes)
-    if not np.any(y):
-        raise UndefinedError("no mass was detected")
-    return 1 - _sse(e, y) / float(y @ y)
+def _terms_of_varied_pairs(sizes: ModalitySizes) -> FloatArray:
+    terms = _terms_of_varied_sizes(sizes)
+    _need_spread(sizes.ex_vivo_mm, f"all {len(sizes.ex_vivo_mm)} ex-vivo sizes are equal")
+    return terms
 
 
-def pearson_r(sizes: ModalitySizes) -> float:
-    """Correlation coefficient; its sign says what the squares hide."""
-    e, y = _scaled(sizes)
-    _need_spread(y, f"all {len(y)} sizes are equal")
-    _need_spread(e, f"all {len(e)} ex-vivo sizes are equal")
-    e, y = e - e.mean(), y - y.mean()
-    r = float(e @ y) / float(np.sqrt(e @ e) * np.sqrt(y @ y))
-    return min(1.0, max(-1.0, r))
+def _slope(sums: FloatArray) -> FloatArray:
+    return ratio(sums[..., 1], sums[..., 0])
 
 
-def r2_pearson(sizes: ModalitySizes) -> float:
-    """Squared correlation coefficient; blind to scale and offset."""
-    return pearson_r(sizes) ** 2
+def _sse(sums: FloatArray) -> FloatArray:
+    """Sum of squares about the line through zero."""
+    return np.maximum(sums[..., 2] - _slope(sums) * sums[..., 1], 0.0)
+
+
+def _sst(sums: FloatArray) -> FloatArray:
+    return sums[..., 8] - sums[..., 5] ** 2 / sums[..., 3]
+
+
+def _pearson(sums: FloatArray) -> FloatArray:
+    n = sums[..., 3]
+    product = sums[..., 7] - sums[..., 4] * sums[..., 5] / n
+    return np.clip(ratio(product, np.sqrt((sums[..., 6] - sums[..., 4] ** 2 / n) * _sst(sums))), -1.0, 1.0)
+
+
+# Least-squares slope of sizes on ex-vivo sizes without an intercept: sum e y / sum e^2.
+slope = SumStatistic(_terms, _slope)
+
+# Share of the variance about the mean that the line through zero explains, 1 - SSE0 / SST; below 0 when the mean of
+# the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it.
+r2_centred = SumStatistic(_terms_of_varied_sizes, lambda sums: 1 - ratio(_sse(sums), _sst(sums)))
+
+# Share of the sum of squares about zero that the line explains, 1 - SSE0 / sum y^2: what R prints for
+# lm(y ~ 0 + x). It flatters: any line through a cloud far from zero explains most of it.
+r2_uncentred = SumStatistic(_terms, lambda sums: 1 - ratio(_sse(sums), sums[..., 2]), "no mass was detected")
+
+# Correlation coefficient; its sign says what the squares hide.
+pearson_r = SumStatistic(_terms_of_varied_pairs, _pearson)
+
+# Squared correlation coefficient; blind to scale and offset.
+r2_pearson = SumStatistic(_terms_of_varied_pairs, lambda sums: _pearson(sums) ** 2)
 
 
 def _scaled(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
@@ -78,11 +91,7 @@ def _scaled(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
     return sizes.ex_vivo_mm / unit, sizes.size_mm / unit
 
 
-def _sse(e: FloatArray, y: FloatArray) -> float:
-    residual = y - float(e @ y / (e @ e)) * e
-    return float(residual @ residual)
-
-
 def _need_spread(values: FloatArray, reason: str) -> None:
+    some(values)
     if np.ptp(values) <= _EQUAL * np.abs(values).max():
         raise UndefinedError("one mass has no spread" if len(values) == 1 else reason)

@@ -117,6 +117,16 @@ class ModalitySizes:
             replicates_mm=tuple(sizes for sizes, kept in zip(self.replicates_mm, keep, strict=True) if kept),
         )
 
+    def take(self, masses: npt.NDArray[np.int64]) -> ModalitySizes:
+        """The masses at these indices, as often as each is named; for resampling."""
+        return ModalitySizes(
+            name=self.name,
+            patient=self.patient[masses],
+            ex_vivo_mm=self.ex_vivo_mm[masses],
+            size_mm=self.size_mm[masses],
+            replicates_mm=tuple(self.replicates_mm[i] for i in masses),
+        )
+
     def only_detected(self) -> ModalitySizes:
         """The masses that this modality found."""
         return self.only(self.detected)

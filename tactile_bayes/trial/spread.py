@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from tactile_bayes.trial.figures import Figure, figure
 from tactile_bayes.trial.jackknife import UndefinedError
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
 
 def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
@@ -30,37 +29,34 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     }
 
 
-def mean_sd_mm(sizes: ModalitySizes) -> float:
-    """Mean over masses of the standard deviation of the replicates (divisor n - 1), in mm."""
-    sds, _, _ = _moments(sizes)
-    return float(sds.mean())
-
-
-def rms_sd_mm(sizes: ModalitySizes) -> float:
-    """Root of the mean variance over masses, weighted by degrees of freedom, in mm.
-
-    Bland & Altman (1996), BMJ 312, 1654: the within-subject standard deviation of a one-way analysis of variance.
-    """
-    sds, _, freedom = _moments(sizes)
-    return math.sqrt(float(np.average(sds**2, weights=freedom)))
-
-
-def mean_cv_percent(sizes: ModalitySizes) -> float:
-    """Mean over masses of standard deviation over mean, in percent."""
-    sds, means, _ = _moments(sizes)
-    return 100 * float(np.mean(sds / means))
-
-
-def rms_cv_percent(sizes: ModalitySizes) -> float:
-    """Root mean square of standard deviation over mean, weighted by degrees of freedom, in percent."""
-    sds, means, freedom = _moments(sizes)
-    return 100 * math.sqrt(float(np.average((sds / means) ** 2, weights=freedom)))
-
-
-def _moments(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Standard deviation, mean and degrees of freedom of each mass's replicates."""
+def _terms(sizes: ModalitySizes) -> FloatArray:
+    """SD, SD over mean, variance and squared SD over mean by degrees of freedom, those, and 1, of each mass."""
     if not sizes.replicates_mm:
         raise UndefinedError("no mass has two detected replicates")
-    sds = np.array([group.std(ddof=1) for group in sizes.replicates_mm])
-    freedom = np.array([float(len(group) - 1) for group in sizes.replicates_mm])
-    return sds, sizes.size_mm, freedom
+    sds, freedom = _moments(sizes)
+    cvs = sds / sizes.size_mm
+    return columns(sds, cvs, freedom * sds**2, freedom * cvs**2, freedom, 1.0)
+
+
+def _moments(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
+    """Standard deviation (divisor n - 1) and degrees of freedom of each mass's replicates."""
+    number = np.array([len(group) for group in sizes.replicates_mm])
+    start = np.concatenate([[0], np.cumsum(number)[:-1]])
+    values = np.concatenate(sizes.replicates_mm)
+    off = values - np.repeat(np.add.reduceat(values, start) / number, number)
+    freedom = number - 1.0
+    return np.sqrt(np.add.reduceat(off**2, start) / freedom), freedom
+
+
+# Mean over masses of the standard deviation of the replicates, in mm.
+mean_sd_mm = SumStatistic(_terms, lambda sums: ratio(sums[..., 0], sums[..., 5]))
+
+# Root of the mean variance over masses, weighted by degrees of freedom, in mm: the within-subject standard deviation
+# of a one-way analysis of variance (Bland & Altman 1996, BMJ 312, 1654).
+rms_sd_mm = SumStatistic(_terms, lambda sums: np.sqrt(ratio(sums[..., 2], sums[..., 4])))
+
+# Mean over masses of standard deviation over mean, in percent.
+mean_cv_percent = SumStatistic(_terms, lambda sums: 100 * ratio(sums[..., 1], sums[..., 5]))
+
+# Root mean square of standard deviation over mean, weighted by degrees of freedom, in percent.
+rms_cv_percent = SumStatistic(_terms, lambda sums: 100 * np.sqrt(ratio(sums[..., 3], sums[..., 4])))
