@@ -22,6 +22,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
     "simulate": ("simulate", "Make a scan with known truth from a scene."),
+    "record": ("record", "Record a scan head and a tracker into a scan file."),
+    "repair": ("repair", "Close a scan file that was cut off: what is intact is kept."),
+    "emulate": ("emulate", "Serve a scan as a scan head or a tracker would send it."),
     "show": ("show", "Say what any of our files is and how good it is."),
 }
 

@@ -102,7 +102,7 @@ def test_a_golden_frame_byte_by_byte():
 def test_every_payload_comes_back():
     parser = HeadParser()
     counts, wire = frame(sequence=7)
-    pose = PoseReading((152.27590461, -1e-300, 3.0), (0.1, 0.2, 0.3, 0.4), 8_333_333)
+    pose = PoseReading((152.27590461, -1e-300, 3.0), (0.1, -0.7, 0.1, 0.7), 8_333_333)
     hello, read, turned, end = parser.feed(
         encode_hello(HELLO) + wire + encode_pose(pose, sequence=1) + encode_end(9, 2)
     )

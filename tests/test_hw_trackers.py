@@ -200,5 +200,5 @@ def test_other_messages_and_other_devices_are_passed_over():
 
 
 def test_an_exact_pose_stays_exact():
-    pose = PoseReading((152.27590461023, -107.0805, 1e-9), (0.1, -0.2, 0.3, 0.9), 8_333_333)
+    pose = PoseReading((152.27590461023, -107.0805, 1e-9), (0.1, -0.7, 0.1, 0.7), 8_333_333)
     assert HeadParser().feed(encode_pose(pose, sequence=0)) == [pose]

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading
+from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading, plausible
 
 SCALE_INCH: Final = 36.0
 _WORDS: Final = 7
@@ -54,9 +54,9 @@ class BirdParser:
             return None
         x, y, z, *turn = (word(record[i], record[i + 1]) for i in range(0, 2 * _WORDS, 2))
         w, i, j, k = (number / 32768 for number in turn)
-        if abs(math.hypot(w, i, j, k) - 1) > 0.02:
-            return None
         step = self._scale / 32768 * MM_PER_INCH
+        if not plausible((x * step, y * step, z * step), (w, i, j, k)):
+            return None
         return PoseReading((x * step, y * step, z * step), (w, i, j, k), station=record[-1] if self._group else 1)
 
 

@@ -20,6 +20,7 @@ from tactile_bayes.hardware.readings import (
     PoseReading,
     Reading,
     SequenceCheck,
+    plausible,
 )
 
 HELLO: Final = 1
@@ -119,8 +120,11 @@ class HeadParser:
         if len(packet.payload) != _POSE.size:
             self.misfits += 1
             return None
-        self.sequence.missing_before(packet.sequence)
         rest_ns, x, y, z, qw, qx, qy, qz = _POSE.unpack(packet.payload)
+        if not plausible((x, y, z), (qw, qx, qy, qz)) or rest_ns > 999:
+            self.misfits += 1
+            return None
+        self.sequence.missing_before(packet.sequence)
         return PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns)
 
     def _hello(self, packet: Packet) -> HelloReading | None:

@@ -80,7 +80,11 @@ class IgtlinkParser:
 def _pose(body: bytes, seconds: int, fraction: int) -> list[Reading]:
     columns = np.array(_BODY.unpack(body), dtype=np.float64).reshape(4, 3)
     rotation, position = columns[:3].T, columns[3]
-    if not np.isfinite(columns).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_SLACK:
+    if (
+        not np.isfinite(columns).all()
+        or np.abs(position).max() > 25_000
+        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_SLACK
+    ):
         return []
     w, i, j, k = (float(value) for value in quaternion_from_rotation(rotation))
     x, y, z = (float(value) for value in position)

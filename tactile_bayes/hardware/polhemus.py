@@ -16,7 +16,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading
+from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading, plausible
 
 FASTRAK_BINARY: Final = (2, 11, 0)
 FASTRAK_ASCII: Final = (2, 11, 1)
@@ -39,7 +39,6 @@ _LIBERTY_KIND: Final = {
 _NUMBERS: Final = {"position": 3, "euler": 3, "quaternion": 4}  # others: 1
 _TAGS: Final = (b"LY", b"PA", b"LU")
 _LIBERTY_HEADER: Final = struct.Struct("<2sBBBBH")
-_QUATERNION_SLACK: Final = 0.02
 _LONGEST_LINE: Final = 512
 
 
@@ -204,15 +203,13 @@ def pose_from_items(
     values: Mapping[str, tuple[float, ...]], *, flags: tuple[str, ...], station: int
 ) -> PoseReading | None:
     """A pose from a record's items in inches; None when they cannot be one (the record is noise)."""
-    position = values["position"]
+    position = [number * MM_PER_INCH for number in values["position"]]
     quaternion = values.get("quaternion") or quaternion_from_euler(*values["euler"])
-    if not all(map(math.isfinite, (*position, *quaternion))) or max(map(abs, position)) > 1000:
-        return None
-    if abs(math.hypot(*quaternion) - 1) > _QUATERNION_SLACK:
+    if not plausible(position, quaternion):
         return None
     distortion = int(values.get("distortion", (0,))[0])
     flags += (f"distortion {distortion}",) if distortion else ()
-    x, y, z = (number * MM_PER_INCH for number in position)
+    x, y, z = position
     w, i, j, k = quaternion
     time_ms = values.get("time_ms")
     return PoseReading(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -81,6 +83,13 @@ class Parser(Protocol):
 
     def feed(self, data: bytes) -> list[Reading]:
         """Readings that are complete with `data`."""
+
+
+def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) -> bool:
+    """Whether numbers can be a pose: finite, within 25 m, a quaternion of unit length within a scan's tolerance."""
+    if not all(map(math.isfinite, (*position_mm, *quaternion_wxyz))):
+        return False
+    return max(map(abs, position_mm)) < 25_000 and abs(math.hypot(*quaternion_wxyz) - 1) < 0.009
 
 
 class SequenceCheck:

@@ -1,0 +1,231 @@
+"""`record`: a scan head and a tracker into a scan file, losing nothing."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.commands.emulate import PROTOCOLS
+from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
+
+if TYPE_CHECKING:
+    from tactile_bayes.hardware.readings import HelloReading
+    from tactile_bayes.hardware.recorder import Line, Recorder, Report
+    from tactile_bayes.scan import HeadGeometry, Landmarks
+
+_FILE = click.Path(path_type=Path)
+_CODE = "A code, not a name."
+
+
+@click.command("record")
+@click.option("-o", "--output", required=True, metavar="SCAN.mcap", type=_FILE, help="Scan file to write.")
+@click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
+@click.option("--tracker", "tracker_url", metavar="URL", help="Port of the tracker; without, there are no poses.")
+@click.option(
+    "--tracker-protocol",
+    type=click.Choice(PROTOCOLS),
+    default="fastrak",
+    show_default=True,
+    help="What the tracker speaks; PATRIOT is liberty.",
+)
+@click.option("--head-baud", type=click.IntRange(min=300), default=2_000_000, show_default=True, help="Line rate.")
+@click.option("--tracker-baud", type=click.IntRange(min=300), help="Line rate; by default the protocol's.")
+@click.option("--every", type=click.IntRange(1, 255), default=1, show_default=True, help="Ask for every n-th frame.")
+@click.option("--duration", "duration_s", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Stop then.")
+@click.option(
+    "--clock",
+    type=click.Choice(["arrival", "shared"]),
+    default="arrival",
+    show_default=True,
+    help="Place poses by when they arrive, or trust that both devices count from one zero.",
+)
+@click.option("--invert-rotation", is_flag=True, help="The tracker gives the inverse rotation.")
+@click.option("--like", type=_FILE, metavar="SCAN.mcap", help="Take geometry and calibration from this scan.")
+@click.option("--head-geometry", type=_FILE, metavar="HEAD.json", help="Where the taxels and the tracker sit.")
+@click.option("--array-calibration", type=_FILE, metavar="ARRAY.json", help="From `calibrate array`.")
+@click.option("--uncalibrated", is_flag=True, help="Record with the nominal gain: for bladder steps.")
+@click.option("--accept-calibration", is_flag=True, help="Even when it is stale or another head's.")
+@click.option("--calibration-days", type=click.FloatRange(min=0.0), default=1.0, show_default=True, help="Stale after.")
+@click.option("--landmarks", type=_FILE, metavar="FILE", help="Take landmarks from a JSON file or a scan.")
+@click.option("--side", type=click.Choice(["left", "right", "phantom"]), help="Which breast.")
+@click.option("--posture", type=click.Choice(["supine", "oblique", "sitting", "phantom"]), help="During the scan.")
+@click.option("--lubricant", metavar="TEXT", help="What was put on the skin.")
+@click.option("--examiner", metavar="CODE", help=_CODE)
+@click.option("--subject", metavar="CODE", help=_CODE)
+@click.option("--force", is_flag=True, help="Overwrite the output.")
+@click.pass_context
+def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
+    """Record a scan head and a tracker.
+
+    On a terminal, `n` and `x` touch the sternal notch and the xiphoid, space starts, `q` or Ctrl-C stops; with
+    --duration, or without a terminal, recording starts at once. The file can be read at any moment: a kill costs at
+    most the last fraction of a second, and `repair` closes what was cut off.
+
+    Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
+    """
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.report.record_text import record_text
+
+    refuse_existing(output, force=bool(options["force"]))
+    request = Request(output=output, **options)
+    report, interrupted = _record(request)
+    click.echo(record_text(report, output=str(output)), nl=False)
+    if report.fault:
+        raise DeviceError(report.fault)
+    ctx.exit(EXIT_INTERRUPTED if interrupted and request.duration_s is not None else 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """The options of one recording, as they were given."""
+
+    output: Path
+    head_url: str
+    tracker_url: str | None
+    tracker_protocol: str
+    head_baud: int
+    tracker_baud: int | None
+    every: int
+    duration_s: float | None
+    clock: str
+    invert_rotation: bool
+    like: Path | None
+    head_geometry: Path | None
+    array_calibration: Path | None
+    uncalibrated: bool
+    accept_calibration: bool
+    calibration_days: float
+    landmarks: Path | None
+    side: str | None
+    posture: str | None
+    lubricant: str | None
+    examiner: str | None
+    subject: str | None
+    force: bool
+
+    def session(self, hello: HelloReading) -> dict[str, str]:
+        """Plain text facts for the file."""
+        facts = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
+        tracker = self.tracker_protocol if self.tracker_url else "none"
+        devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker}
+        more = {"clock": self.clock, "rotation": "inverted"} if self.invert_rotation else {"clock": self.clock}
+        return devices | more | {name: value for name, value in facts.items() if value}
+
+    def settings(self, hello: HelloReading) -> dict[str, Any]:
+        """For the provenance."""
+        return {
+            "tracker_protocol": self.tracker_protocol if self.tracker_url else None,
+            "rate_hz": hello.rate_hz / self.every,
+            "every": self.every,
+            "clock": self.clock,
+            "invert_rotation": self.invert_rotation,
+            "calibrated": not self.uncalibrated,
+        }
+
+
+def _record(request: Request) -> tuple[Report, bool]:
+    """Check everything, record, close the file; the account, and whether somebody interrupted."""
+    from dataclasses import asdict
+    from datetime import date
+
+    from tactile_bayes.commands.record_parts import Stopper, instrument_of, provenance_of, refuse_calibration
+    from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
+    from tactile_bayes.hardware.recorder import Recorder
+
+    head, calibration, landmarks = instrument_of(request)
+    with ExitStack() as stack:
+        hello, lines = _connect(request, stack)
+        _check_fit(hello, head, request)
+        refuse_calibration(request, head_id=hello.device_id, today=date.today())
+        stream = stack.enter_context(create_exclusive(request.output, force=request.force))
+        writer = RecordingWriter(
+            stream,
+            head=head,
+            element_calibration=calibration,
+            session=request.session(hello),
+            provenance=provenance_of(request, request.settings(hello)),
+            path=request.output,
+        )
+        recorder = Recorder(
+            *lines,
+            writer,
+            shared_clock=request.clock == "shared",
+            invert_rotation=request.invert_rotation,
+            duration_s=request.duration_s,
+            observer=None,
+        )
+        _place(landmarks, writer)
+        stopper = stack.enter_context(Stopper(recorder))
+        try:
+            report = _run(recorder, stopper, head, request)
+            writer.close(asdict(report))
+        except OSError as error:
+            raise full_disk(request.output, error) from None
+    return report, stopper.interrupted
+
+
+def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:
+    """Open the ports, check who is there, start the reading processes."""
+    from tactile_bayes.hardware import head
+    from tactile_bayes.hardware.drivers import TRACKERS, check_head
+    from tactile_bayes.hardware.head import HeadParser
+    from tactile_bayes.hardware.ports import Port
+    from tactile_bayes.hardware.recorder import Line
+    from tactile_bayes.hardware.streams import read_in_process
+
+    port = Port(request.head_url, baud=request.head_baud, role="head")
+    stack.callback(port.close)
+    hello = check_head(port, every=request.every)
+    start = head.encode_command(head.START, every=request.every)
+    parser = HeadParser(every=request.every)
+    parser.hello = hello
+    stop = head.encode_command(head.STOP)
+    tracker_port = None
+    if request.tracker_url:
+        driver = TRACKERS[request.tracker_protocol]
+        tracker_port = Port(request.tracker_url, baud=request.tracker_baud or driver.baud or 9600, role="tracker")
+        stack.callback(tracker_port.close)
+        driver.check(tracker_port)
+    head_stream = read_in_process(port)
+    stack.callback(head_stream.close)
+    line = Line("head", port, head_stream, parser, start, stop)
+    if tracker_port is None:
+        return hello, (line, None)
+    tracker_stream = read_in_process(tracker_port)
+    stack.callback(tracker_stream.close)
+    return hello, (line, Line("tracker", tracker_port, tracker_stream, driver.parser(), driver.start, driver.stop))
+
+
+def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> None:
+    if (hello.rows, hello.columns) != head.shape:
+        raise UsageError(
+            f"head {request.head_url} has {hello.rows} x {hello.columns} taxels, the geometry given is for "
+            f"{head.shape[0]} x {head.shape[1]}; give this head's"
+        )
+    if request.every > 1:
+        click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
+
+
+def _place(landmarks: Landmarks | None, writer: Any) -> None:
+    if landmarks is None:
+        return
+    for name in ("sternal_notch", "xiphoid"):
+        writer.add_landmark(name, getattr(landmarks, f"{name}_mm"), device_ns=0, host_ns=0)
+
+
+def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:
+    from tactile_bayes.commands.record_parts import Keys
+
+    with Keys(recorder, head.scanhead_from_tracker, wait=request.duration_s is None) as keys:
+        if not keys.waiting:
+            recorder.start()
+
+        def look() -> None:
+            keys.look()
+            stopper.look()
+
+        return recorder.run(look)

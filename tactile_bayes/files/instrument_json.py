@@ -1,0 +1,132 @@
+"""What `record` must know of an instrument: the head's geometry, the array's calibration, landmarks; JSON each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import unreadable, write_text
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_parts import (
+    calibration_document,
+    calibration_from_document,
+    head_document,
+    head_from_document,
+)
+from tactile_bayes.files.schema import dump_json
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
+
+HEAD_SCHEMA: Final = "tactile-bayes/head/1"
+ARRAY_SCHEMA: Final = "tactile-bayes/array-calibration/1"
+LANDMARKS_SCHEMA: Final = "tactile-bayes/landmarks/1"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayCalibrationFile:
+    """An array's calibration with where it came from.
+
+    Parameters
+    ----------
+    calibration
+        Gains, offsets, curvatures.
+    head_id
+        The head it was measured on.
+    day
+        When it was measured.
+    quality
+        Figures of the fit.
+    """
+
+    calibration: ElementCalibration
+    head_id: str
+    day: date
+    quality: Mapping[str, Any]
+
+
+def write_array_calibration(
+    path: Path, content: ArrayCalibrationFile, *, provenance: Provenance, force: bool = False
+) -> None:
+    """Write the calibration of an array."""
+    document = {
+        "schema": ARRAY_SCHEMA,
+        "head_id": content.head_id,
+        "date": content.day.isoformat(),
+        "units": {"gain": "kPa per count", "offset": "kPa", "curvature": "kPa per count squared"},
+        **calibration_document(content.calibration),
+        "quality": dict(content.quality),
+        "provenance": provenance.as_dict(),
+    }
+    write_text(path, dump_json(document), force=force)
+
+
+def read_array_calibration(path: Path) -> ArrayCalibrationFile:
+    """Read the calibration of an array.
+
+    Raises
+    ------
+    BadDataError
+        When it is another file, or damaged.
+    """
+    document = _read(path, ARRAY_SCHEMA, way_out="give a file from `tactile-bayes calibrate array`")
+    try:
+        return ArrayCalibrationFile(
+            calibration=calibration_from_document(document),
+            head_id=str(document["head_id"]),
+            day=date.fromisoformat(document["date"]),
+            quality=document.get("quality", {}),
+        )
+    except BadDataError as error:
+        raise error.at(path) from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadDataError(f"lacks a head_id or a date ({error})", way_out="calibrate again", path=str(path)) from None
+
+
+def write_head_geometry(path: Path, head: HeadGeometry, *, force: bool = False) -> None:
+    """Write where the taxels sit and how the tracker is mounted."""
+    write_text(path, dump_json({"schema": HEAD_SCHEMA, **head_document(head)}), force=force)
+
+
+def read_head_geometry(path: Path) -> HeadGeometry:
+    """Read where the taxels sit and how the tracker is mounted."""
+    document = _read(path, HEAD_SCHEMA, way_out="give surface_mm, pitch_mm and scanhead_from_tracker")
+    try:
+        return head_from_document(document)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def write_landmarks(path: Path, landmarks: Landmarks, *, force: bool = False) -> None:
+    """Write two points in `base`."""
+    points = {name: getattr(landmarks, name).tolist() for name in ("sternal_notch_mm", "xiphoid_mm")}
+    write_text(path, dump_json({"schema": LANDMARKS_SCHEMA, **points}), force=force)
+
+
+def read_landmarks(path: Path) -> Landmarks:
+    """Read two points in `base`."""
+    document = _read(path, LANDMARKS_SCHEMA, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
+    try:
+        return Landmarks(*(np.array(document[name], dtype=np.float64) for name in ("sternal_notch_mm", "xiphoid_mm")))
+    except BadDataError as error:
+        raise error.at(path) from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadDataError(f"lacks a landmark ({error})", way_out="give three numbers each", path=str(path)) from None
+
+
+def _read(path: Path, schema: str, *, way_out: str) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise unreadable(path, error) from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise BadDataError(f"is not a JSON file ({error})", way_out=way_out, path=str(path)) from None
+    found = document.get("schema") if isinstance(document, dict) else None
+    if found != schema:
+        raise BadDataError(f"has schema {found!r}, not {schema!r}", way_out=way_out, path=str(path))
+    return dict(document)

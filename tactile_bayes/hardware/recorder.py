@@ -1,0 +1,338 @@
+"""Take what devices send and hand it to a writer, losing nothing and saying what was lost on the way."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+import numpy as np
+
+from tactile_bayes.errors import DeviceError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.hardware.clocks import PoseClock
+from tactile_bayes.hardware.landmarks import LandmarkTouch
+from tactile_bayes.hardware.ports import Port
+from tactile_bayes.hardware.readings import CountArray, EndReading, FrameReading, Parser, PoseReading
+from tactile_bayes.hardware.streams import Stream
+
+FLUSH_S: Final = 0.2
+DRAIN_S: Final = 0.25
+SILENT_S: Final = 3.0
+_TICK_S: Final = 0.05
+
+
+class Sink(Protocol):
+    """Where a recording goes; `files` has the one for scan files."""
+
+    def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None:
+        """One frame."""
+
+    def add_pose(self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int) -> None:
+        """One pose."""
+
+    def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None:
+        """One touch."""
+
+    def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None:
+        """Something to know about the data at this time."""
+
+    def flush(self) -> None:
+        """What was added so far is safe when this process dies."""
+
+
+class Observer(Protocol):
+    """Who looks on while a recording runs; must not wait."""
+
+    def frame(self, counts: CountArray, device_ns: int) -> None:
+        """A frame was recorded."""
+
+    def pose(self, pose: PoseReading, device_ns: int) -> None:
+        """A pose was recorded."""
+
+    def told(self, report: Report) -> None:
+        """Several times a second: the account so far."""
+
+
+@dataclass(slots=True)
+class Report:
+    """The account of a recording, in records unless it says bytes."""
+
+    frames: int = 0
+    frames_lost: int = 0
+    frames_backwards: int = 0
+    head_dropped: int = 0
+    poses: int = 0
+    poses_repeated: int = 0
+    poses_flagged: int = 0
+    poses_without_time: int = 0
+    head_garbage_bytes: int = 0
+    tracker_garbage_bytes: int = 0
+    overrun_bytes: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    longest_wait_ms: float = 0.0
+    ended_by: str = ""
+    fault: str = ""
+    landmarks: list[str] = field(default_factory=list)
+
+    @property
+    def duration_s(self) -> float:
+        """By the head's clock, from the first frame to the last."""
+        return (self.last_ns - self.first_ns) / 1e9
+
+
+@dataclass(slots=True)
+class Line:
+    """One device in use: its port, its reading process, its parser, the commands that start and stop it."""
+
+    role: str
+    port: Port
+    stream: Stream
+    parser: Parser
+    start: bytes
+    stop: bytes
+    heard_ns: int = 0
+    finished: bool = False
+
+
+class Recorder:
+    """Runs one recording.
+
+    Parameters
+    ----------
+    head, tracker
+        Devices that were checked and do not stream yet; a recording without tracker has no poses.
+    sink
+        Gets everything in order of arrival.
+    shared_clock
+        See `PoseClock`.
+    invert_rotation
+        The tracker gives the rotation from base to sensor; it is turned round.
+    duration_s
+        By the head's clock; None goes on until it is stopped.
+    observer
+        Looks on.
+    clock_ns
+        Host time, the one the reading processes stamp with.
+    """
+
+    def __init__(
+        self,
+        head: Line,
+        tracker: Line | None,
+        sink: Sink,
+        *,
+        shared_clock: bool = False,
+        invert_rotation: bool = False,
+        duration_s: float | None = None,
+        observer: Observer | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.report = Report()
+        self._head, self._tracker, self._sink = head, tracker, sink
+        self._lines = [line for line in (head, tracker) if line is not None]
+        self._clock = PoseClock(shared=shared_clock)
+        self._invert = invert_rotation
+        self._duration_ns = None if duration_s is None else round(duration_s * 1e9)
+        self._observer = observer
+        self._now_ns = clock_ns
+        self._zero_ns = clock_ns()
+        self._touch: LandmarkTouch | None = None
+        self._last_pose: PoseReading | None = None
+        self._pose_ns = -1
+        self._drain_until_ns: int | None = None
+        self.recording = False
+
+    def start(self) -> None:
+        """Let the devices send and record it."""
+        for line in reversed(self._lines):  # the tracker first, so that no frame is without a pose
+            line.port.write(line.start)
+            line.heard_ns = self._now_ns()
+        self.recording = True
+
+    def listen(self) -> None:
+        """Let the tracker send for landmarks, before the scan starts."""
+        if self._tracker is not None:
+            self._tracker.port.write(self._tracker.start)
+
+    def touch(self, landmark: LandmarkTouch) -> None:
+        """Average the next poses for a landmark."""
+        self._touch = landmark
+
+    def stop(self, why: str) -> None:
+        """End the recording when what is on its way has arrived."""
+        if not self.report.ended_by:
+            self.report.ended_by = why
+            self._drain_until_ns = self._now_ns() + round(DRAIN_S * 1e9)
+
+    def run(self, each_tick: Callable[[], None] = lambda: None) -> Report:
+        """Record until the end; `each_tick` is called many times a second and may call `stop`, `start` and `touch`.
+
+        Whatever happens, the devices are told to stop and the account is complete.
+        """
+        flushed_ns = self._now_ns()
+        try:
+            while not self._done():
+                self._take()
+                each_tick()
+                now = self._now_ns()
+                if now - flushed_ns > FLUSH_S * 1e9:
+                    flushed_ns = now
+                    self._sink.flush()
+                    self._account()
+                self._look_for_silence(now)
+        finally:
+            self._hush()
+            self._account()
+        return self.report
+
+    def _take(self) -> None:
+        """Wait a moment for bytes and deal with all of them."""
+        waiting = [line.stream for line in self._lines if not line.stream.ended]
+        if not waiting:
+            time.sleep(_TICK_S)
+        ready, _, _ = select.select(waiting, [], [], _TICK_S)
+        for line in self._lines:
+            if line.stream not in ready:
+                continue
+            for host_ns, data in line.stream.read():
+                line.heard_ns = host_ns
+                for reading in line.parser.feed(data):
+                    self._read(line, reading, host_ns)
+            if line.stream.ended and not line.finished:
+                self._gone(line)
+
+    def _read(self, line: Line, reading: object, host_ns: int) -> None:
+        match reading:
+            case FrameReading():
+                self._frame(reading, host_ns)
+            case PoseReading():
+                self._pose(reading, host_ns)
+            case EndReading():
+                self._ended(line, reading)
+            case _:
+                pass
+
+    def _frame(self, reading: FrameReading, host_ns: int) -> None:
+        report, host_ns = self.report, host_ns - self._zero_ns
+        if not self.recording or (report.frames and reading.device_ns <= report.last_ns):
+            report.frames_backwards += self.recording
+            return
+        self._clock.head.observe(reading.device_ns, host_ns)
+        if not report.frames:
+            report.first_ns = reading.device_ns
+        elif self._duration_ns is not None and reading.device_ns - report.first_ns >= self._duration_ns:
+            self.stop("duration")
+            return
+        if reading.lost:
+            report.frames_lost += reading.lost
+            self._note(f"{reading.lost} frames lost before this one", "head", reading.device_ns, host_ns)
+        self._sink.add_frame(reading.counts, device_ns=reading.device_ns, host_ns=max(0, host_ns))
+        report.frames += 1
+        report.last_ns = reading.device_ns
+        report.longest_wait_ms = max(report.longest_wait_ms, (self._now_ns() - self._zero_ns - host_ns) / 1e6)
+        if self._observer is not None:
+            self._observer.frame(reading.counts, reading.device_ns)
+
+    def _pose(self, reading: PoseReading, host_ns: int) -> None:
+        if self._invert:
+            w, i, j, k = reading.quaternion_wxyz
+            reading = reading._replace(quaternion_wxyz=(w, -i, -j, -k))
+        host_ns -= self._zero_ns
+        self._touched(reading, host_ns)
+        if not self.recording:
+            return
+        device_ns = self._clock.place(reading.device_ns, host_ns)
+        if device_ns is None:
+            self.report.poses_without_time += 1
+            return
+        flags = self._flags(reading)
+        position, turn = np.array(reading.position_mm), np.array(reading.quaternion_wxyz)
+        self._sink.add_pose(position, turn, device_ns=device_ns, host_ns=max(0, host_ns))
+        self.report.poses += 1
+        self._pose_ns = device_ns
+        if flags:
+            serious = flags != ("repeated",)
+            self._note(", ".join(flags), "tracker", device_ns, host_ns, serious=serious)
+        if self._observer is not None:
+            self._observer.pose(reading, device_ns)
+
+    def _flags(self, reading: PoseReading) -> tuple[str, ...]:
+        """What the device says against a pose, and whether it repeats the last one."""
+        self.report.poses_flagged += bool(reading.flags)
+        last, self._last_pose = self._last_pose, reading
+        if last is None or (last.position_mm, last.quaternion_wxyz) != (reading.position_mm, reading.quaternion_wxyz):
+            return reading.flags
+        self.report.poses_repeated += 1
+        return (*reading.flags, "repeated")
+
+    def _touched(self, reading: PoseReading, host_ns: int) -> None:
+        touch = self._touch.add(reading) if self._touch else None
+        if touch is None:
+            return
+        self._touch = None
+        self.report.landmarks.append(str(touch))
+        device_ns = max(0, self._pose_ns)
+        self._sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
+        self._note(str(touch), "tracker", device_ns, host_ns, serious=not touch.steady)
+
+    def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:
+        self._sink.add_note(text, device=device, device_ns=device_ns, host_ns=max(0, host_ns), serious=serious)
+
+    def _ended(self, line: Line, reading: EndReading) -> None:
+        if not self.recording:
+            return
+        line.finished = True
+        if line is self._head:
+            self.report.head_dropped = reading.dropped
+            self.stop("the head stopped")
+
+    def _gone(self, line: Line) -> None:
+        """The cable was pulled, or the device's program ended."""
+        line.finished = True
+        if self.report.ended_by:
+            return
+        lost = f"after {self.report.duration_s:.2f} s" if self.report.frames else "before the first frame"
+        self.report.fault = (
+            f"{line.port.name}: more data was expected, the device has gone {lost}; check its cable and record again"
+        )
+        self.stop(f"the {line.role} has gone")
+
+    def _look_for_silence(self, now_ns: int) -> None:
+        if not self.recording or self.report.ended_by:
+            return
+        for line in self._lines:
+            silent_s = (now_ns - line.heard_ns) / 1e9
+            if silent_s > SILENT_S and not line.finished:
+                self.report.fault = (
+                    f"{line.port.name}: more data was expected, nothing has come for {silent_s:.1f} s; check that the "
+                    "device runs and record again"
+                )
+                self.stop(f"the {line.role} fell silent")
+
+    def _done(self) -> bool:
+        """Whether all that belongs to the recording has arrived."""
+        if self._drain_until_ns is None:
+            return False
+        tracker = self._tracker
+        behind = tracker is not None and not tracker.finished and self._pose_ns < self.report.last_ns
+        return not behind or self._now_ns() > self._drain_until_ns
+
+    def _account(self) -> None:
+        report = self.report
+        report.head_garbage_bytes = self._head.parser.garbage_bytes
+        report.tracker_garbage_bytes = self._tracker.parser.garbage_bytes if self._tracker else 0
+        report.overrun_bytes = sum(line.stream.overrun_bytes for line in self._lines)
+        if self._observer is not None:
+            self._observer.told(report)
+
+    def _hush(self) -> None:
+        """Tell the devices to stop; those that have gone need no telling."""
+        for line in self._lines:
+            with contextlib.suppress(DeviceError):
+                line.port.write(line.stop)
+            line.stream.stop()

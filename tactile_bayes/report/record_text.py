@@ -1,0 +1,32 @@
+"""The account of a recording in words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    from tactile_bayes.hardware.recorder import Report
+
+
+def record_text(report: Report, *, output: str) -> str:
+    """A few lines on what was recorded and what is missing."""
+    rate = (report.frames - 1) / report.duration_s if report.frames > 1 and report.duration_s > 0 else 0.0
+    dropped = f" (the head dropped {report.head_dropped})" if report.head_dropped else ""
+    lines = [
+        f"{output}: scan, ended by {report.ended_by}",
+        f"{report.frames} frames in {report.duration_s:.3f} s, {rate:.1f} Hz; {report.poses} poses",
+        f"frames lost {report.frames_lost}{dropped}",
+        f"poses repeated {report.poses_repeated}, flagged {report.poses_flagged}",
+        *report.landmarks,
+    ]
+    odd = {
+        "frames out of order, left out": report.frames_backwards,
+        "poses without a time, left out": report.poses_without_time,
+        "bytes from the head that made no sense": report.head_garbage_bytes,
+        "bytes from the tracker that made no sense": report.tracker_garbage_bytes,
+        "bytes this computer came too late for": report.overrun_bytes,
+    }
+    lines += [f"{words}: {number}" for words, number in odd.items() if number]
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"

@@ -1,0 +1,353 @@
+"""`record` against emulated devices, and everything that can end it."""
+
+from __future__ import annotations
+
+import os
+import pty
+import resource
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from emulated_devices import head_and_tracker, serving, short_scan
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from tactile_bayes.cli import cli
+from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, write_scan
+from tactile_bayes.hardware.emulated import EmulatedTracker, Faults
+from tactile_bayes.hardware.emulator import PtyLink
+from tactile_bayes.hardware.readings import MM_PER_INCH
+from tactile_bayes.mapping import build_map
+from tactile_bayes.scan import Scan
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("source") / "source.mcap"
+    write_scan(path, short_scan(), provenance=Provenance("test", {}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def scan(source) -> Scan:
+    return read_scan(source)
+
+
+@pytest.fixture(scope="module")
+def long_scan() -> Scan:
+    return short_scan(4.0)
+
+
+@pytest.fixture
+def start(child_environment, tmp_path, source):
+    """Start `record` in the background: ``start(words, output)``."""
+    processes = []
+
+    def begin(words, output="a.mcap", **options):
+        arguments = [sys.executable, "-m", "tactile_bayes", "record", "-o", output, *words, "--like", source]
+        process = subprocess.Popen(
+            [str(word) for word in arguments],
+            cwd=tmp_path,
+            env=child_environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **options,
+        )
+        processes.append(process)
+        return process
+
+    yield begin
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def wait_for_bytes(path: Path, size: int) -> None:
+    """Until a recording has written that much."""
+    for _ in range(1000):
+        if path.exists() and path.stat().st_size >= size:
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"{path} did not grow")
+
+
+@pytest.fixture
+def record(tmp_path, source, monkeypatch):
+    """Run `record` in this process, without a terminal: ``record(*words)``, in `tmp_path`, like `source`."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words, like=True):
+        given = [*words, *(["--like", source] if like else [])]
+        done = CliRunner().invoke(cli, ["record", "-o", "a.mcap", *map(str, given)])
+        error = done.exception
+        known = isinstance(error, TactileBayesError)
+        if error is not None and not known and not isinstance(error, SystemExit):
+            raise error
+        return subprocess.CompletedProcess(
+            given,
+            error.exit_code if known else done.exit_code,
+            done.stdout,
+            done.stderr + (f"error: {error}\n" if known else ""),
+        )
+
+    return run
+
+
+# The emulated devices run faster than life where nothing depends on the time it takes.
+FAST = 5.0
+
+
+def notes(path: Path) -> list[tuple[str, str]]:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [(m.name, m.message) for _, _, _, m in reader.iter_decoded_messages(topics=["/log"])]
+
+
+@pytest.mark.parametrize("tcp", [False, True], ids=["pty", "tcp"])
+def test_a_recorded_scan_gives_the_bit_identical_map(record, tmp_path, source, scan, tcp):
+    with head_and_tracker(scan, tcp=tcp, speed=FAST) as devices:
+        words = ["--clock", "shared", "--landmarks", source, "--side", "phantom", "--examiner", "E7"]
+        done = record(*devices, *words)
+    assert done.returncode == 0, done.stderr
+    assert "200 frames in 0.995 s, 200.0 Hz; 120 poses" in done.stdout
+    assert "frames lost 0" in done.stdout
+    path = tmp_path / "a.mcap"
+    file = read_scan_report(path)
+    assert file.complete
+    np.testing.assert_array_equal(file.scan.frames.counts, scan.frames.counts)
+    np.testing.assert_array_equal(file.scan.frames.time_s, scan.frames.time_s)
+    one, other = build_map([file.scan]), build_map([scan])
+    for name in ("mean", "variance", "count", "x_mm", "y_mm", "plane_from_base", "patient_from_plane"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    assert file.scan.session["examiner"] == "E7"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_the_reference_reader_opens_a_recording(record, tmp_path, scan):
+    with head_and_tracker(scan, head_faults=Faults(drop=0.05), speed=FAST) as devices:
+        done = record(*devices)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        kinds = {schema.name for schema, *_ in reader.iter_decoded_messages()}
+        counts = reader.get_summary().statistics.channel_message_counts
+        account = {m.name: m.metadata for m in reader.iter_metadata()}["recording"]
+    assert kinds == {"foxglove.Grid", "foxglove.PoseInFrame", "foxglove.Log"}
+    lost = int(account["frames_lost"])
+    assert lost > 0
+    assert counts[1] == int(account["frames"]) == 200 - lost
+    gaps = [int(text.split()[0]) for device, text in notes(tmp_path / "a.mcap") if device == "head"]
+    assert sum(gaps) == lost
+    assert f"frames lost {lost}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "protocol",
+    [
+        "fastrak",
+        "bird",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("liberty", "liberty-ascii", "igtlink")),
+    ],
+)
+def test_every_tracker_is_recorded_as_its_wire_carries_it(record, tmp_path, scan, protocol):
+    tcp = protocol == "igtlink"
+    with head_and_tracker(scan, protocol=protocol, tcp=tcp, speed=1.0 if tcp else FAST) as devices:
+        done = record(*devices)
+    assert done.returncode == 0, done.stderr
+    poses = read_scan(tmp_path / "a.mcap").poses
+    step = {"bird": 0.12, "liberty-ascii": 2e-4}.get(protocol, 1e-4)
+    # before the head's first frame there is no time to place a pose at: the first few may be missing
+    assert 80 <= len(poses) <= 120
+    assert np.abs(poses.position_mm - scan.poses.position_mm[120 - len(poses) :]).max() < step
+    assert np.diff(poses.time_s).min() >= 0
+
+
+def test_a_shared_clock_and_single_precision_give_the_map_of_the_scan_as_the_wire_carries_it(record, tmp_path, scan):
+    with head_and_tracker(scan, protocol="liberty", speed=FAST) as devices:
+        words = [*devices, "--clock", "shared"]
+        done = record(*words)
+    assert done.returncode == 0, done.stderr
+    got = read_scan(tmp_path / "a.mcap").poses
+    inches = (scan.poses.position_mm / MM_PER_INCH).astype(np.float32).astype(np.float64)
+    np.testing.assert_array_equal(got.position_mm, inches * MM_PER_INCH)
+    np.testing.assert_array_equal(got.quaternion_wxyz, scan.poses.quaternion_wxyz.astype(np.float32))
+    np.testing.assert_array_equal(np.rint(got.time_s * 1000), np.floor(scan.poses.time_s * 1000 + 1e-6))
+
+
+def test_faults_are_counted_and_noted(record, tmp_path, scan):
+    spoilt, held = Faults(corrupt=0.1, stall=(0.3, 0.1)), Faults(hold=3)
+    with head_and_tracker(scan, head_faults=spoilt, tracker_faults=held, speed=FAST) as devices:
+        done = record(*devices)
+    assert done.returncode == 0, done.stderr
+    assert "the head dropped 20" in done.stdout
+    assert "bytes from the head that made no sense" in done.stdout
+    repeated = [text for device, text in notes(tmp_path / "a.mcap") if device == "tracker" and "repeated" in text]
+    assert len(repeated) >= 70
+    assert f"poses repeated {len(repeated)}" in done.stdout
+    frames = read_scan(tmp_path / "a.mcap").frames
+    rows = np.rint(frames.time_s * 200).astype(int)
+    np.testing.assert_array_equal(frames.counts, scan.frames.counts[rows])
+
+
+def test_a_kill_costs_the_last_fraction_of_a_second(tmp_path, start, run_cli, long_scan):
+    with head_and_tracker(long_scan) as devices:
+        process = start(devices)
+        wait_for_bytes(tmp_path / "a.mcap", 250_000)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    file = read_scan_report(tmp_path / "a.mcap")
+    assert not file.complete
+    assert "everything after" in file.lost[0]
+    assert len(file.scan.frames) >= 100
+    done = run_cli("repair", "a.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "everything after" in done.stdout
+    mended = read_scan_report(tmp_path / "a.mcap")
+    assert mended.complete
+    np.testing.assert_array_equal(mended.scan.frames.counts, file.scan.frames.counts)
+
+
+@pytest.mark.parametrize(("number", "words"), [(signal.SIGTERM, "SIGTERM"), (signal.SIGINT, "Ctrl-C")])
+def test_a_signal_ends_the_recording_in_order(tmp_path, start, long_scan, number, words):
+    with head_and_tracker(long_scan) as devices:
+        process = start(devices)
+        wait_for_bytes(tmp_path / "a.mcap", 150_000)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    assert f"ended by {words}" in out
+    file = read_scan_report(tmp_path / "a.mcap")
+    assert file.complete
+    assert f"{len(file.scan.frames)} frames" in out
+
+
+@pytest.mark.parametrize("role", ["head", "tracker"])
+def test_a_pulled_cable_ends_it_with_one_line(record, tmp_path, scan, role):
+    pulled = {f"{role}_faults": Faults(disconnect_s=0.5)}
+    with head_and_tracker(scan, **pulled, speed=FAST) as devices:
+        done = record(*devices)
+    assert done.returncode == 4, done.stderr
+    assert done.stderr.count("\n") == 1
+    url = devices[devices.index(f"--{role}") + 1]
+    assert done.stderr.startswith(f"error: {role} {url}: more data was expected, the device has gone after 0.")
+    file = read_scan_report(tmp_path / "a.mcap")
+    assert file.complete
+    assert 90 <= len(file.scan.frames) <= 115
+
+
+def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, start, long_scan):
+    def little_room() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+
+    with head_and_tracker(long_scan) as devices:
+        process = start(devices, preexec_fn=little_room)
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == 3
+    assert "cannot be written on (File too large)" in err
+    assert err.count("\n") == 1
+    assert "`tactile-bayes repair`" in err
+    assert len(read_scan_report(tmp_path / "a.mcap").scan.frames) > 50
+
+
+def test_a_duration_is_by_the_heads_clock(record, tmp_path, scan):
+    with head_and_tracker(scan, speed=FAST) as devices:
+        words = [*devices, "--clock", "shared", "--duration", 0.5]
+        done = record(*words)
+    assert done.returncode == 0, done.stderr
+    assert "100 frames in 0.495 s" in done.stdout
+    recorded = read_scan(tmp_path / "a.mcap")
+    assert recorded.poses.time_s[-1] >= recorded.frames.time_s[-1] - 0.01
+
+
+def test_one_frame_in_four_is_asked_for(record, tmp_path, scan):
+    with head_and_tracker(scan, speed=FAST) as devices:
+        done = record(*devices, "--every", 4)
+    assert done.returncode == 0, done.stderr
+    assert "one frame in 4: 50 Hz" in done.stderr
+    assert "frames lost 0" in done.stdout
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.mcap").frames.counts, scan.frames.counts[::4])
+
+
+def test_a_rotation_can_be_turned_round(record, tmp_path, scan):
+    with head_and_tracker(scan, speed=FAST) as devices:
+        words = [*devices, "--clock", "shared", "--invert-rotation"]
+        done = record(*words)
+    assert done.returncode == 0, done.stderr
+    recorded = read_scan(tmp_path / "a.mcap")
+    np.testing.assert_array_equal(recorded.poses.quaternion_wxyz, scan.poses.quaternion_wxyz * [1, -1, -1, -1])
+    assert recorded.session["rotation"] == "inverted"
+
+
+def test_no_trace_is_left_when_the_devices_are_not_there(record, tmp_path):
+    done = record("--head", "/dev/nothing")
+    assert done.returncode == 4
+    assert done.stderr == (
+        "error: head /dev/nothing: cannot be opened (No such file or directory); "
+        "`tactile-bayes devices` lists what is there\n"
+    )
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_another_device_on_the_port_is_told_by_what_it_says(record, scan):
+    with serving(EmulatedTracker(scan.poses, protocol="bird"), PtyLink()) as emulator:
+        done = record("--head", emulator._link.url)
+    assert done.returncode == 4
+    assert "a HELLO packet was expected, " in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ([], 2, "--head-geometry HEAD.json or --like SCAN.mcap"),
+        (["--head", "nonsense://x", "--like", "SOURCE"], 4, "not a port"),
+        (["--head-baud", "115200", "--like", "SOURCE"], 4, "--every 15"),
+        (["--tracker", "/dev/nothing", "--like", "SOURCE"], 4, "tracker /dev/nothing: cannot be opened"),
+        (["--examiner", "Dr Who", "--like", "SOURCE"], 3, "examiner"),
+    ],
+)
+def test_mistakes_end_in_one_line(record, source, scan, words, code, said):
+    with head_and_tracker(scan, speed=FAST) as devices:
+        given = [str(source) if word == "SOURCE" else word for word in words]
+        url = [] if "--head" in given else devices[:2]
+        done = record(*url, *given, like=False)
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_keys_touch_landmarks_start_and_stop(child_environment, tmp_path, source, long_scan):
+    near, far = pty.openpty()
+    with head_and_tracker(long_scan) as devices:
+        words = [sys.executable, "-m", "tactile_bayes", "record", "-o", "a.mcap", *devices, "--like", str(source)]
+        process = subprocess.Popen(
+            words, cwd=tmp_path, env=child_environment, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        assert process.stderr is not None
+        assert b"space start" in process.stderr.readline()
+        for key, answer in ((b"n", b"sternal notch at"), (b"x", b"xiphoid at"), (b" ", b"recording")):
+            os.write(near, key)
+            assert answer in process.stderr.readline()
+        wait_for_bytes(tmp_path / "a.mcap", 150_000)
+        os.write(near, b"q")
+        out, err = process.communicate(timeout=20)
+    os.close(near)
+    os.close(far)
+    assert process.returncode == 0, err
+    assert b"spread" in out
+    recorded = read_scan(tmp_path / "a.mcap")
+    assert recorded.landmarks is not None
+    assert np.linalg.norm(recorded.landmarks.xiphoid_mm) > 0
