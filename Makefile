@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check slow bench docs clean
+.PHONY: demo test check slow bench bench-map docs clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -28,6 +28,11 @@ slow: $(VENV)/.installed
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.run
+
+# Peers and the compiler are no dependencies of the program: they are installed here only.
+bench-map: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'boost-histogram>=1.4' '.[fast]'
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.map_speed
 
 docs: $(VENV)/.installed
 	$(BIN)/python docs/make_reference.py

@@ -12,16 +12,19 @@ from tactile_bayes.geometry import FloatArray, Plane, check_rigid
 from tactile_bayes.mapping.cells import CellSums
 from tactile_bayes.mapping.elements import TaxelFault
 from tactile_bayes.mapping.engine import Engine, NumpyEngine
-from tactile_bayes.mapping.frames import chunks, gate
+from tactile_bayes.mapping.frames import BoolArray, chunks, gate
 from tactile_bayes.mapping.plane import HeadMoments, MomentSums, head_moments
 from tactile_bayes.mapping.poses import FramePoses
-from tactile_bayes.mapping.project import Projector
+from tactile_bayes.mapping.project import Projection, Projector
 from tactile_bayes.mapping.readout import Readout
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry
 
 _TALLIES = ("frames_total", "frames_used", "dropped_no_pose", "dropped_elements", "dropped_low", "dropped_high")
+
+# Frames that are projected at once.
+_PORTION = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,32 +174,41 @@ class MapAccumulator:
             )
         if self._kept is not None:
             self._kept.append((counts, poses))
-        size = self._engine.chunk_frames(self.instrument.readout.size)
-        return sum(self._add(counts[part], poses.part(part)) for part in chunks(len(counts), size))
+        return sum(self._add(counts[part], poses.part(part)) for part in chunks(len(counts), _PORTION))
 
     def _add(self, counts: CountArray, poses: FramePoses) -> int:
-        instrument, readings = self.instrument, self.instrument.readout.counts(counts)
-        level, share = self._engine.levels(instrument.readout, readings)
-        low, high, used = gate(poses.known, level, share, pressure_window_kpa=instrument.pressure_window_kpa)
-        number = int(np.count_nonzero(used))
-        refused = int(np.count_nonzero(low)), int(np.count_nonzero(high))
-        unknown = len(counts) - int(np.count_nonzero(poses.known))
-        tallies = (len(counts), number, unknown, len(counts) - number - sum(refused) - unknown, *refused)
-        for name, value in zip(_TALLIES, tallies, strict=True):
-            self._tally[name] += value
-        if number < len(counts):
-            readings, poses, level, share = readings[used], poses.part(used), level[used], share[used]
+        """A portion: projected and counted as a whole, read in chunks that suit the engine."""
+        readout, projection = self.instrument.readout, self._projector.at(poses)
+        used = np.zeros(len(counts), dtype=bool)
+        for part in chunks(len(counts), self._engine.chunk_frames(readout.size)):
+            used[part] = self._read(readout.counts(counts[part]), poses.known[part], projection.part(part))
+        self._moments.add(FramePoses(poses.position_mm, poses.rotation, used))
+        return int(np.count_nonzero(used))
+
+    def _read(self, readings: CountArray, known: BoolArray, projection: Projection) -> BoolArray:
+        """Which frames of a chunk are used, after they were added."""
+        instrument, engine = self.instrument, self._engine
+        level, share = engine.levels(instrument.readout, readings)
+        low, high, used = gate(known, level, share, pressure_window_kpa=instrument.pressure_window_kpa)
+        number = self._count(known, low, high, used)
+        if number < len(used):
+            readings, projection, level, share = readings[used], projection.part(used), level[used], share[used]
         if number:
-            self._scatter(readings, poses, level)
             taxels, array = len(instrument.readout.taxels), instrument.readout.size
             self._saturated += int(np.rint((taxels - share * array).sum()))
-        return number
+            divisor = level if instrument.normalise == "mean" else np.ones(number)
+            engine.add(self._sums, instrument.readout, readings, projection=projection, level=divisor)
+        return used
 
-    def _scatter(self, readings: CountArray, poses: FramePoses, level: FloatArray) -> None:
-        readout, normalise = self.instrument.readout, self.instrument.normalise
-        self._moments.add(poses)
-        divisor = level if normalise == "mean" else np.ones(len(level))
-        self._engine.add(self._sums, readout, readings, projection=self._projector.at(poses), level=divisor)
+    def _count(self, known: BoolArray, low: BoolArray, high: BoolArray, used: BoolArray) -> int:
+        """Put each frame under one heading; the number used."""
+        total, number = len(used), int(np.count_nonzero(used))
+        refused = int(np.count_nonzero(low)), int(np.count_nonzero(high))
+        unknown = total - int(np.count_nonzero(known))
+        tallies = (total, number, unknown, total - number - sum(refused) - unknown, *refused)
+        for name, value in zip(_TALLIES, tallies, strict=True):
+            self._tally[name] += value
+        return number
 
     def merge(self, other: MapAccumulator) -> None:
         """Add all that another one was given.

@@ -80,7 +80,15 @@ class CellSums:
         steps = np.rint(value * (1.0 / VALUE_STEP))
         self.add_steps(first, shape, (row - first[0]) * shape[1] + (column - first[1]), steps)
 
-    def add_steps(self, first: tuple[int, int], shape: tuple[int, int], flat: IntArray, steps: FloatArray) -> None:
+    def add_steps(
+        self,
+        first: tuple[int, int],
+        shape: tuple[int, int],
+        flat: IntArray,
+        steps: FloatArray,
+        *,
+        bounded: bool = False,
+    ) -> None:
         """Add at most `READINGS_PER_CALL` values in whole steps; `steps` is used up.
 
         Parameters
@@ -91,14 +99,12 @@ class CellSums:
             Cell of each in the block, row by row.
         steps : (...) array
             Whole numbers; beyond `LIMIT_STEPS` either way they are clipped and counted.
+        bounded
+            Whether they are known to lie in 0 to `LIMIT_STEPS`.
         """
         self.make_room(first, shape)
-        lowest = float(steps.min())
-        if lowest < 0:
-            self.negative += int((steps < 0).sum())
-        if max(float(steps.max()), -lowest) > LIMIT_STEPS:
-            self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
-            np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
+        if not bounded:
+            self._count_and_clip(steps)
         cells, weights, index = shape[0] * shape[1], steps.ravel(), flat.ravel()
         square = np.bincount(index, weights * weights, cells).astype(np.int64)
         weights += 2.0**_PACK_BITS
@@ -107,6 +113,14 @@ class CellSums:
         self.add_block(
             first, count.reshape(shape), (packed - (count << _PACK_BITS)).reshape(shape), square.reshape(shape)
         )
+
+    def _count_and_clip(self, steps: FloatArray) -> None:
+        lowest = float(steps.min())
+        if lowest < 0:
+            self.negative += int((steps < 0).sum())
+        if max(float(steps.max()), -lowest) > LIMIT_STEPS:
+            self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
+            np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
 
     def add_block(self, first: tuple[int, int], count: IntArray, total: IntArray, square: IntArray) -> None:
         """Add sums over a block of the lattice."""

@@ -14,7 +14,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping import loops
 from tactile_bayes.mapping.cells import LIMIT_STEPS, READINGS_PER_CALL, VALUE_STEP, CellSums
 from tactile_bayes.mapping.project import Projection
-from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.mapping.readout import BoolArray, Readout
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.scan import CountArray
 
@@ -45,13 +45,19 @@ class Engine(Protocol):
 class NumpyEngine:
     """The core path: whole-array operations on chunks that stay in the processor's cache."""
 
+    def __init__(self) -> None:
+        # Pressures of the last chunk whose levels were asked for: most often it is added next.
+        self._last: tuple[CountArray, FloatArray, BoolArray | None] | None = None
+
     def chunk_frames(self, taxels: int) -> int:
         """Frames whose sums are exact in one call."""
         return max(1, min(128, READINGS_PER_CALL // max(1, taxels)))
 
     def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
         """Level in kPa and valid share of each frame."""
-        return readout.levels(*readout.pressure_kpa(counts))
+        pressure, valid = readout.pressure_kpa(counts)
+        self._last = (counts, pressure, valid)
+        return readout.levels(pressure, valid)
 
     def add(
         self, sums: CellSums, readout: Readout, counts: CountArray, *, projection: Projection, level: FloatArray
@@ -59,15 +65,18 @@ class NumpyEngine:
         """Scatter with `numpy.bincount`."""
         if not counts.size:
             return
-        steps, valid = readout.pressure_kpa(counts)
+        last, self._last = self._last, None
+        known = last is not None and last[0] is counts
+        steps, valid = (last[1], last[2]) if known and last is not None else readout.pressure_kpa(counts)
         steps *= (1.0 / VALUE_STEP / level)[:, None]
         np.rint(steps, out=steps)
         first, shape = projection.block()
         flat = projection.flat(first, shape)
+        bounded = _bounded(readout, level)
         if valid is None:
-            sums.add_steps(first, shape, flat, steps)
+            sums.add_steps(first, shape, flat, steps, bounded=bounded)
         elif valid.any():
-            sums.add_steps(first, shape, flat[valid], steps[valid])
+            sums.add_steps(first, shape, flat[valid], steps[valid], bounded=bounded)
 
 
 class LoopEngine:
@@ -83,9 +92,8 @@ class LoopEngine:
         self._levels, self._scatter = levels_loop, scatter_loop
 
     def chunk_frames(self, taxels: int) -> int:
-        """Enough that what a call costs beside its loop does not show."""
-        del taxels
-        return _FAST_FRAMES
+        """Enough that what a call costs beside its loop does not show, and few enough for the packed sums."""
+        return max(1, min(_FAST_FRAMES, 2**21 // max(1, taxels)))
 
     def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
         """Level in kPa and valid share of each frame."""
@@ -102,12 +110,13 @@ class LoopEngine:
         if not counts.size:
             return
         first, shape = projection.block()
-        cells = np.zeros((shape[0] * shape[1] + 1, 4), dtype=np.int64)
+        cells = np.zeros((shape[0] * shape[1] + 1, 2), dtype=np.int64)
         clipped, negative = self._scatter(
             counts,
             *_calibration(readout),
             1.0 / VALUE_STEP / level,
             LIMIT_STEPS,
+            readout.plain_count if _bounded(readout, level) else -1,
             projection.taxels_mm,
             projection.turn,
             projection.shift - np.array([first[1], first[0]]),
@@ -116,12 +125,21 @@ class LoopEngine:
         )
         sums.clipped += int(clipped)
         sums.negative += int(negative)
-        count, total, square = np.moveaxis(cells[:-1, :3].reshape(*shape, 3), -1, 0)
-        sums.add_block(first, count, total, square)
+        packed, square = cells[:-1, 0].reshape(shape), cells[:-1, 1].reshape(shape)
+        count = (packed + (1 << (loops.PACK_BITS - 1))) >> loops.PACK_BITS
+        sums.add_block(first, count, packed - (count << loops.PACK_BITS), square)
 
 
 def _calibration(readout: Readout) -> tuple[FloatArray, FloatArray, int, float]:
     return readout.gain_kpa, readout.offset_kpa, readout.full_count, PRESSURE_RANGE_KPA[1]
+
+
+def _bounded(readout: Readout, level: FloatArray) -> bool:
+    """Whether no valid reading over its frame's level can be negative or beyond what cells hold.
+
+    Valid readings lie below the sensor's range; then nobody has to look at each.
+    """
+    return readout.never_negative and PRESSURE_RANGE_KPA[1] / VALUE_STEP < LIMIT_STEPS * float(level.min())
 
 
 def fast_is_installed() -> bool:

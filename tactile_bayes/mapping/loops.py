@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+# Count and sum travel as one number: up to 2^21 readings of at most 2^18 steps sum to less than 2^39.
+PACK_BITS = 40
+
 # Arrays and numbers of the kinds named in the docstrings; a compiler infers them from the call.
 _Any = Any
 
@@ -45,6 +48,7 @@ def scatter_loop(
     top: _Any,
     scale: _Any,
     limit: _Any,
+    plain: _Any,
     taxels: _Any,
     turn: _Any,
     shift: _Any,
@@ -61,15 +65,17 @@ def scatter_loop(
         Steps a kPa, frame by frame.
     limit
         Largest value in steps.
+    plain
+        Frames without a count above it are known to be valid, not negative and within the limit.
     taxels, turn, shift
         See `tactile_bayes.mapping.project.Projection`; the shift is counted from the block's first cell.
     columns : int32
         Columns of the block.
-    cells : (rows x columns + 1, 4) int64
-        Count, sum and sum of squares of each cell, and nothing, which keeps a cell on one line of the cache. Invalid
-        readings go to the last row.
+    cells : (rows x columns + 1, 2) int64
+        Count x 2^`PACK_BITS` + sum, and sum of squares, of each cell. Invalid readings go to the last row.
     """
     index, steps = np.empty(counts.shape[1], np.int32), np.empty(counts.shape[1], np.int32)
+    one = np.int64(1) << np.int64(PACK_BITS)
     nowhere, clipped, negative = np.int32(cells.shape[0] - 1), 0, 0
     for f in range(counts.shape[0]):
         row = counts[f]
@@ -77,17 +83,23 @@ def scatter_loop(
             u = turn[f, 0, 0] * taxels[0, k] + turn[f, 0, 1] * taxels[1, k] + turn[f, 0, 2] * taxels[2, k] + shift[f, 0]
             v = turn[f, 1, 0] * taxels[0, k] + turn[f, 1, 1] * taxels[1, k] + turn[f, 1, 2] * taxels[2, k] + shift[f, 1]
             index[k] = np.int32(v) * columns + np.int32(u)
+        highest = row[0]
         for k in range(counts.shape[1]):
-            pressure = row[k] * gain[k] + offset[k]
-            value = np.rint(pressure * scale[f])
-            good = row[k] < full and pressure < top
-            index[k] = index[k] if good else nowhere
-            clipped += 1 if good and abs(value) > limit else 0
-            negative += 1 if good and value < 0 else 0
-            steps[k] = np.int32(min(max(value, -limit), limit))
+            highest = max(highest, row[k])
+        if highest <= plain:
+            for k in range(counts.shape[1]):
+                steps[k] = np.int32(np.rint((row[k] * gain[k] + offset[k]) * scale[f]))
+        else:
+            for k in range(counts.shape[1]):
+                pressure = row[k] * gain[k] + offset[k]
+                value = np.rint(pressure * scale[f])
+                good = row[k] < full and pressure < top
+                index[k] = index[k] if good else nowhere
+                clipped += 1 if good and abs(value) > limit else 0
+                negative += 1 if good and value < 0 else 0
+                steps[k] = np.int32(min(max(value, -limit), limit))
         for k in range(counts.shape[1]):
             i, step = index[k], np.int64(steps[k])
-            cells[i, 0] += 1
-            cells[i, 1] += step
-            cells[i, 2] += step * step
+            cells[i, 0] += one + step
+            cells[i, 1] += step * step
     return clipped, negative

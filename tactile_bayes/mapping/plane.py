@@ -18,7 +18,7 @@ from tactile_bayes.scan import HeadGeometry
 _POSITION_STEP = 2.0**-16
 _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
-_CHUNK = 512
+_CHUNK = 1024
 # Steps from one place up to 2^26 (1 m), and 2^10 frames: squares stay below 2^62. Beyond 2^52 steps floats have gaps.
 _FAR_STEPS = 2**26
 _FRAMES_AT_ONCE = 2**10
@@ -129,8 +129,8 @@ class MomentSums:
             self._add(rotation[start : start + _CHUNK], position[start : start + _CHUNK])
 
     def _add(self, rotation: FloatArray, position: FloatArray) -> None:
-        centres = np.rint((position + (rotation * self._middle).sum(axis=2)) * (1.0 / _POSITION_STEP))
-        if float(np.abs(centres).max()) > _FARTHEST_STEPS:
+        centres = np.rint((position + _times(rotation, self._middle)) * (1.0 / _POSITION_STEP))
+        if max(float(centres.max()), -float(centres.min())) > _FARTHEST_STEPS:
             raise BadDataError(
                 f"the head was {float(np.abs(centres).max()) * _POSITION_STEP:.3g} mm from the tracker's base",
                 way_out="check the unit of the positions (mm)",
@@ -146,8 +146,9 @@ class MomentSums:
         if int(np.abs(offset).max()) >= _FAR_STEPS:
             self._add_apart(rotation, position)
             return
-        spread = np.einsum("fij,jk,flk->fil", rotation, self._covariance, rotation)
-        axes = (rotation[:, None] * self._axes[None, :, None, :]).sum(axis=3)
+        turned = sum(rotation[:, :, j, None] * self._covariance[j] for j in range(3))
+        spread = sum(turned[:, :, None, k] * rotation[:, None, :, k] for k in range(3))
+        axes = np.stack([_times(rotation, axis) for axis in self._axes], axis=1)
         self._count += len(steps)
         self._first += offset.sum(axis=0)
         self._product += offset.T @ offset
@@ -177,6 +178,12 @@ def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
     sums = MomentSums(head)
     sums.add(poses)
     return sums.moments()
+
+
+def _times(rotation: FloatArray, vector: FloatArray) -> FloatArray:
+    """(n, 3) products of (n, 3, 3) rotations and one vector, term by term: any number of them has the same bits."""
+    product: FloatArray = rotation[:, :, 0] * vector[0] + rotation[:, :, 1] * vector[1] + rotation[:, :, 2] * vector[2]
+    return product
 
 
 def _whole(values: FloatArray) -> WholeArray:

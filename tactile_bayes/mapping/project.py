@@ -104,15 +104,28 @@ class Projector:
 
     def at(self, poses: FramePoses) -> Projection:
         """Projection of the frames at `poses` onto the cells of the plane."""
-        turn = (self._rows[None, :, :, None] * poses.rotation[:, None, :, :]).sum(axis=2)
+        turn = np.stack([_combined(row, poses.rotation) for row in self._rows], axis=1)
         offset = poses.position_mm - self._origin_mm  # first of all: bases may lie far away
-        shift = (self._rows[None, :, :] * offset[:, None, :]).sum(axis=2) + (turn * self._middle).sum(axis=2)
+        shift = np.stack([_dot(row, offset) for row in self._rows], axis=1)
+        shift += np.stack([_dot(self._middle, turn[:, axis]) for axis in (0, 1)], axis=1)
         return Projection(
             self._taxels,
             _rounded(turn / self._cell_mm, _TURN_STEP),
             _rounded(shift / self._cell_mm + 0.5, _SHIFT_STEP),
             self._cell_mm,
         )
+
+
+def _combined(row: FloatArray, rotation: FloatArray) -> FloatArray:
+    """(n, 3) products of a row and (n, 3, 3) rotations, term by term: the bits do not hang on how many there are."""
+    product: FloatArray = row[0] * rotation[:, 0] + row[1] * rotation[:, 1] + row[2] * rotation[:, 2]
+    return product
+
+
+def _dot(row: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(n,) products of a row and (n, 3) vectors, term by term."""
+    product: FloatArray = row[0] * vectors[:, 0] + row[1] * vectors[:, 1] + row[2] * vectors[:, 2]
+    return product
 
 
 def _rounded(values: FloatArray, step: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,10 @@ class Readout:
         On the grid of `PRESSURE_STEP_KPA`.
     full_count
         Readings at or above it carry no pressure.
+    plain_count
+        Up to it no taxel is saturated; -1 where that holds for no count.
+    never_negative
+        Whether no count gives a pressure below 0.
     """
 
     taxels: NDArray[np.intp]
@@ -39,6 +43,16 @@ class Readout:
     gain_kpa: FloatArray
     offset_kpa: FloatArray
     full_count: int
+    plain_count: int = field(init=False)
+    never_negative: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        used = self.gain_kpa > 0
+        room = (PRESSURE_RANGE_KPA[1] - self.offset_kpa[used]) / self.gain_kpa[used]
+        plain = min(float(room.min(initial=np.inf)) - 1, self.full_count - 1, 65535)
+        sound = bool((self.offset_kpa < PRESSURE_RANGE_KPA[1]).all())
+        object.__setattr__(self, "plain_count", int(max(plain, -1)) if sound else -1)
+        object.__setattr__(self, "never_negative", bool(self.offset_kpa.min(initial=0.0) >= 0))
 
     @classmethod
     def of(cls, calibration: ElementCalibration, good: BoolArray) -> Readout:
@@ -61,7 +75,7 @@ class Readout:
         """
         pressure = np.multiply(counts, self.gain_kpa, dtype=np.float64)
         pressure += self.offset_kpa
-        if not counts.size or (counts.max() < self.full_count and pressure.max() < PRESSURE_RANGE_KPA[1]):
+        if not counts.size or int(counts.max()) <= self.plain_count:
             return pressure, None
         valid = (counts < self.full_count) & (pressure < PRESSURE_RANGE_KPA[1])
         return pressure, None if valid.all() else valid

@@ -1,0 +1,245 @@
+"""Map building against tuned peers, over time, and frame by frame: ``python -m benchmarks.map_speed [--json OUT]``.
+
+CPU time of this thread, the least of several runs: it hardly depends on what else runs. Every way of the same run
+reads the same frames. "path" does what the peers do; "accumulator" also gates, turns poses into projections and keeps
+the moments of the plane. `make bench-map` keeps BLAS on one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.map_peers import BINCOUNT_FRAMES, BOOST, BOOST_FRAMES, Job, bincount
+from tactile_bayes.forward.scene import Head, Scene, Strokes
+from tactile_bayes.forward.simulate import head_positions
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.cells import CellSums
+from tactile_bayes.mapping.engine import Engine, NumpyEngine, compiled_engine, fast_is_installed
+from tactile_bayes.mapping.frames import chunks
+from tactile_bayes.mapping.poses import FramePoses
+from tactile_bayes.mapping.project import Projection, Projector
+from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.scan import ElementCalibration, HeadGeometry
+
+RATE_HZ = 200
+_POOL = 2000
+
+
+class Frames:
+    """Readings and poses of an endless scan, made piece by piece: the same counts come round, the motion goes on."""
+
+    def __init__(self, seed: int = 1) -> None:
+        rng = np.random.default_rng(seed)
+        self.scene = Scene(duration_s=7.0, strokes=Strokes(), head=Head())
+        self.head = HeadGeometry(self.scene.head.surface_mm(), self.scene.head.pitch_mm, np.eye(4))
+        gain = 34 / 4095 * (1 + 0.03 * rng.standard_normal(self.head.shape))
+        self.calibration = ElementCalibration(gain, np.zeros(self.head.shape))
+        self.pool = rng.normal(1144, 40, (_POOL, *self.head.shape)).astype(np.uint16)
+
+    def poses(self, start: int, stop: int) -> FramePoses:
+        """Poses of frames `start` to `stop`: the strokes of 7 s again and again."""
+        rotation, position = head_positions(self.scene, np.arange(start, stop) / RATE_HZ % self.scene.duration_s)
+        return FramePoses(position, rotation, np.ones(stop - start, dtype=bool))
+
+    def counts(self, start: int, stop: int) -> Any:
+        """Counts of frames `start` to `stop`, at most `_POOL` of them."""
+        first = start % _POOL
+        if first + stop - start <= _POOL:
+            return self.pool[first : first + stop - start]
+        return self.pool[np.arange(start, stop) % _POOL]
+
+    def accumulator(self, engine: Engine, *, keep_frames: bool = False) -> MapAccumulator:
+        """An empty map under the strokes."""
+        grid = MapGrid.under(self.head, self.poses(0, 1400))
+        return MapAccumulator(grid, Instrument(self.head, self.calibration), keep_frames=keep_frames, engine=engine)
+
+    def job(self, frames: int) -> Job:
+        """What the peers get: everything per frame prepared beforehand, which our own way does inside its time."""
+        grid = self.accumulator(NumpyEngine()).grid
+        good = np.ones(self.head.shape, dtype=bool)
+        projector = Projector(self.head, plane_from_base=grid.plane_from_base, taxels=good, cell_mm=grid.cell_mm)
+        projection = projector.at(self.poses(0, frames))
+        first, shape = projection.block()
+        counts = np.concatenate([self.counts(a, min(a + 1000, frames)) for a in range(0, frames, 1000)])
+        return Job(
+            counts.reshape(frames, -1),
+            self.calibration.gain_kpa_per_count.ravel(),
+            self.calibration.offset_kpa.ravel(),
+            projection.turn,
+            projection.shift - np.array([first[1], first[0]]),
+            projection.taxels_mm,
+            shape,
+        )
+
+
+def cpu_s(action: Callable[[], object], *, runs: int) -> float:
+    """Least CPU time of several runs after one to warm up."""
+    action()
+    times = []
+    for _ in range(runs):
+        gc.collect()
+        start = time.thread_time()
+        action()
+        times.append(time.thread_time() - start)
+    return min(times)
+
+
+def same_work(source: Frames, job: Job, engine: Engine) -> CellSums:
+    """What the peers do, our way: levels, projection and scatter, with the frames' numbers prepared beforehand."""
+    good = np.ones(source.head.shape, dtype=bool)
+    readout, sums = Readout.of(source.calibration, good), CellSums(1.0)
+    projection = Projection(job.taxels, job.turn, job.shift, 1.0)
+    for part in chunks(len(job.counts), engine.chunk_frames(readout.size)):
+        counts = job.counts[part]
+        level, _ = engine.levels(readout, counts)
+        engine.add(sums, readout, counts, projection=projection.part(part), level=level)
+    return sums
+
+
+def against_peers(frames: int, *, runs: int) -> dict[str, float]:
+    """CPU seconds of each way through the same frames."""
+    source = Frames()
+    job = source.job(frames)
+    poses = source.poses(0, frames)
+    counts = job.counts.reshape(frames, *source.head.shape)
+
+    engines = {"numpy": NumpyEngine(), **({"fast": compiled_engine()} if fast_is_installed() else {})}
+    times = {}
+    for name, engine in engines.items():
+        times[f"{name} path"] = cpu_s(lambda e=engine: same_work(source, job, e), runs=runs)
+        whole = cpu_s(lambda e=engine: source.accumulator(e).add(counts, poses), runs=runs)
+        times[f"{name} accumulator, all it does"] = whole
+    times["bincount"] = min(cpu_s(lambda n=n: bincount(job, frames=n), runs=runs) for n in BINCOUNT_FRAMES)
+    try:
+        for name, fill in BOOST.items():
+            best = min(cpu_s(lambda n=n, fill=fill: fill(job, frames=n), runs=runs) for n in BOOST_FRAMES)
+            times[f"boost-histogram {name}"] = best
+    except ImportError:
+        print("boost-histogram is not installed: no ratio against it")
+    return times
+
+
+def streamed(minutes: float, engine: Engine) -> tuple[float, float]:
+    """CPU seconds in `MapAccumulator.add` for a scan made as it goes, and peak memory in MB of this process."""
+    source = Frames()
+    grown, spent, total = source.accumulator(engine), 0.0, int(minutes * 60 * RATE_HZ)
+    for start in range(0, total, 1000):
+        stop = min(start + 1000, total)
+        poses, counts = source.poses(start, stop), source.counts(start, stop)
+        begin = time.thread_time()
+        grown.add(counts, poses)
+        spent += time.thread_time() - begin
+    if grown.figures["frames_used"] != total:
+        raise SystemExit(f"only {grown.figures['frames_used']:.0f} of {total} frames were used")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+def live_steps(seconds: float, engine: Engine, *, every: int) -> dict[str, FloatArray]:
+    """Work of each frame in microseconds: one frame added, the plane, and a snapshot every so many frames."""
+    source = Frames()
+    grown = source.accumulator(engine, keep_frames=True)
+    grown.add(source.counts(0, 1), source.poses(0, 1))
+    gc.collect()
+    gc.freeze()
+    gc.disable()  # as a live reader does: one full collection took 613 ms
+    steps = np.zeros((int(seconds * RATE_HZ), 2))
+    for frame in range(len(steps)):
+        counts, poses = source.counts(frame, frame + 1), source.poses(frame, frame + 1)
+        wall, cpu = time.perf_counter(), time.thread_time()
+        grown.add(counts, poses)
+        grown.plane()
+        if frame % every == 0:
+            grown.snapshot()
+        steps[frame] = time.perf_counter() - wall, time.thread_time() - cpu
+    gc.enable()
+    return {"wall": 1e6 * steps[:, 0], "work": 1e6 * steps[:, 1]}
+
+
+def _live_report(seconds: float, name: str, engine: Engine, *, every: int) -> dict[str, Any]:
+    rows: dict[str, Any] = {}
+    for busy in (0, 2):
+        beside = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+        try:
+            steps = live_steps(seconds, engine, every=every)
+        finally:
+            for process in beside:
+                process.kill()
+                process.wait()
+        for kind, values in steps.items():
+            p50, p99 = np.percentile(values, [50, 99])
+            rows[f"{name}, {busy} busy processes beside it, {kind}"] = {"p50_us": round(p50), "p99_us": round(p99)}
+            print(f"{name}, {busy} busy beside it, {kind:<5} p50 {p50:6.0f} us   p99 {p99:6.0f} us", flush=True)
+    return rows
+
+
+def _compare(minutes: Sequence[float], *, runs: int) -> dict[str, Any]:
+    rows = {}
+    for length in minutes:
+        times = against_peers(int(length * 60 * RATE_HZ), runs=runs if length < 5 else max(2, runs // 3))
+        boost = min((value for name, value in times.items() if name.startswith("boost")), default=float("nan"))
+        print(f"{length:g} min of {RATE_HZ} Hz frames")
+        for name, value in times.items():
+            against = f"{value / times['bincount']:.2f} x bincount, {value / boost:.2f} x boost-histogram"
+            print(f"  {name:<36}{value:8.3f} s CPU   {against}", flush=True)
+        rows[f"{length:g} min"] = {name: round(value, 4) for name, value in times.items()}
+    return rows
+
+
+def _growth(minutes: Sequence[float], name: str) -> dict[str, Any]:
+    """Each length in a process of its own, so that its peak memory is its own."""
+    rows = {}
+    for length in minutes:
+        words = [sys.executable, "-m", "benchmarks.map_speed", "--stream", str(length), "--engine", name]
+        done = subprocess.run(words, capture_output=True, text=True, check=True, env=os.environ)
+        cpu, peak = json.loads(done.stdout)
+        each_us = 1e6 * cpu / (length * 60 * RATE_HZ)
+        print(f"  {name:<6}{length:6g} min{cpu:9.3f} s CPU{each_us:7.2f} us a frame{peak:7.0f} MB", flush=True)
+        rows[f"{length:g} min"] = {"cpu_s": round(cpu, 3), "peak_mb": round(peak, 1)}
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print tables; write JSON when asked."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.map_speed", description=__doc__)
+    parser.add_argument("--minutes", type=float, nargs="+", default=[1, 30], help="lengths compared with the peers")
+    parser.add_argument("--growth", type=float, nargs="*", default=[1, 10, 30, 120], help="lengths streamed")
+    parser.add_argument("--live-s", type=float, default=60.0, help="length of the live run")
+    parser.add_argument("--runs", type=int, default=9)
+    parser.add_argument("--json", type=Path, metavar="OUT")
+    parser.add_argument("--stream", type=float, help=argparse.SUPPRESS)
+    parser.add_argument("--engine", choices=("numpy", "fast"), default="numpy", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.stream:
+        engine = NumpyEngine() if options.engine == "numpy" else compiled_engine()
+        streamed(0.01, engine)  # start-up is told apart: see `tactile_bayes.mapping.engine`
+        print(json.dumps(streamed(options.stream, engine)))
+        return 0
+    document = {"schema": "tactile-bayes/benchmarks-map/1", "load": os.getloadavg()[0]}
+    print(f"load average {document['load']:.2f} on {os.cpu_count()} cores")
+    document["peers"] = _compare(options.minutes, runs=options.runs)
+    print("cost against length")
+    names = ["numpy", *(["fast"] if fast_is_installed() else [])]
+    document["growth"] = {name: _growth(options.growth, name) for name in names}
+    print("live step: one frame added, the plane, a snapshot every 8th frame (25 Hz)")
+    document["live"] = _live_report(options.live_s, "numpy", NumpyEngine(), every=8)
+    if options.json:
+        options.json.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
