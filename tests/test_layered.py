@@ -1,0 +1,134 @@
+"""The layered body's surface against closed forms, another program's algebra, and what must not change it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import dblquad, quad
+from scipy.special import j0
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.body import Layers
+from tactile_bayes.forward.layered import (
+    LayeredBody,
+    layering_compliance,
+    square_compliance,
+    surface_flexibility,
+    taxel_compliance,
+)
+from tactile_bayes.forward.plane_layers import surface_transfer
+
+NU = 0.495
+BREAST = LayeredBody((5.0, 50.0), (15.0, 55.0), NU)
+WAVES = np.geomspace(0.01, 20.0, 40)
+
+
+def half_space(k: np.ndarray, modulus: float = 5.0, nu: float = NU) -> np.ndarray:
+    return 2 * (1 - nu**2) / (modulus * k)
+
+
+def bonded_layer(k: np.ndarray, modulus: float, thickness: float) -> np.ndarray:
+    """An incompressible layer bonded to a rigid base: hyperbolic closed form."""
+    kh, shear = k * thickness, modulus / 3
+    return (np.sinh(2 * kh) - 2 * kh) / (np.cosh(2 * kh) + 1 + 2 * kh**2) / (2 * shear * k)
+
+
+@pytest.mark.parametrize("layers", [(5.0,), (5.0, 5.0), (5.0, 5.0, 5.0)])
+def test_layers_of_one_tissue_on_itself_are_a_half_space(layers: tuple[float, ...]) -> None:
+    body = LayeredBody(layers, (15.0, 4.0)[: len(layers) - 1], NU)
+    np.testing.assert_allclose(surface_flexibility(WAVES, body), half_space(WAVES), rtol=1e-9)
+    np.testing.assert_allclose(layering_compliance(np.array([0.0, 3.0, 60.0]), body), 0.0, atol=1e-12)
+
+
+def test_splitting_a_layer_changes_nothing() -> None:
+    split = LayeredBody((5.0, 5.0, 50.0, 50.0), (6.0, 9.0, 30.0, 25.0), NU)
+    np.testing.assert_allclose(surface_flexibility(WAVES, split), surface_flexibility(WAVES, BREAST), rtol=1e-10)
+
+
+def test_an_incompressible_layer_is_the_closed_form() -> None:
+    k = np.geomspace(0.01, 5.0, 30)
+    body = LayeredBody((7.0,), (3.0,), 0.5)
+    np.testing.assert_allclose(surface_flexibility(k, body), bonded_layer(k, 7.0, 3.0), rtol=1e-9)
+
+
+def test_a_slip_of_nu_from_a_half_is_a_slip_of_the_answer() -> None:
+    exact = surface_flexibility(WAVES, LayeredBody((5.0, 50.0), (15.0, 55.0), 0.5))
+    near = surface_flexibility(WAVES, LayeredBody((5.0, 50.0), (15.0, 55.0), 0.4999999))
+    np.testing.assert_allclose(near, exact, rtol=1e-4)
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3, 0.495])
+def test_plane_and_axisymmetric_waves_are_one(nu: float) -> None:
+    """The two-dimensional model's transfer function was written apart from this one."""
+    body = LayeredBody((5.0, 40.0), (12.0, 58.0), nu)
+    other = surface_transfer(WAVES, Layers(12.0, 70.0, 5.0, 8.0, nu))
+    np.testing.assert_allclose(surface_flexibility(WAVES, body), other, rtol=1e-8)
+
+
+@pytest.mark.parametrize("r", [0.0, 1.0, 8.0, 40.0])
+def test_the_hankel_transform_is_that_of_adaptive_quadrature(r: float) -> None:
+    body = LayeredBody((7.0,), (3.0,), 0.5)
+
+    def integrand(k: float) -> float:
+        bracket = bonded_layer(np.array([k]), 7.0, 3.0)[0] - half_space(k, 7.0, 0.5)
+        return float(bracket * j0(k * r) * k / (2 * np.pi))
+
+    edges = np.concatenate([[1e-6], np.arange(0.25, 8.0, 0.25)])
+    expected = sum(quad(integrand, a, b, epsabs=1e-13)[0] for a, b in zip(edges[:-1], edges[1:], strict=True))
+    scale = abs(layering_compliance(np.array([0.0]), body)[0])
+    assert layering_compliance(np.array([r]), body)[0] == pytest.approx(expected, abs=2e-6 * scale)
+
+
+def test_the_point_load_is_boussinesqs() -> None:
+    """A square from afar is a point: w = (1 - nu^2) P / (pi E r)."""
+    w = square_compliance(np.array([60.0]), np.array([80.0]), side_mm=1.5, modulus_kpa=5.0, nu=NU)[0]
+    assert w == pytest.approx((1 - NU**2) * 1.5**2 / (np.pi * 5.0 * 100.0), rel=1e-4)
+
+
+def test_the_uniform_square_is_love_s() -> None:
+    """Johnson (1985) sec. 3.3: at the centre of a square of side 2a under p, w = 8 asinh(1) (1 - nu^2) p a / (pi E)."""
+    w = square_compliance(np.zeros(1), np.zeros(1), side_mm=3.0, modulus_kpa=5.0, nu=NU)[0]
+    assert w == pytest.approx(8 * np.arcsinh(1.0) * 1.5 * (1 - NU**2) / (np.pi * 5.0), rel=1e-12)
+    off, _ = dblquad(lambda y, x: 1 / np.hypot(x - 4.0, y - 1.0), -1.5, 1.5, -1.5, 1.5)
+    beside = square_compliance(np.array([4.0]), np.array([1.0]), side_mm=3.0, modulus_kpa=5.0, nu=NU)[0]
+    assert beside == pytest.approx(off * (1 - NU**2) / (np.pi * 5.0), rel=1e-9)
+
+
+def test_taxel_compliance_is_symmetric_positive_and_falls_with_distance() -> None:
+    compliance = taxel_compliance(BREAST, rows=5, columns=7, pitch_mm=1.5)
+    np.testing.assert_array_equal(compliance, compliance.T)
+    assert np.linalg.eigvalsh(compliance).min() > 0
+    assert (np.diff(compliance[0, :7]) < 0).all()
+    # the mean of a uniform square over itself: 2.9732 (1 - nu^2) p s / (pi E) on a half-space
+    soft = taxel_compliance(LayeredBody((5.0,), (), NU), rows=1, columns=1, pitch_mm=1.5)[0, 0]
+    assert soft == pytest.approx(2.9732 * 1.5 * (1 - NU**2) / (np.pi * 5.0), rel=2e-3)
+
+
+def test_four_small_squares_are_one_large_one() -> None:
+    fine = taxel_compliance(BREAST, rows=8, columns=8, pitch_mm=1.5).reshape(4, 2, 4, 2, 4, 2, 4, 2)
+    merged = fine.mean(axis=(1, 3)).sum(axis=(3, 5)).reshape(16, 16)
+    coarse = taxel_compliance(BREAST, rows=4, columns=4, pitch_mm=3.0)
+    np.testing.assert_allclose(merged, coarse, rtol=2e-3)
+
+
+def test_stiffness_scales_out() -> None:
+    harder = LayeredBody((15.0, 150.0), (15.0, 55.0), NU)
+    a, b = (taxel_compliance(body, rows=3, columns=4, pitch_mm=1.5) for body in (BREAST, harder))
+    np.testing.assert_allclose(3 * b, a, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("moduli", "thicknesses", "nu", "words"),
+    [
+        ((5.0,), (1.0, 2.0), 0.4, "1 moduli for 2 thicknesses"),
+        ((), (), 0.4, "0 moduli"),
+        ((5.0, -1.0), (1.0, 2.0), 0.4, r"modulus_kpa\[1\] is -1"),
+        ((5.0,), (0.0,), 0.4, r"thickness_mm\[0\] is 0"),
+        ((5.0,), (1.0,), 0.6, "nu is 0.6"),
+    ],
+)
+def test_a_body_that_cannot_be_is_refused(
+    moduli: tuple[float, ...], thicknesses: tuple[float, ...], nu: float, words: str
+) -> None:
+    with pytest.raises(BadDataError, match=words):
+        LayeredBody(moduli, thicknesses, nu)
