@@ -162,7 +162,7 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         )
     x, n = x_axis / length, normal
     y = np.array([n[1] * x[2] - n[2] * x[1], n[2] * x[0] - n[0] * x[2], n[0] * x[1] - n[1] * x[0]])  # n cross x
-    rotation = np.stack([x, y, n])
+    rotation = np.array([x, y, n])
     return Plane(rigid(rotation, -rotation @ centroid_mm), float(spread[2]), spread)
 
 

@@ -146,9 +146,15 @@ class MomentSums:
         if int(np.abs(offset).max()) >= _FAR_STEPS:
             self._add_apart(rotation, position)
             return
-        turned = sum(rotation[:, :, j, None] * self._covariance[j] for j in range(3))
-        spread = sum(turned[:, :, None, k] * rotation[:, None, :, k] for k in range(3))
-        axes = np.stack([_times(rotation, axis) for axis in self._axes], axis=1)
+        # Term by term and not by matrix products: the bits of a frame do not hang on how many others there are.
+        covariance, r = self._covariance, rotation
+        turned = r[:, :, 0, None] * covariance[0] + r[:, :, 1, None] * covariance[1] + r[:, :, 2, None] * covariance[2]
+        spread = turned[:, :, 0, None] * r[:, None, :, 0]
+        spread += turned[:, :, 1, None] * r[:, None, :, 1]
+        spread += turned[:, :, 2, None] * r[:, None, :, 2]
+        axes = r[:, None, :, 0] * self._axes[:, 0, None]
+        axes += r[:, None, :, 1] * self._axes[:, 1, None]
+        axes += r[:, None, :, 2] * self._axes[:, 2, None]
         self._count += len(steps)
         self._first += offset.sum(axis=0)
         self._product += offset.T @ offset

@@ -104,28 +104,20 @@ class Projector:
 
     def at(self, poses: FramePoses) -> Projection:
         """Projection of the frames at `poses` onto the cells of the plane."""
-        turn = np.stack([_combined(row, poses.rotation) for row in self._rows], axis=1)
-        offset = poses.position_mm - self._origin_mm  # first of all: bases may lie far away
-        shift = np.stack([_dot(row, offset) for row in self._rows], axis=1)
-        shift += np.stack([_dot(self._middle, turn[:, axis]) for axis in (0, 1)], axis=1)
+        # Term by term and not by matrix products: the bits of a frame do not hang on how many others there are.
+        rows, rotation, middle = self._rows, poses.rotation[:, None], self._middle
+        turn = rows[:, 0, None] * rotation[:, :, 0]
+        turn += rows[:, 1, None] * rotation[:, :, 1]
+        turn += rows[:, 2, None] * rotation[:, :, 2]
+        offset = (poses.position_mm - self._origin_mm)[:, :, None]  # first of all: bases may lie far away
+        shift = rows[:, 0] * offset[:, 0] + rows[:, 1] * offset[:, 1] + rows[:, 2] * offset[:, 2]
+        shift += turn[:, :, 0] * middle[0] + turn[:, :, 1] * middle[1] + turn[:, :, 2] * middle[2]
         return Projection(
             self._taxels,
             _rounded(turn / self._cell_mm, _TURN_STEP),
             _rounded(shift / self._cell_mm + 0.5, _SHIFT_STEP),
             self._cell_mm,
         )
-
-
-def _combined(row: FloatArray, rotation: FloatArray) -> FloatArray:
-    """(n, 3) products of a row and (n, 3, 3) rotations, term by term: the bits do not hang on how many there are."""
-    product: FloatArray = row[0] * rotation[:, 0] + row[1] * rotation[:, 1] + row[2] * rotation[:, 2]
-    return product
-
-
-def _dot(row: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(n,) products of a row and (n, 3) vectors, term by term."""
-    product: FloatArray = row[0] * vectors[:, 0] + row[1] * vectors[:, 1] + row[2] * vectors[:, 2]
-    return product
 
 
 def _rounded(values: FloatArray, step: float) -> FloatArray:

@@ -45,6 +45,7 @@ class Readout:
     full_count: int
     plain_count: int = field(init=False)
     never_negative: bool = field(init=False)
+    _ones: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         used = self.gain_kpa > 0
@@ -52,6 +53,7 @@ class Readout:
         plain = min(float(room.min(initial=np.inf)) - 1, self.full_count - 1, 65535)
         sound = bool((self.offset_kpa < PRESSURE_RANGE_KPA[1]).all())
         object.__setattr__(self, "plain_count", int(max(plain, -1)) if sound else -1)
+        object.__setattr__(self, "_ones", np.ones(len(self.taxels)))
         object.__setattr__(self, "never_negative", bool(self.offset_kpa.min(initial=0.0) >= 0))
 
     @classmethod
@@ -82,10 +84,13 @@ class Readout:
 
     def levels(self, pressure: FloatArray, valid: BoolArray | None) -> tuple[FloatArray, FloatArray]:
         """Mean over the valid taxels (n,), NaN without any, and the share of the whole array that is valid (n,)."""
-        number = np.full(len(pressure), pressure.shape[1], dtype=np.int64)
-        if valid is not None:
-            pressure, number = np.where(valid, pressure, 0.0), valid.sum(axis=1)
-        total = pressure @ np.ones(pressure.shape[1])  # whole steps: any order of adding gives the same bits
+        # Sums of whole steps: any order of adding gives the same bits, so a matrix product may do it.
+        if valid is None and len(self.taxels):
+            share = np.broadcast_to(len(self.taxels) / self.size, len(pressure))
+            return pressure @ self._ones / len(self.taxels), share
+        valid = np.ones(pressure.shape, dtype=bool) if valid is None else valid
+        number = valid.sum(axis=1)
+        total = np.where(valid, pressure, 0.0) @ self._ones
         level = np.full(len(total), np.nan)
         np.divide(total, number, out=level, where=number > 0)
         return level, number / self.size
