@@ -71,7 +71,7 @@ def command(
     A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
     lump's centre on the fat-gland boundary, 1 (resting) its lowest point.
 
-    Example: tactile-bayes study -o study.csv, then calibrate size study.csv -o size.json
+    Example: tactile-bayes study --seat resting -o study.csv
     """
     from tactile_bayes.batch import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
@@ -85,6 +85,8 @@ def command(
     geometries = paper_grid(chosen) if grid == "paper" else read_grid(Path(grid), seat=chosen)
     if output is not None:
         refuse_existing(output, force=force)
+    if figures is not None:
+        prepare_figures(figures, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
         rows = run_study(geometries, settings=settings, executor=executor, output=output)
     if output is None:
@@ -269,9 +271,26 @@ def summary(rows: list[StudyRow]) -> str:
     return "\n".join(lines)
 
 
+def figure_paths(folder: Path) -> list[Path]:
+    """Where figures 5 to 8 go."""
+    return [folder / f"figure_{number}.png" for number in (5, 6, 7, 8)]
+
+
+def prepare_figures(folder: Path, *, force: bool) -> None:
+    """Make the directory, and stop before any work where a figure is in the way."""
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.atomic import refuse_existing
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be made a directory ({error.strerror}); choose another name") from None
+    for path in figure_paths(folder):
+        refuse_existing(path, force=force)
+
+
 def draw_figures(rows: list[StudyRow], settings: StudySettings, folder: Path, *, seat: float, force: bool) -> None:
     """Figures 5 to 8 of the paper."""
     from tactile_bayes.report.study_figures import study_figures
 
-    folder.mkdir(parents=True, exist_ok=True)
-    study_figures(rows, settings, folder, seat=seat, fit=fit_line, force=force)
+    study_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_line, force=force)

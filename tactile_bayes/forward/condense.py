@@ -175,7 +175,7 @@ def _hole_compliance(
     skin = skin[np.argsort(x[skin])]
     vertical = place[2 * skin + 1]
     lowered = np.where(vertical[:, None] >= 0, solution[vertical], 0.0)
-    average = skin_average(mesh, skin, edges_mm=edges_mm)
+    average = skin_average(x[skin], edges_mm=edges_mm, even=even)
     at_rim = solution[place[rim]]
     return 0.5 * (at_rim + at_rim.T), average @ lowered
 

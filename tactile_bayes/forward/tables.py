@@ -16,8 +16,9 @@ import numpy as np
 
 from tactile_bayes.forward.empirical import EmpiricalModel, fit_empirical
 from tactile_bayes.forward.study import HARD_RATIO, Fit, LineFit, StudySettings
-from tactile_bayes.forward.tactile_line import LineFrames, TactileLine, build_line
+from tactile_bayes.forward.tactile_line import LineFrames, TactileLine, build_line, press_layers
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import HEAD_PITCH_MM
 
 TABLE_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 TABLE_DEPTH_RATIOS = (0.6, 1.8)
@@ -115,12 +116,17 @@ def phantom_scenes(seat: float) -> list[Scene]:
 
 
 def scene_curves(scene: Scene, settings: StudySettings) -> Curves:
-    """Frames and maps of both models; the empirical one is fitted to the elastic frames far from and over the lump."""
+    """Frames and maps of both models; the empirical one is fitted to what the taxels see far from and over the lump."""
     surface = settings.surface(settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat))
     elastic = settings.frames(surface, scene.stiffness_ratio)
-    far = settings.frames(surface, None).at(0.0)
+    far = press_layers(surface.body.layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
+    seen = elastic.as_taxels(HEAD_PITCH_MM)
     model = fit_empirical(
-        elastic.s_mm, far, elastic.at(0.0), d_mm=scene.d_mm, half_width_mm=settings.head.half_width_mm
+        seen.s_mm,
+        far.as_taxels(HEAD_PITCH_MM).at(0.0),
+        seen.at(0.0),
+        d_mm=scene.d_mm,
+        half_width_mm=settings.head.half_width_mm,
     )
     empirical = model.frames(elastic.x_c_mm, elastic.s_mm)
     return Curves(elastic, empirical, build_line(elastic), build_line(empirical), model)
@@ -131,10 +137,11 @@ def compare(scene: Scene, *, settings: StudySettings, fit: Fit) -> Agreement:
     curves = scene_curves(scene, settings)
     inside = np.abs(curves.elastic_map.x_mm) <= settings.fit_radius_mm
     ours, theirs = curves.empirical_map.mean[inside], curves.elastic_map.mean[inside]
+    fitted, seen = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
     return Agreement(
         scene,
-        mean_squared_difference(curves.empirical.at(0.0), curves.elastic.at(0.0)),
-        mean_squared_difference(curves.empirical.pressure_kpa, curves.elastic.pressure_kpa),
+        mean_squared_difference(fitted.at(0.0), seen.at(0.0)),
+        mean_squared_difference(fitted.pressure_kpa, seen.pressure_kpa),
         mean_squared_difference(ours, theirs),
         float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
         fit(curves.elastic_map, settings.fit_radius_mm),

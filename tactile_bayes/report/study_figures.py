@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_bayes.forward.body import Layers
-from tactile_bayes.forward.empirical import homogeneous_pressure
+from tactile_bayes.forward.body import THICKNESS_MM, Layers
+from tactile_bayes.forward.empirical import fit_empirical
 from tactile_bayes.forward.study import (
     DETECTABLE,
     HARD_RATIO,
@@ -23,7 +23,7 @@ from tactile_bayes.forward.study import (
 )
 from tactile_bayes.forward.tables import PHANTOMS, Curves, Scene, mean_squared_difference, scene_curves
 from tactile_bayes.forward.tactile_line import build_line, press_layers
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE
 from tactile_bayes.report.figures import _figure as png_figure
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 # Tell apart in greyscale and by colour-blind eyes.
 _COLOURS = ("#1f3b73", "#c8641e", "#2a8c6e", "#8a4fa3", "#7a7a7a", "#b8a100")
 _MARKS = ("o", "s", "^", "D", "v", "P")
-_THICKNESSES_MM = (25.0, 35.0, 50.0, 70.0, 100.0)
-_FAT_MM = 15.0
+_FAT_MM = (5.0, 10.0, 15.0, 25.0, 50.0)
+_FITTED_FAT_MM = 15.0
 _CENTRED = ((10.0, 0.8), (15.0, 1.0), (20.0, 1.2))
 _PHANTOM = "phantom 12.5 mm"
 _FRAME_PLACES_MM = (0.0, 6.0, 12.0, 20.0)
@@ -43,9 +43,15 @@ _SIZE_IN = (10.0, 4.3)
 
 
 def study_figures(
-    rows: Sequence[StudyRow], settings: StudySettings, folder: Path, *, seat: float, fit: Fit, force: bool = False
-) -> list[Path]:
-    """Draw the four figures as PNG files in `folder`.
+    rows: Sequence[StudyRow],
+    settings: StudySettings,
+    paths: Sequence[Path],
+    *,
+    seat: float,
+    fit: Fit,
+    force: bool = False,
+) -> None:
+    """Draw the four figures as PNG files.
 
     Parameters
     ----------
@@ -56,10 +62,8 @@ def study_figures(
     fit
         Fits Eq 5 to a map.
 
-    Returns
-    -------
-    list of Path
-        The files written.
+    paths
+        Of figures 5, 6, 7 and 8.
 
     Raises
     ------
@@ -67,38 +71,34 @@ def study_figures(
         When one of them exists and `force` is false.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
-    paths = [folder / f"figure_{number}.png" for number in (5, 6, 7, 8)]
     figure_5(settings, paths[0], seat=seat, force=force)
     figure_6(settings, paths[1], seat=seat, force=force)
     figure_7(of_seat, settings, paths[2], seat=seat, fit=fit, force=force)
     figure_8(of_seat, paths[3], force=force)
-    return paths
 
 
 def figure_5(settings: StudySettings, path: Path, *, seat: float, force: bool = False) -> None:
-    """Frames far from the lump on tissue of several thicknesses with Eq 1, and frames over three lumps with Eq 3."""
+    """Frames far from the lump on fat of several thicknesses with Eq 1, and frames over three lumps with Eq 3."""
     with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
-        for colour, thickness in zip(_COLOURS, _THICKNESSES_MM, strict=False):
-            layers = Layers(_FAT_MM, thickness, settings.fat_kpa, settings.gland_ratio, settings.poisson)
+        for colour, fat in zip(_COLOURS, _FAT_MM, strict=False):
+            layers = Layers(fat, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
             frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
-            left.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"t = {thickness:g} mm")
+            left.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat:g} mm")
+            if fat == _FITTED_FAT_MM:
+                seen, half = frame.as_taxels(HEAD_PITCH_MM), settings.head.half_width_mm
+                model = fit_empirical(seen.s_mm, seen.at(0.0), seen.at(0.0), d_mm=1.0, half_width_mm=half)
+                text = f"Eq 1 fitted to taxels, fat {fat:g} mm"
+                left.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
         for colour, (d, h) in zip(_COLOURS, _CENTRED, strict=False):
             curves = scene_curves(Scene("", d, h, seat), settings)
             s = curves.elastic.s_mm
             right.plot(s, curves.elastic.at(0.0), color=colour, label=f"d {d:g} mm, h/d {h:g}")
             right.plot(s, curves.empirical.at(0.0), ":", color=colour)
-            if d == _FAT_MM:
-                model = curves.model
-                p1 = homogeneous_pressure(
-                    s,
-                    peak_kpa=model.peak_kpa,
-                    curvature_per_mm2=model.curvature_per_mm2,
-                    half_width_mm=model.half_width_mm,
-                )
-                left.plot(s, p1, "k:", label="Eq 1 fitted, t = 70 mm")
-        _finish(left, "(a) far from the lump, fat 15 mm", "position on the head (mm)", "pressure (kPa)")
-        _finish(right, "(b) over the lump; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)")
+        _finish(
+            left, "(a) far from the lump, fat over gland, 70 mm in all", "position on the head (mm)", "pressure (kPa)"
+        )
+        _finish(right, "(b) over the lump; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)", headroom=0.15)
         figure.text(0.01, 0.01, _caption("Figure 5", settings, seat), fontsize=7.5, color="0.3")
 
 
@@ -113,7 +113,7 @@ def figure_6(settings: StudySettings, path: Path, *, seat: float, force: bool = 
             left.plot(curves.empirical.s_mm, curves.empirical.at(place), ":", color=colour)
         _draw_maps(right, curves)
         _finish(left, f"(a) frames, d {d:g} mm, h/d {h:g}; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)")
-        _finish(right, "(b) maps", "place on the skin (mm)", "pressure / mean of its frame")
+        _finish(right, "(b) maps", "place on the skin (mm)", "pressure / mean of its frame", headroom=0.25)
         figure.text(0.01, 0.01, _caption("Figure 6", settings, seat), fontsize=7.5, color="0.3")
 
 
@@ -140,7 +140,13 @@ def figure_7(
             )
         right.axhspan(0.95, 1.05, color="0.9", zorder=0)
         right.set_xscale("log")
-        _finish(left, f"(a) maps, d {d:g} mm, h/d {h:g}", "place on the skin (mm)", "pressure / mean of its frame")
+        _finish(
+            left,
+            f"(a) maps, d {d:g} mm, h/d {h:g}",
+            "place on the skin (mm)",
+            "pressure / mean of its frame",
+            headroom=0.4,
+        )
         _finish(right, "(b) width, h/d 1; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
         figure.text(0.01, 0.01, _caption("Figure 7", settings, seat), fontsize=7.5, color="0.3")
 
@@ -181,7 +187,7 @@ def _draw_maps(axes: Axes, curves: Curves) -> None:
     elastic, empirical = curves.elastic_map.mean[near], curves.empirical_map.mean[near]
     share = 100 * mean_squared_difference(empirical, elastic)
     axes.plot(curves.elastic_map.x_mm[near], elastic, color=_COLOURS[0], label="elastic model")
-    text = f"empirical model (MSD {share:.1f} % of the elastic map's squares)"
+    text = f"empirical model (MSD {share:.1f} %)"
     axes.plot(curves.empirical_map.x_mm[near], empirical, ":", color=_COLOURS[1], label=text)
 
 
@@ -193,7 +199,10 @@ def _caption(name: str, settings: StudySettings, seat: float) -> str:
     )
 
 
-def _finish(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+def _finish(axes: Axes, title: str, x_label: str, y_label: str, *, headroom: float = 0.0) -> None:
+    """Title, labels and a legend; `headroom` is space above the curves for it, as a share of their height."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + headroom * (high - low))
     axes.set_title(title, loc="left", fontsize=10)
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(y_label, fontsize=9)

@@ -1,0 +1,51 @@
+"""`tables` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from subprocess import CompletedProcess
+
+import pytest
+
+from tactile_bayes.commands.tables import tables_text
+from tactile_bayes.errors import EXIT_BAD_DATA
+from tactile_bayes.forward.study import LineFit
+from tactile_bayes.forward.tables import Agreement, phantom_scenes, table_scenes
+
+Run = Callable[..., "CompletedProcess[str]"]
+
+
+def agreement(scene) -> Agreement:
+    return Agreement(scene, 0.05, 0.06, 0.01, 0.4, LineFit(0.3, 3.0, 0.01), LineFit(0.4, 3.5, 0.02))
+
+
+def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> None:
+    text = tables_text([agreement(s) for s in table_scenes(0.0)], [agreement(s) for s in phantom_scenes(0.0)])
+    assert text.startswith("MSD = sum of squared differences over the sum of squares of the elastic model")
+    assert "5.0 (4.1)" in text
+    assert "1.0 (2.7)" in text
+    assert "mean 5.0 (of the printed cells 4.1)" in text
+    assert "40.0" in text  # the strict norm
+    assert "phantom 18.75 mm" in text
+    assert max(map(len, text.splitlines()[1:])) <= 100
+
+
+@pytest.mark.slow
+def test_the_command_prints_both_forms(run_cli: Run) -> None:
+    text = run_cli("tables", "--seat", "resting", "--workers", 2)
+    assert text.returncode == 0, text.stderr
+    assert "Research use only" in text.stdout
+    document = json.loads(run_cli("tables", "--seat", "resting", "--json").stdout)
+    assert document["schema"] == "tactile-bayes/tables/1"
+    assert len(document["cases"]) == 10
+    assert len(document["phantoms"]) == 4
+    first = document["cases"][0]
+    assert first["scene"]["d_mm"] == 5.0
+    assert 0 < first["map"] < first["map_strict"]
+
+
+def test_an_unknown_seat_is_named(run_cli: Run) -> None:
+    done = run_cli("tables", "--seat", "2")
+    assert done.returncode == EXIT_BAD_DATA
+    assert "seat is '2'" in done.stderr
