@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check slow bench bench-map docs clean
+.PHONY: bench-record demo test check slow bench bench-map docs clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -33,6 +33,9 @@ bench: $(VENV)/.installed
 bench-map: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'boost-histogram>=1.4' '.[fast]'
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.map_speed
+
+bench-record: $(VENV)/.installed
+	$(BIN)/python -m benchmarks.record throughput
 
 docs: $(VENV)/.installed
 	$(BIN)/python docs/make_reference.py

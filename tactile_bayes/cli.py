@@ -16,7 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "Run the main job on an embedded scan: map, estimate, figures, a table."),
     "import": ("import_", "Bring other people's arrays, grids and images in."),
     "map": ("map", "Build a tactile map from one or more scans (paper steps i-iii)."),
-    "calibrate": ("calibrate", "Learn a calibration: `calibrate size`."),
+    "calibrate": ("calibrate", "Learn a calibration: `calibrate size`, `calibrate array`."),
     "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
     "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),

@@ -10,6 +10,8 @@ import click
 from tactile_bayes.presets import FIT_RADIUS_MM, NORMALISE
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from tactile_bayes.files.tables import Table
     from tactile_bayes.posterior.learn_size import SizeTable
 
@@ -83,6 +85,42 @@ def size(
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, calibration, provenance=provenance, force=force)
     click.echo(calibration_text(calibration), nl=False)
+
+
+@command.command("array")
+@click.option(
+    "--step",
+    "steps",
+    type=(float, _FILE),
+    metavar="KPA SCAN.mcap",
+    multiple=True,
+    required=True,
+    help="The bladder's pressure and what the head recorded under it.",
+)
+@click.option("-o", "--output", required=True, metavar="ARRAY.json", type=_FILE, help="Where to write the calibration.")
+@click.option("--head-id", metavar="ID", help="Of the head; by default what the scans say.")
+@click.option(
+    "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="When it was measured; by default today."
+)
+@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+def array(
+    steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
+) -> None:
+    """Learn gain and offset of each taxel from a pressure bladder, with what is left uneven.
+
+    Record each step with `record --uncalibrated`. Dead and hot taxels are found and get gain 0, which leaves them out
+    of maps. A parabola is fitted as well, to tell whether a straight line is enough.
+
+    Example: tactile-bayes calibrate array --step 0 p0.mcap --step 8 p8.mcap --step 16 p16.mcap -o array.json
+    """
+    from datetime import date
+
+    from tactile_bayes.commands.calibrate_array import calibrate_array
+    from tactile_bayes.files.atomic import refuse_existing
+
+    refuse_existing(output, force=force)
+    measured = day.date() if day else date.today()
+    click.echo(calibrate_array(steps, output, head_id=head_id, day=measured, force=force), nl=False)
 
 
 def size_table(table: Table) -> SizeTable:

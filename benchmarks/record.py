@@ -1,0 +1,243 @@
+"""Measure recording: ``python -m benchmarks.record [throughput|load|kills] [--json OUT]``.
+
+``throughput``: bytes a second of one core through the head's parser and through the whole recorder, against real time;
+time and size of the scan file. ``load``: emulated head and tracker recorded while 0, 2 and 4 processes are busy.
+``kills``: SIGKILL at random times; what the file has lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measure import environment
+
+RATE_HZ = 200.0
+SCENE = """[scene]
+seed = 5
+duration_s = {duration}
+frame_rate_hz = 200.0
+pose_rate_hz = 120.0
+[[lump]]
+amplitude = 0.3
+d_mm = 15.0
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the figures, write JSON when asked."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.record", description=__doc__)
+    parser.add_argument("what", nargs="?", choices=["throughput", "load", "kills"], default="throughput")
+    parser.add_argument("--duration", type=float, default=60.0, help="of the scan in s (60)")
+    parser.add_argument("--repeats", type=int, default=10, help="kills (10)")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures as JSON")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        scan = make_scan(folder, options.duration)
+        print(f"load of the machine before: {os.getloadavg()[0]:.2f}, cores {os.cpu_count()}")
+        rows = {"throughput": throughput, "load": load, "kills": kills}[options.what](folder, scan, options)
+        print(f"load of the machine after: {os.getloadavg()[0]:.2f}")
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+def make_scan(folder: Path, duration_s: float) -> Path:
+    """A simulated scan to emulate."""
+    (folder / "scene.toml").write_text(SCENE.format(duration=duration_s), encoding="utf-8")
+    program(["simulate", "scene.toml", "-o", "scan.mcap"], folder).wait()
+    return folder / "scan.mcap"
+
+
+def program(words: Sequence[str], folder: Path, **options: Any) -> subprocess.Popen[str]:
+    """The program in a process of its own."""
+    command = [sys.executable, "-m", "tactile_bayes", *words]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
+    return subprocess.Popen(command, cwd=folder, env=dict(environment()), text=True, **quiet)
+
+
+def throughput(folder: Path, scan: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """How much one core could take, in bytes a second and in times real time."""
+    del options
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.scan_mcap import read_scan, write_scan
+    from tactile_bayes.hardware.head import HeadParser
+
+    data = read_scan(scan)
+    seconds = len(data.frames) / RATE_HZ
+    wire = wire_of(data)
+    pieces = [wire[i : i + 4000] for i in range(0, len(wire), 4000)]
+    parser = HeadParser()
+    parsing = cpu_of(lambda: [parser.feed(piece) for piece in pieces])
+    recording = cpu_of(lambda: record_pieces(data, pieces, folder / "recorded.mcap"))
+    writing = cpu_of(
+        lambda: write_scan(folder / "written.mcap", data, provenance=Provenance("benchmark", {}), force=True)
+    )
+    reading = cpu_of(lambda: read_scan(folder / "written.mcap"))
+    size = (folder / "written.mcap").stat().st_size
+    rows = {
+        "head parser": rate(parsing, len(wire), seconds),
+        "recorder (parse, serialise, compress, write)": rate(recording, len(wire), seconds),
+        "MCAP write": {"cpu_s": round(writing, 3), "times_real_time": round(seconds / writing, 1)},
+        "MCAP read": {"cpu_s": round(reading, 3), "times_real_time": round(seconds / reading, 1)},
+        "MCAP size": {"bytes": size, "bytes_per_frame": round(size / len(data.frames), 1), "raw_bytes_per_frame": 832},
+    }
+    for name, row in rows.items():
+        print(f"{name:<46}" + "  ".join(f"{key} {value:,}" for key, value in row.items()))
+    return rows
+
+
+def rate(cpu_s: float, size: int, seconds: float) -> dict[str, float]:
+    """Bytes a second of one core, and how many heads that would be."""
+    return {"megabytes_per_s": round(size / cpu_s / 1e6, 2), "times_real_time": round(seconds / cpu_s, 1)}
+
+
+def cpu_of(work: Callable[[], object]) -> float:
+    """CPU seconds of this process, least of three."""
+    costs = []
+    for _ in range(3):
+        begun = time.process_time()
+        work()
+        costs.append(time.process_time() - begun)
+    return min(costs)
+
+
+def wire_of(data: Any) -> bytes:
+    """A scan as its head would send it."""
+    from tactile_bayes.hardware.emulated import EmulatedHead
+    from tactile_bayes.hardware.head import encode_hello
+
+    head = EmulatedHead(data)
+    return encode_hello(head.hello()) + b"".join(head.record(i) for i in range(len(data.frames)))
+
+
+def record_pieces(data: Any, pieces: list[bytes], path: Path) -> None:
+    """What the recorder does with them, but for waiting."""
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive
+    from tactile_bayes.hardware.head import HeadParser
+    from tactile_bayes.hardware.recorder import Line, Recorder
+
+    with create_exclusive(path, force=True) as stream:
+        writer = RecordingWriter(
+            stream,
+            head=data.head,
+            element_calibration=data.element_calibration,
+            session={"source": "benchmark"},
+            provenance=Provenance("benchmark", {}),
+            path=path,
+        )
+        line = Line("head", None, None, HeadParser(), b"", b"")  # type: ignore[arg-type]
+        recorder = Recorder(line, None, writer)
+        recorder.recording = True
+        for number, piece in enumerate(pieces):
+            for reading in line.parser.feed(piece):
+                recorder._read(line, reading, time.monotonic_ns())
+            if number % 9 == 0:  # every 0.2 s of real time
+                writer.flush()
+        writer.close({})
+
+
+@contextlib.contextmanager
+def devices(folder: Path, scan: Path) -> Iterator[tuple[list[str], dict[str, int]]]:
+    """Emulated head and tracker on pseudo-terminals: words for `record`, and their process ids."""
+    started = {
+        kind: program(["emulate", kind, str(scan)], folder, stdout=subprocess.PIPE) for kind in ("head", "tracker")
+    }
+    urls = {kind: process.stdout.readline().strip() for kind, process in started.items() if process.stdout}
+    words = ["--head", urls["head"], "--tracker", urls["tracker"], "--tracker-protocol", "open", "--clock", "shared"]
+    try:
+        yield [*words, "--like", str(scan)], {kind: process.pid for kind, process in started.items()}
+    finally:
+        for process in started.values():
+            process.terminate()
+            process.wait()
+
+
+def load(folder: Path, scan: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Record the whole scan while others are busy."""
+    rows = []
+    for busy in (0, 2, 4):
+        others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+        try:
+            with devices(folder, scan) as (words, pids):
+                output = folder / f"busy{busy}.mcap"
+                process = program(["record", "-o", output.name, *words], folder)
+                time.sleep(options.duration * 0.9)
+                used = processes_cpu({"record": process.pid, **pids})
+                process.wait()
+            row = {"busy": busy, "exit": process.returncode, **account_of(output), "cpu_s": used}
+        finally:
+            for other in others:
+                other.kill()
+                other.wait()
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+    return rows
+
+
+def account_of(path: Path) -> dict[str, Any]:
+    """The account that the recording closed with."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as stream:
+        found = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}["recording"]
+    names = ("frames", "frames_lost", "head_dropped", "poses", "overrun_bytes", "longest_wait_ms", "ended_by")
+    return {name: found[name] for name in names}
+
+
+def processes_cpu(pids: dict[str, int]) -> dict[str, float]:
+    """CPU seconds so far of some processes and of the children of `record`."""
+    tick = os.sysconf("SC_CLK_TCK")
+    found = {}
+    names = {pid: name for name, pid in pids.items()}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = path.read_text().rpartition(")")[2].split()
+            pid, parent = int(path.parent.name), int(fields[1])
+            name = names.get(pid) or (f"reader {pid}" if parent == pids["record"] else None)
+            if name:
+                found[name] = (int(fields[11]) + int(fields[12])) / tick
+    return dict(sorted(found.items()))
+
+
+def kills(folder: Path, scan: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """SIGKILL the recorder at random times: frames the head had sent, frames in the file."""
+    from tactile_bayes.files.scan_mcap import read_scan_report
+
+    rng, rows = random.Random(1), []
+    print("killed after s   frames in file   lost s")
+    for number in range(options.repeats):
+        after_s = rng.uniform(1.0, 6.0)
+        output = folder / f"kill{number}.mcap"
+        with devices(folder, scan) as (words, _):
+            process = program(["record", "-o", output.name, *words], folder)
+            while not output.exists():
+                time.sleep(0.001)
+            begun = time.monotonic()  # the file is made just before the devices are told to start
+            time.sleep(after_s)
+            process.send_signal(signal.SIGKILL)
+            killed_s = time.monotonic() - begun
+            process.wait()
+        frames = read_scan_report(output).scan.frames
+        held_s = float(frames.time_s[-1]) + 1 / RATE_HZ
+        row = {"killed_after_s": round(killed_s, 3), "frames": len(frames), "lost_s": round(killed_s - held_s, 3)}
+        rows.append(row)
+        print(f"{row['killed_after_s']:>14} {row['frames']:>16} {row['lost_s']:>8}", flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,172 @@
+"""Calibrate an array from a pressure bladder: steps of known, uniform pressure to a gain and an offset a taxel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.hardware.readings import CountArray
+from tactile_bayes.scan import ElementCalibration
+
+# A taxel whose counts rise by less than this share of the median taxel's is dead, by more than this many times hot.
+DEAD_SHARE: Final = 0.1
+HOT_RATIO: Final = 2.5
+MIN_FRAMES: Final = 10
+# With fewer steps a curvature fits the noise.
+STEPS_FOR_CURVATURE: Final = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BladderStep:
+    """The array under one known pressure.
+
+    Parameters
+    ----------
+    pressure_kpa
+        Of the bladder.
+    counts : (rows, columns) array
+        Mean over the frames.
+    saturated : (rows, columns) bool array
+        Taxels that reached full scale in any frame.
+    """
+
+    pressure_kpa: float
+    counts: FloatArray
+    saturated: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, pressure_kpa: float, frames: CountArray, *, saturation_count: int) -> BladderStep:
+        """Average the frames of a step.
+
+        Raises
+        ------
+        BadDataError
+            When there are too few, or the pressure is not one.
+        """
+        if not np.isfinite(pressure_kpa) or pressure_kpa < 0:
+            raise BadDataError(f"a step of {pressure_kpa} kPa", way_out="give the bladder's pressure, 0 or more")
+        if len(frames) < MIN_FRAMES:
+            raise BadDataError(
+                f"the step of {pressure_kpa:g} kPa has {len(frames)} frames", way_out=f"record {MIN_FRAMES} or more"
+            )
+        saturated: NDArray[np.bool_] = np.asarray((frames >= saturation_count).any(axis=0))
+        return cls(float(pressure_kpa), frames.mean(axis=0), saturated)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayFit:
+    """What the steps say about each taxel.
+
+    Parameters
+    ----------
+    calibration
+        Pressure = gain x counts + offset, which is what maps use; gain 0 for dead and hot taxels.
+    curvature_kpa_per_count2 : (rows, columns) array
+        Of a parabola through the same steps; 0 where there are too few. Maps do not use it: it tells how far the
+        straight line is from enough.
+    dead, hot
+        (row, column) of taxels that hardly answer, or far too much.
+    nonuniformity : (steps,) array
+        Standard deviation over the good taxels of the calibrated pressure, as a share of the step's (NaN at 0).
+    curved_nonuniformity : (steps,) array
+        The same with the parabolas.
+    pressure_kpa : (steps,) array
+        Rising.
+    """
+
+    calibration: ElementCalibration
+    curvature_kpa_per_count2: FloatArray
+    dead: tuple[tuple[int, int], ...]
+    hot: tuple[tuple[int, int], ...]
+    nonuniformity: FloatArray
+    curved_nonuniformity: FloatArray
+    pressure_kpa: FloatArray
+
+
+def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFit:
+    """Least-squares line (and parabola) of pressure on counts for each taxel.
+
+    Steps at which a taxel is saturated are left out for it.
+
+    Raises
+    ------
+    BadDataError
+        When there are fewer than two different pressures, or no taxel answers.
+    """
+    ordered = sorted(steps, key=lambda step: step.pressure_kpa)
+    pressure = np.array([step.pressure_kpa for step in ordered])
+    if len(np.unique(pressure)) < 2:
+        raise BadDataError("there are fewer than two different pressures", way_out="give two steps or more")
+    counts = np.array([step.counts for step in ordered])
+    valid = ~np.array([step.saturated for step in ordered])
+    dead, hot = _odd_taxels(pressure, counts, valid)
+    good = ~(dead | hot)
+    line = _polynomials(pressure, counts, valid & good, degree=1)
+    curve = _polynomials(pressure, counts, valid & good, degree=2) if len(steps) >= STEPS_FOR_CURVATURE else None
+    gain, offset = line[1], line[0]
+    if (gain[good] < 0).any():
+        row, column = (int(i) for i in np.argwhere(good & (gain < 0))[0])
+        raise BadDataError(
+            f"row {row} column {column} reads less under more pressure", way_out="check the steps' pressures"
+        )
+    return ArrayFit(
+        calibration=ElementCalibration(gain, offset, saturation_count=saturation_count),
+        curvature_kpa_per_count2=np.zeros(gain.shape) if curve is None else curve[2],
+        dead=_places(dead),
+        hot=_places(hot),
+        nonuniformity=_nonuniformity(line, pressure, counts, valid & good),
+        curved_nonuniformity=_nonuniformity(line if curve is None else curve, pressure, counts, valid & good),
+        pressure_kpa=pressure,
+    )
+
+
+def _odd_taxels(
+    pressure: FloatArray, counts: FloatArray, valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Taxels that are dead and taxels that are hot, by how much their counts rise."""
+    weight = valid.astype(np.float64)
+    number = np.maximum(weight.sum(axis=0), 1)
+    x = pressure[:, None, None] - (weight * pressure[:, None, None]).sum(axis=0) / number
+    spread = (weight * x * x).sum(axis=0)
+    rise = (weight * x * counts).sum(axis=0) / np.where(spread > 0, spread, 1.0)
+    enough = (valid.sum(axis=0) >= 2) & (spread > 0)
+    if not enough.any() or not (typical := float(np.median(rise[enough]))) > 0:
+        raise BadDataError("the array does not answer to pressure", way_out="check its cable and the bladder")
+    dead = ~(rise > DEAD_SHARE * typical) & enough
+    hot = (rise > HOT_RATIO * typical) | ~enough  # saturated in all steps but one
+    return dead, hot & ~dead
+
+
+def _polynomials(pressure: FloatArray, counts: FloatArray, use: NDArray[np.bool_], *, degree: int) -> FloatArray:
+    """(degree + 1, rows, columns) coefficients of pressure in counts, lowest first; zero where nothing is used."""
+    result = np.zeros((degree + 1, *counts.shape[1:]))
+    for row, column in np.argwhere(use.sum(axis=0) >= 2):
+        chosen = use[:, row, column]
+        order = min(degree, int(chosen.sum()) - 1)
+        c, scale = counts[chosen, row, column], float(counts[chosen, row, column].max()) or 1.0
+        matrix = np.vander(c / scale, order + 1, increasing=True)
+        fitted = np.linalg.lstsq(matrix, pressure[chosen], rcond=None)[0]
+        result[: order + 1, row, column] = fitted / scale ** np.arange(order + 1)
+    return result
+
+
+def _nonuniformity(
+    coefficients: FloatArray, pressure: FloatArray, counts: FloatArray, use: NDArray[np.bool_]
+) -> FloatArray:
+    powers = np.arange(len(coefficients))[:, None, None]
+    found = np.full(len(pressure), np.nan)
+    for i, (step, chosen) in enumerate(zip(counts, use, strict=True)):
+        if pressure[i] > 0 and chosen.sum() > 1:
+            kpa = (coefficients * step**powers).sum(axis=0)[chosen]
+            found[i] = float(kpa.std(ddof=1)) / pressure[i]
+    return found
+
+
+def _places(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
+    return tuple((int(row), int(column)) for row, column in np.argwhere(mask))
