@@ -144,8 +144,17 @@ def streamed(minutes: float, engine: Engine) -> tuple[float, float]:
         spent += time.thread_time() - begin
     if grown.figures["frames_used"] != total:
         raise SystemExit(f"only {grown.figures['frames_used']:.0f} of {total} frames were used")
+    return spent, _peak_mb()
+
+
+def _peak_mb() -> float:
+    """Largest resident memory since this program began; the kernel's ru_maxrss would count the parent's too."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return float(line.split()[1]) * 1024 / 1e6
     unit = 1 if sys.platform == "darwin" else 1024
-    return spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 def live_steps(seconds: float, engine: Engine, *, every: int) -> dict[str, FloatArray]:

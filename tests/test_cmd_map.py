@@ -51,6 +51,9 @@ def test_scans_become_the_map_the_function_builds(folder, run_cli):
         "pressure_window_kpa": [5.0, 14.0],
         "normalise": "mean",
         "latency_ms": 0.0,
+        "plane_radius_mm": "all",
+        "flat_field": False,
+        "register_strokes": False,
     }
     assert [one["role"] for one in header["provenance"]["inputs"]] == ["scan_1", "scan_2"]
     for name in ("map.nc", "map.png"):
@@ -64,7 +67,7 @@ def test_the_table_says_what_was_used_and_what_was_left_out(folder, run_cli):
     assert table["left out"] == "5 mean pressure below the window of 5 to 14 kPa"
     assert re.fullmatch(r"rms 0\.0 mm, 0\.0 deg from the head's face", table["plane"])
     assert table["resolves"] == "lumps of map width sigma 1.3 mm or more"
-    assert table["patient axes"] == "from the landmarks"
+    assert table["patient axes"] == "from the landmarks, repeats within 0.0 mm of their mean"
     assert lines[-1] == RESEARCH_USE
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.number_or import NumberOr
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import CELL_MM, NORMALISE, PRESSURE_WINDOW_KPA
 
@@ -39,7 +40,24 @@ _FILE = click.Path(path_type=Path)
     help="mean: divide a frame by its mean (the paper); gain: solve for one gain a frame; none: keep kPa.",
 )
 @click.option(
-    "--latency-ms", type=float, default=0.0, show_default=True, help="By how much the tracker's time stamps are late."
+    "--latency-ms",
+    type=NumberOr("auto"),
+    metavar="MS|auto",
+    default="0",
+    show_default=True,
+    help="By how much the tracker's time stamps are late; auto finds it from the scan, or refuses.",
+)
+@click.option(
+    "--plane-radius-mm",
+    type=NumberOr("auto", "all"),
+    metavar="MM|auto|all",
+    default="all",
+    show_default=True,
+    help="Fit the plane to the frames so near to the mass; auto: those whose array can reach it.",
+)
+@click.option("--flat-field", is_flag=True, help="Take off the head's own response, from frames without a lump.")
+@click.option(
+    "--register-strokes", is_flag=True, help="Shift the strokes onto each other, for a lump that follows the head."
 )
 @click.option("--figure", metavar="FIG.png", type=_FILE, help="Draw the map and its coverage.")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
@@ -50,7 +68,10 @@ def command(
     cell_mm: float,
     pressure_window_kpa: tuple[float, float],
     normalise: str,
-    latency_ms: float,
+    latency_ms: float | str,
+    plane_radius_mm: float | str,
+    flat_field: bool,
+    register_strokes: bool,
     figure: Path | None,
     force: bool,
     verbose: bool,
@@ -74,6 +95,9 @@ def command(
         "pressure_window_kpa": list(pressure_window_kpa),
         "normalise": normalise,
         "latency_ms": latency_ms,
+        "plane_radius_mm": plane_radius_mm,
+        "flat_field": flat_field,
+        "register_strokes": register_strokes,
     }
     clock = _Clock(verbose)
     loaded, lost = _read(scans)
@@ -85,6 +109,9 @@ def command(
             pressure_window_kpa=pressure_window_kpa,
             normalise=normalise,
             latency_ms=latency_ms,
+            plane_radius_mm=None if plane_radius_mm == "all" else plane_radius_mm,
+            flat_field=flat_field,
+            register_strokes=register_strokes,
             progress=progress,
         )
     clock.tell("map")

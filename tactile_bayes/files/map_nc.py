@@ -244,7 +244,13 @@ def _recipe(fields: dict[str, Any]) -> MapRecipe:
         if not good:
             raise BadDataError(f"recipe.{name} is {_short(fields.get(name))}", way_out=_WAY_OUT)
     ends = None if window is None else (float(window[0]), float(window[1]))
-    return MapRecipe(fields["source"], fields["normalise"], float(fields["cell_mm"]), ends, float(fields["latency_ms"]))
+    later = {name: fields.get(name, False) for name in ("flat_field", "registered")}  # not in the first maps
+    for name, value in later.items():
+        if not isinstance(value, bool):
+            raise BadDataError(f"recipe.{name} is {_short(value)}", way_out=_WAY_OUT)
+    return MapRecipe(
+        fields["source"], fields["normalise"], float(fields["cell_mm"]), ends, float(fields["latency_ms"]), **later
+    )
 
 
 def _is_number(value: object) -> bool:

@@ -28,7 +28,14 @@ def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
         "saturated_readings": sum(_saturated(part) for part in selections),
     }
     levels = np.concatenate([part.level_kpa[part.used] for part in selections])
-    return {**{name: float(value) for name, value in figures.items()}, "mean_pressure_kpa": float(levels.mean())}
+    felt = np.concatenate([part.level_kpa[part.used | part.low | part.high] for part in selections])
+    low, high = np.quantile(felt, [0.05, 0.95])
+    return {
+        **{name: float(value) for name, value in figures.items()},
+        "mean_pressure_kpa": float(levels.mean()),
+        "level_p05_kpa": float(low),
+        "level_p95_kpa": float(high),
+    }
 
 
 def _saturated(part: SelectedFrames) -> int:

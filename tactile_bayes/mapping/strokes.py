@@ -23,6 +23,8 @@ LEAST_REACH_MM = 10.0
 KNOWN_SD_MM = 0.5
 LONGEST_SHIFT_MM = 8.0
 _ROUNDS = 4
+# Squared slopes of the others' map must exceed those of its noise this many times.
+_LEAST_SLOPE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,8 +208,13 @@ def _step(
         return np.zeros(2), np.full(2, np.inf)
     inverse = np.linalg.inv(information)
     best = inverse @ (design.T @ data)
+    misfit = np.square(data - design @ best)
+    # The others' map has noise of its own, and so has its gradient: without much more than that there is no slope.
+    noise_slope = (weight**2 / m[sound]).sum() * float(misfit.mean()) / (2 * cell_mm**2)
+    if not np.diag(information)[:2].min() > _LEAST_SLOPE * noise_slope:
+        return np.zeros(2), np.full(2, np.inf)
     # Neighbours share readings after smoothing, and the misfit is one of shape: a tenth of the cells count.
-    noise = float(np.square(data - design @ best).sum()) / max(1.0, 0.1 * len(data) - 3)
+    noise = float(misfit.sum()) / max(1.0, 0.1 * len(data) - 3)
     return best[:2], np.sqrt(noise * np.diag(inverse)[:2])
 
 

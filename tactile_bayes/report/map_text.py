@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from tactile_bayes.mapping.tactile_map import TactileMap
+import numpy as np
+
+from tactile_bayes.mapping.advice import advise_cell
+from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE
 
 # A strip of the plane narrower than the head itself shows no lump's flanks.
@@ -12,6 +15,8 @@ _LOW_COVERAGE = 0.5
 _HIGH_TILT_DEG = 10.0
 _HIGH_YAW_DEG = 15.0
 _LISTED_TAXELS = 8
+# Leaving out more frames than this share for their pressure is worth a word about the window.
+_MUCH_GATED = 0.2
 _UNITS = {
     "mean": "times the mean of their frames (normalise mean)",
     "gain": "times the level beside a lump (normalise gain)",
@@ -33,7 +38,8 @@ def map_text(tactile_map: TactileMap, *, lost: Sequence[str] = ()) -> str:
     lost
         What the scan files had lost before they were read, one line each.
     """
-    rows = [*_what(tactile_map), *_frames(tactile_map), *_plane(tactile_map), *_cells(tactile_map)]
+    parts = (_what, _frames, _timing, _plane, _strokes, _cells)
+    rows = [row for part in parts for row in part(tactile_map)]
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {text}" for name, text in rows]
     return "\n".join([*lines, "", *lost, *_notes(tactile_map), RESEARCH_USE]) + "\n"
@@ -64,15 +70,59 @@ def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     yield "mean pressure", f"{quality['mean_pressure_kpa']:.1f} kPa"
 
 
+def _timing(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """How evenly frames and poses came, and the delay between them."""
+    quality = tactile_map.quality
+    if "frame_rate_hz" in quality:
+        jitter, missing = quality["frame_jitter_ms"], quality["frames_missing"]
+        yield "frames", f"{quality['frame_rate_hz']:.1f} Hz, jitter {jitter:.2f} ms, {missing:.0f} missing"
+    if "pose_rate_hz" in quality:
+        repeats, gap = quality["pose_repeats"], quality["pose_gap_ms"]
+        yield "poses", f"{quality['pose_rate_hz']:.1f} Hz, {repeats:.0f} repeats dropped, longest gap {gap:.0f} ms"
+    if "latency_sd_ms" in quality:
+        found = f"{tactile_map.recipe.latency_ms:.2f} +- {quality['latency_sd_ms']:.2f} ms"
+        yield "latency", f"{found}, from {quality['latency_frames']:.0f} frames (a mobile lump mimics one)"
+
+
+def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """What shifting the strokes onto each other found, and the head's own response."""
+    quality = tactile_map.quality
+    if "strokes" in quality:
+        known = f"{quality['strokes_known']:.0f} of {quality['strokes']:.0f} shifted onto each other"
+        yield "strokes", known
+        shifts = [
+            f"{number}: {quality[f'stroke_{number}_shift_x_mm']:+.1f} {quality[f'stroke_{number}_shift_y_mm']:+.1f}"
+            for number in range(1, int(quality["strokes"]) + 1)
+            if f"stroke_{number}_shift_x_mm" in quality
+        ]
+        yield "  shifts", f"x and y in mm; {', '.join(shifts)}"
+    if "mobility_mm" in quality:
+        moved = f"{quality['mobility_mm']:.2f} +- {quality['mobility_sd_mm']:.2f} mm with the head"
+        yield "mobility", f"{moved} (a latency left in the poses looks alike)"
+    if "flat_field_frames" in quality:
+        spread = 100 * quality["flat_field_sd"]
+        yield (
+            "flat field",
+            f"from {quality['flat_field_frames']:.0f} frames without a lump; taxels differ by {spread:.1f} % (SD)",
+        )
+
+
 def _plane(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     """How well the motion lies on a plane, and how the head was held."""
     quality = tactile_map.quality
     if "plane_rms_mm" not in quality:
         return
     yield "plane", f"rms {quality['plane_rms_mm']:.1f} mm, {quality['tilt_deg']:.1f} deg from the head's face"
+    if "plane_condition" in quality:
+        of = f"{quality['plane_frames']:.0f} frames" if "plane_frames" in quality else "all frames used"
+        near = f" within {quality['plane_radius_mm']:.0f} mm of the mass" if "plane_radius_mm" in quality else ""
+        yield "  fitted to", f"{of}{near}; longest over second spread {quality['plane_condition']:.1f}"
     moved = f"{quality['span_x_mm']:.0f} x {quality['span_y_mm']:.0f} mm"
     yield "head", f"turned by {quality['yaw_sd_deg']:.1f} deg (SD), moved {moved}"
-    yield "patient axes", "from the landmarks" if tactile_map.patient_from_plane is not None else "none: no landmarks"
+    repeats = quality.get("landmark_spread_mm")
+    spread = "" if repeats is None else f", repeats within {repeats:.1f} mm of their mean"
+    axes = f"from the landmarks{spread}" if tactile_map.patient_from_plane is not None else "none: no landmarks"
+    yield "patient axes", axes
 
 
 def _cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
@@ -83,6 +133,9 @@ def _cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
             f"{100 * quality['coverage']:.0f} % of the cells, {quality['median_count']:.0f} readings a cell",
         )
     yield "resolves", f"lumps of map width sigma {tactile_map.recipe.cell_mm / CELL_PER_SIGMA:.2g} mm or more"
+    advice = advise_cell(tactile_map)
+    if advice is not None:
+        yield "cell", advice.text()
     if tactile_map.recipe.normalise == "gain":
         yield "gain solve", f"{quality['gain_passes']:.0f} passes, last change {quality['gain_last_change']:.1e}"
 
@@ -98,11 +151,19 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
         yield f"{quality['saturated_readings']:.0f} readings at full scale left out: the map is too low there"
     if quality.get("clipped_values"):
         yield f"{quality['clipped_values']:.0f} values beyond the map's range were clipped"
+    if quality.get("few_cells"):
+        yield f"{quality['few_cells']:.0f} cells have fewer than {FEW_READINGS} readings: noisy, mostly at the rim"
+    if quality.get("negative_readings"):
+        yield f"{quality['negative_readings']:.0f} readings below 0 kPa were kept as they are"
+    gated = quality.get("dropped_low", 0.0) + quality.get("dropped_high", 0.0)
+    if gated > _MUCH_GATED * quality.get("frames_total", np.inf):
+        ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
+        yield f"a window of {ends} would keep nine frames in ten; it lets in pressures the head was not shaped for"
     if quality.get("gain_unsettled"):
         yield "the gain solve stopped before it settled: use --normalise mean, or scan with overlapping strokes"
     if quality.get("coverage", 1.0) < _LOW_COVERAGE:
         yield "coverage is low: add strokes side by side, or use larger cells"
     if quality.get("tilt_deg", 0.0) > _HIGH_TILT_DEG:
-        yield "the head's face was tilted against its motion: check the lever arm of the tracker"
+        yield "the head's face was tilted against its motion: check the tracker's lever arm and quaternion order"
     if quality.get("yaw_sd_deg", 0.0) > _HIGH_YAW_DEG:
         yield "the head was turned while scanning: widths across and along it are mixed"
