@@ -89,7 +89,7 @@ def test_every_contact_is_complementary_and_bears_its_force(
 
 
 def test_the_answer_is_that_of_non_negative_least_squares() -> None:
-    """At its depth the contact minimises p C p / 2 - p (depth - height) over p >= 0: one NNLS with a Cholesky factor."""
+    """At its depth the contact minimises p C p / 2 - p (depth - height) over p >= 0: NNLS of a Cholesky factor."""
     rng = np.random.default_rng(3)
     compliance, height = small_body(), rng.uniform(0, 5, 49)
     contact = press(ContactStiffness.of(compliance), height, mean_kpa=1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.integrate import dblquad, quad
@@ -74,7 +76,7 @@ def test_the_hankel_transform_is_that_of_adaptive_quadrature(r: float) -> None:
         return float(bracket * j0(k * r) * k / (2 * np.pi))
 
     edges = np.concatenate([[1e-6], np.arange(0.25, 8.0, 0.25)])
-    expected = sum(quad(integrand, a, b, epsabs=1e-13)[0] for a, b in zip(edges[:-1], edges[1:], strict=True))
+    expected = sum(quad(integrand, a, b, epsabs=1e-13)[0] for a, b in pairwise(edges))
     scale = abs(layering_compliance(np.array([0.0]), body)[0])
     assert layering_compliance(np.array([r]), body)[0] == pytest.approx(expected, abs=2e-6 * scale)
 

@@ -91,13 +91,12 @@ def surface_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArra
         stiffness = _layer_stiffness(k, modulus, thickness, body.nu)
         upper, across = stiffness[:, :2, :2], stiffness[:, :2, 2:]
         if below is None:
-            below = upper
+            below = np.asarray(upper, dtype=np.float64)
         else:
             lower = stiffness[:, 2:, 2:] + below
             below = np.asarray(upper - across @ np.linalg.solve(lower, stiffness[:, 2:, :2]), dtype=np.float64)
     assert below is not None
-    flexibility: FloatArray = np.linalg.inv(below)[:, 1, 1]
-    return flexibility
+    return np.asarray(np.linalg.inv(below)[:, 1, 1], dtype=np.float64)
 
 
 def _waves(depth: FloatArray, nu: float) -> tuple[FloatArray, FloatArray]:

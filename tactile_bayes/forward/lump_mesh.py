@@ -1,0 +1,312 @@
+"""Meshes of a layered body with a spheroid on its vertical axis: nine-node quadrilaterals in the (r, z) half-plane.
+
+Element edges follow the spheroid, the boundary of the layers and the base. About the lump the mesh is a fan of rays to
+a box; beyond the box it is a graded lattice. z runs down from the skin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+
+IntArray = NDArray[np.int64]
+EXTERIOR_FAT, EXTERIOR_GLAND, INTERIOR_FAT, INTERIOR_GLAND = range(4)
+# A layer boundary nearer than this to touching the spheroid (as a share of its vertical half axis) is moved away.
+_LEAST_CAP: Final = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class LumpGeometry:
+    """A spheroid on the vertical axis of a body of two layers on a rigid base.
+
+    Parameters
+    ----------
+    radius_mm, half_height_mm
+        Half axes of the spheroid, across and along the vertical.
+    depth_mm
+        Of its centre below the skin.
+    fat_mm
+        Depth of the boundary between fat and gland.
+    thickness_mm
+        Depth of the rigid base.
+    """
+
+    radius_mm: float
+    half_height_mm: float
+    depth_mm: float
+    fat_mm: float
+    thickness_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("radius_mm", "half_height_mm", "depth_mm", "fat_mm"):
+            if not getattr(self, name) > 0:
+                raise BadDataError(f"{name} is {getattr(self, name)}", way_out="it must be above 0")
+        top, bottom = self.depth_mm - self.half_height_mm, self.depth_mm + self.half_height_mm
+        room = 0.02 * self.half_height_mm
+        if top < room:
+            raise BadDataError(
+                f"the lump reaches {-top:.3g} mm above the skin (depth {self.depth_mm:g} mm)",
+                way_out=f"its centre must lie {self.half_height_mm + room:.4g} mm deep or deeper",
+            )
+        if bottom > self.thickness_mm - room:
+            raise BadDataError(
+                f"the lump reaches {bottom:.4g} mm deep, the base lies at {self.thickness_mm:g} mm",
+                way_out="give a thicker body or a shallower lump",
+            )
+        if not self.fat_mm < self.thickness_mm:
+            raise BadDataError(
+                f"fat_mm is {self.fat_mm:g}", way_out=f"it must stay below thickness_mm, {self.thickness_mm:g} mm"
+            )
+
+    def boundary_mm(self) -> float:
+        """Depth of the layer boundary, moved by up to 4 % of the half height where it nearly touches the lump."""
+        offset = (self.fat_mm - self.depth_mm) / self.half_height_mm
+        gap = abs(offset) - 1.0
+        if abs(gap) >= _LEAST_CAP:
+            return self.fat_mm
+        moved = np.sign(offset) * (1.0 + (_LEAST_CAP if gap >= 0 else -_LEAST_CAP))
+        return float(self.depth_mm + moved * self.half_height_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshSize:
+    """How fine a mesh is.
+
+    Parameters
+    ----------
+    arc
+        Elements along the half circle of the lump.
+    rings, core
+        Rings of elements outside and inside it.
+    grade
+        Ratio of neighbouring elements beyond the box.
+    reach_mm
+        Least radius of the mesh.
+    """
+
+    arc: int = 18
+    rings: int = 6
+    core: int = 3
+    grade: float = 1.45
+    reach_mm: float = 300.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LumpMesh:
+    """Nodes and elements of a mesh.
+
+    Parameters
+    ----------
+    node_mm : (n, 2) array
+        (r, z) of each node.
+    element : (e, 9) int array
+        Nodes of each element, row by row of its three by three lattice.
+    region : (e,) int array
+        `EXTERIOR_FAT` and so on.
+    arc : (a,) int array
+        Nodes on the lump's boundary from the top pole to the bottom pole.
+    surface : (s,) int array
+        Nodes on the skin by increasing r.
+    """
+
+    node_mm: FloatArray
+    element: IntArray
+    region: IntArray
+    arc: IntArray
+    surface: IntArray
+
+
+@dataclass(slots=True)
+class _Patches:
+    """Lattices of nodes, gathered before equal nodes are merged."""
+
+    lattices: list[tuple[FloatArray, int]] = field(default_factory=list)
+
+    def add(self, lattice: FloatArray, region: int) -> None:
+        self.lattices.append((lattice, region))
+
+
+def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> LumpMesh:
+    """Mesh a lump in its body; see the module for the layout."""
+    size = size or MeshSize()
+    g, boundary = geometry, geometry.boundary_mm()
+    corner_r, top, bottom = _box(g, boundary)
+    lines = _Fan(g, boundary, corner_r, top, bottom, size.arc)
+    patches = _Patches()
+    for arc, rim in lines.sectors():
+        middle = float(rim[len(rim) // 2, 1])
+        patches.add(_blend(arc, rim, _graded_share(size.rings, 1.25)), int(middle > boundary))
+        fat = float(arc[len(arc) // 2, 1]) < boundary
+        centre = np.array([0.0, boundary if lines.cut else g.depth_mm])
+        core = np.linspace(0.0, 1.0, 2 * size.core + 1)
+        patches.add(_blend(np.broadcast_to(centre, arc.shape), arc, core), INTERIOR_FAT if fat else INTERIOR_GLAND)
+    _beyond_box(patches, lines, g, boundary, size)
+    return _merge(patches)
+
+
+def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
+    """Radius, top and bottom of the box that the fan of rays fills."""
+    margin = 1.3 * max(g.radius_mm, g.half_height_mm)
+    high, low = g.depth_mm - g.half_height_mm, g.depth_mm + g.half_height_mm
+    top, bottom = 0.0, low + margin
+    if boundary < high:
+        top = boundary
+    if low < boundary < bottom + 0.5 * margin:
+        bottom = boundary
+    if bottom > g.thickness_mm - 0.5 * margin:
+        bottom = g.thickness_mm
+    return max(g.radius_mm + margin, 0.8 * (g.depth_mm - top)), top, bottom
+
+
+class _Fan:
+    """Where the rays from the lump meet the box: up to four sectors, split at its corners and at the layer boundary."""
+
+    def __init__(
+        self, g: LumpGeometry, boundary: float, corner_r: float, top: float, bottom: float, elements: int
+    ) -> None:
+        self.g, self.corner_r, self.top, self.bottom = g, corner_r, top, bottom
+        self.cut = abs(boundary - g.depth_mm) < g.half_height_mm
+        upper = float(np.arctan2(corner_r, g.depth_mm - top))
+        lower = float(np.pi - np.arctan2(corner_r, bottom - g.depth_mm))
+        breaks, depths = [0.0, upper, lower, np.pi], [top, bottom]
+        if self.cut:
+            at = float(np.arccos((g.depth_mm - boundary) / g.half_height_mm))
+            breaks = [0.0, min(upper, 0.6 * at), at, max(lower, np.pi - 0.6 * (np.pi - at)), np.pi]
+            depths = [top, boundary, bottom]
+        self.breaks = breaks
+        # the side of the box is shared out between its corners and the layer boundary
+        self.side_depths = depths
+        share = np.diff(breaks) / np.pi * elements
+        self.counts = [max(2 if 0 < i < len(share) - 1 else 1, round(float(s))) for i, s in enumerate(share)]
+        # a thin bridge of tissue above the lump needs elements as short as it is thick
+        bridge = max(g.depth_mm - g.half_height_mm - top, 0.1 * g.half_height_mm)
+        shortest = g.depth_mm * np.tan(breaks[1] / self.counts[0])
+        self.counts[0] = max(self.counts[0], round(self.counts[0] * min(shortest / bridge, 2.0)))
+
+    def side_mm(self) -> FloatArray:
+        """Depths of the nodes on the box's vertical side."""
+        parts = [
+            np.linspace(a, b, 2 * n + 1)
+            for a, b, n in zip(self.side_depths[:-1], self.side_depths[1:], self.counts[1:-1], strict=True)
+        ]
+        return np.concatenate([parts[0], *[part[1:] for part in parts[1:]]])
+
+    def across_mm(self, sector: int) -> FloatArray:
+        """Radii of the nodes on the box's top (sector 0) or bottom (sector -1): closest together over the lump."""
+        angle = self.breaks[1] if sector == 0 else np.pi - self.breaks[-2]
+        share = np.tan(np.linspace(0.0, angle, 2 * self.counts[sector] + 1)) / np.tan(angle)
+        share[-1] = 1.0
+        return np.asarray(self.corner_r * share)
+
+    def sectors(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Nodes on the lump and on the box, sector by sector from the top pole to the bottom pole."""
+        found = []
+        side = self.side_mm()
+        start = 0
+        for i, n in enumerate(self.counts):
+            angle = np.linspace(self.breaks[i], self.breaks[i + 1], 2 * n + 1)
+            sine = np.sin(angle)
+            sine[np.abs(sine) < 1e-14] = 0.0
+            arc = np.stack([self.g.radius_mm * sine, self.g.depth_mm - self.g.half_height_mm * np.cos(angle)], axis=-1)
+            if i == 0:
+                r = self.across_mm(0)
+                rim = np.stack([r, np.full_like(r, self.top)], axis=-1)
+            elif i == len(self.counts) - 1:
+                r = self.across_mm(-1)[::-1]
+                rim = np.stack([r, np.full_like(r, self.bottom)], axis=-1)
+            else:
+                z = side[start : start + 2 * n + 1]
+                rim = np.stack([np.full_like(z, self.corner_r), z], axis=-1)
+                start += 2 * n
+            found.append((arc, rim))
+        return found
+
+
+def _graded_share(count: int, ratio: float) -> FloatArray:
+    """(2 count + 1,) shares 0 to 1 whose elements grow by `ratio`, each with its mid-side node in the middle."""
+    steps = np.repeat(ratio ** np.arange(count), 2)
+    share: FloatArray = np.concatenate([[0.0], np.cumsum(steps)]) / float(steps.sum())
+    share[-1] = 1.0
+    return share
+
+
+def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
+    """(len(share), len(start), 2) lattice between two lines of nodes, exact at both."""
+    s = share[:, None, None]
+    return np.asarray((1.0 - s) * start + s * end)
+
+
+def _graded_line(start: float, stop: float, *, first: float, grade: float) -> FloatArray:
+    """Nodes of elements that grow from about `first` by at most `grade` until `stop`."""
+    length = stop - start
+    count = max(1, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
+    line = start + length * _graded_share(count, grade)
+    line[0], line[-1] = start, stop
+    return line
+
+
+def _beyond_box(patches: _Patches, fan: _Fan, g: LumpGeometry, boundary: float, size: MeshSize) -> None:
+    """The lattices right of, below and above the box."""
+    reach = max(size.reach_mm, 2.0 * fan.corner_r, 4.0 * g.depth_mm)
+    side = fan.side_mm()
+    element_r = float(fan.corner_r - fan.across_mm(0)[-3])
+    right = _graded_line(fan.corner_r, reach, first=element_r, grade=size.grade)
+    below = _down_from(fan.bottom, g.thickness_mm, boundary, first=float(side[-1] - side[-3]), grade=size.grade)
+    above = _down_from(0.0, fan.top, boundary, first=float(side[2] - side[0]), grade=1.0 + 1e-9)
+    for z in (above, side, below):
+        _lattice(patches, right, z, boundary)
+    _lattice(patches, fan.across_mm(-1), below, boundary)
+    _lattice(patches, fan.across_mm(0), above, boundary)
+
+
+def _down_from(start: float, stop: float, boundary: float, *, first: float, grade: float) -> FloatArray:
+    """Nodes down a line that has a node where the layers meet; empty when the line has no length."""
+    if not stop > start:
+        return np.zeros(0)
+    if not start < boundary < stop:
+        return _graded_line(start, stop, first=first, grade=grade)
+    upper = _graded_line(start, boundary, first=first, grade=grade)
+    lower = _graded_line(boundary, stop, first=float(upper[-1] - upper[-3]), grade=grade)
+    return np.concatenate([upper, lower[1:]])
+
+
+def _lattice(patches: _Patches, r: FloatArray, z: FloatArray, boundary: float) -> None:
+    """A rectangle of elements, cut where the layers meet."""
+    cuts = [0, *np.flatnonzero(z == boundary), len(z) - 1]
+    for a, b in pairwise(cuts):
+        if b > a:
+            part = z[a : b + 1]
+            grid = np.stack(np.broadcast_arrays(r[None, :], part[:, None]), axis=-1)
+            patches.add(grid, int(part[len(part) // 2] > boundary))
+
+
+def _merge(patches: _Patches) -> LumpMesh:
+    points = np.concatenate([lattice.reshape(-1, 2) for lattice, _ in patches.lattices])
+    _, first, inverse = np.unique(np.round(points / 1e-7), axis=0, return_index=True, return_inverse=True)
+    node, inverse = points[first], inverse.reshape(-1).astype(np.int64)
+    elements, regions, start = [], [], 0
+    for lattice, region in patches.lattices:
+        rows, columns = lattice.shape[:2]
+        index = inverse[start : start + rows * columns].reshape(rows, columns)
+        start += rows * columns
+        corners = [index[i : rows - 2 + i : 2, j : columns - 2 + j : 2].ravel() for i in range(3) for j in range(3)]
+        elements.append(np.stack(corners, axis=-1))
+        regions.append(np.full(len(corners[0]), region))
+    element, region_of = np.concatenate(elements), np.concatenate(regions)
+    surface = np.flatnonzero(np.abs(node[:, 1]) < 1e-7)
+    inside, outside = (set(element[mask].ravel()) for mask in (region_of >= INTERIOR_FAT, region_of < INTERIOR_FAT))
+    arc = np.array(sorted(inside & outside), dtype=np.int64)
+    return LumpMesh(
+        node_mm=node,
+        element=element,
+        region=region_of,
+        arc=arc[np.argsort(node[arc, 1])],
+        surface=surface[np.argsort(node[surface, 0])],
+    )
