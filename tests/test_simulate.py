@@ -18,8 +18,10 @@ from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.forward import scene as scene_types
+from tactile_bayes.forward.instrument import head_positions, level_kpa
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, SceneLandmarks, Strokes, Taxels, Tracker
-from tactile_bayes.forward.simulate import head_positions, level_kpa, simulate
+from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
 from tactile_bayes.geometry import apply, inverse, rotation_from_quaternion
 from tactile_bayes.scan import Scan
 
@@ -154,15 +156,24 @@ def test_the_schemas_defaults_are_the_types_defaults() -> None:
         "tracker": Tracker,
         "taxels": Taxels,
         "landmarks": SceneLandmarks,
+        "body": SceneBody,
     }
     assert set(tables) == set(kinds)
+    # the keys of a lump of tissue live beside those of a bump, and have no defaults a bump could take
+    both = tables["lump"]["items"]["properties"]
+    of_tissue = {f.name for f in dataclasses.fields(SolidLump)}
+    assert of_tissue <= set(both)
+    tissue_alone = of_tissue - {f.name for f in dataclasses.fields(Lump)}
+    assert all("default" not in both[key] for key in tissue_alone)
     for name, kind in kinds.items():
-        keys = tables[name].get("items", tables[name])["properties"]
+        keys = dict(tables[name].get("items", tables[name])["properties"])
+        if name == "lump":
+            keys = {key: rule for key, rule in keys.items() if key not in tissue_alone}
         made = kind()
         for key, rule in keys.items():
             value = getattr(made, key)
             assert rule.get("default") == (list(value) if isinstance(value, tuple) else value), f"{name}.{key}"
-        assert set(keys) == {f.name for f in dataclasses.fields(kind)} - (set(kinds) | {"lumps"}), name
+        assert set(keys) == {f.name for f in dataclasses.fields(kind)} - (set(kinds) | {"lumps", "solid_lumps"}), name
 
 
 def test_an_empty_scene_is_the_default_scene() -> None:

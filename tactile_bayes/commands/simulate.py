@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from tactile_bayes.forward.scene import Lump
+    from tactile_bayes.forward.solid_scene import SolidLump
 
 
 @click.command("simulate")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Scan file to write (.mcap).")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the random numbers, in place of the scene's.")
+@click.option(
+    "--fidelity",
+    type=click.Choice(["empirical-gaussian", "solid"]),
+    help="Model of the tissue; by default the one the scene is written for.",
+)
 @click.option("--force", is_flag=True, help="Overwrite the output.")
-def command(*, scene: Path, output: Path, seed: int | None, force: bool) -> None:
+def command(*, scene: Path, output: Path, seed: int | None, fidelity: str | None, force: bool) -> None:
     """Make a scan with known truth from SCENE, a TOML file.
+
+    Lumps given as bumps (amplitude, sigma) take the empirical-gaussian model; lumps of tissue (d_mm, depth_ratio,
+    stiffness_ratio, seat) in a [body] take the solid one: every frame is a contact problem in three dimensions.
 
     The truth goes into the scan file beside the data; no other command reads it. The same scene and seed give the
     same bytes.
@@ -22,15 +35,16 @@ def command(*, scene: Path, output: Path, seed: int | None, force: bool) -> None
     from tactile_bayes.presets import RESEARCH_USE
 
     refuse_existing(output, force=force)
-    for line in _run(scene, output, seed=seed, force=force):
+    for line in _run(scene, output, seed=seed, fidelity=fidelity, force=force):
         click.echo(line)
     click.echo(RESEARCH_USE)
 
 
-def _run(scene_path: Path, output: Path, *, seed: int | None, force: bool) -> list[str]:
+def _run(scene_path: Path, output: Path, *, seed: int | None, fidelity: str | None, force: bool) -> list[str]:
     import numpy as np
 
     from tactile_bayes.commands.import_ import describe_scan
+    from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import write_scan
     from tactile_bayes.files.scene_toml import read_scene
@@ -38,12 +52,23 @@ def _run(scene_path: Path, output: Path, *, seed: int | None, force: bool) -> li
 
     scene = read_scene(scene_path)
     used = scene.seed if seed is None else seed
-    simulated = simulate(scene, rng=np.random.default_rng(used))
-    provenance = Provenance("simulate", {"model": "gaussian"}, inputs=hash_inputs(scene=scene_path), seed=used)
+    with progress_bar("frames") as progress:
+        simulated = simulate(scene, rng=np.random.default_rng(used), fidelity=fidelity, progress=progress)
+    provenance = Provenance(
+        "simulate", {"model": simulated.truth["model"]}, inputs=hash_inputs(scene=scene_path), seed=used
+    )
     write_scan(output, simulated.scan, provenance=provenance, truth=simulated.truth, force=force)
-    lumps = [
-        f"lump at {lump.x_mm:g}, {lump.y_mm:g} mm: amplitude {lump.amplitude:g}, "
-        f"sigma {lump.sigma_x_mm:g} x {lump.sigma_y_mm:g} mm" + ("" if lump.d_mm is None else f", d {lump.d_mm:g} mm")
-        for lump in scene.lumps
-    ]
+    lumps = [*map(_bump_line, scene.lumps), *map(_tissue_line, scene.solid_lumps)]
     return [f"{output}: scan, seed {used}", *describe_scan(simulated.scan), *(lumps or ["no lump"])]
+
+
+def _bump_line(lump: Lump) -> str:
+    declared = "" if lump.d_mm is None else f", d {lump.d_mm:g} mm"
+    widths = f"sigma {lump.sigma_x_mm:g} x {lump.sigma_y_mm:g} mm"
+    return f"lump at {lump.x_mm:g}, {lump.y_mm:g} mm: amplitude {lump.amplitude:g}, {widths}{declared}"
+
+
+def _tissue_line(lump: SolidLump) -> str:
+    size = f"d {lump.d_mm:g} mm" + ("" if lump.height_mm is None else f", {lump.height_mm:g} mm high")
+    where = f"h/d {lump.depth_ratio:g}"
+    return f"lump at {lump.x_mm:g}, {lump.y_mm:g} mm: {size}, {where}, {lump.stiffness_ratio:g} times as stiff as fat"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -24,8 +24,12 @@ from tactile_bayes.forward.scene import (
     Taxels,
     Tracker,
 )
+from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
 
 _SCHEMA: Final = "scene.schema.json"
+# A lump with one of the first is tissue; only a Gaussian one may have the others.
+_OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")
+_OF_BUMPS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_deg")
 _TYPES: Final = {
     "number": "a number",
     "integer": "a whole number",
@@ -157,10 +161,13 @@ def _stem(key: str) -> str:
 
 def _scene(document: Mapping[str, Any]) -> Scene:
     taxels = document.get("taxels", {})
+    bumps, tissue = _lumps(document.get("lump", []))
     return Scene(
         **document.get("scene", {}),
         background=Background(**document.get("background", {})),
-        lumps=tuple(Lump(**lump) for lump in document.get("lump", [])),
+        lumps=bumps,
+        body=SceneBody(**document["body"]) if "body" in document else None,
+        solid_lumps=tissue,
         strokes=Strokes(**document.get("strokes", {})),
         head=Head(**document.get("head", {})),
         noise=Noise(**document.get("noise", {})),
@@ -168,6 +175,27 @@ def _scene(document: Mapping[str, Any]) -> Scene:
         taxels=Taxels(**{kind: tuple((row, column) for row, column in pairs) for kind, pairs in taxels.items()}),
         landmarks=SceneLandmarks(**_tuples(document.get("landmarks", {}))),
     )
+
+
+def _lumps(tables: Sequence[Mapping[str, Any]]) -> tuple[tuple[Lump, ...], tuple[SolidLump, ...]]:
+    """The lumps that are bumps, and those that are tissue."""
+    bumps, tissue = [], []
+    for i, table in enumerate(tables):
+        solid = [key for key in _OF_TISSUE if key in table]
+        both = [key for key in _OF_BUMPS if key in table]
+        if solid and both:
+            raise BadDataError(
+                f"lump[{i}] gives {both[0]}, of a bump, and {solid[0]}, of tissue",
+                way_out=f"leave out {', '.join(both)} or {', '.join(solid)}",
+            )
+        if not solid:
+            bumps.append(Lump(**table))
+            continue
+        for key in ("d_mm", "depth_ratio"):
+            if key not in table:
+                raise BadDataError(f"lump[{i}] gives no {key}", way_out=f"a lump of tissue with {solid[0]} needs it")
+        tissue.append(SolidLump(**table))
+    return tuple(bumps), tuple(tissue)
 
 
 def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:

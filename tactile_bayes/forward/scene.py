@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.solid_scene import SceneBody, SolidLump, check_solid
 from tactile_bayes.geometry import FloatArray, rigid, rotation_from_quaternion
 from tactile_bayes.presets import HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS
 
@@ -91,13 +92,18 @@ class Strokes:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """A section of a circular cylinder, its edges rounded off over `shoulder_mm`."""
+    """A section of a circular cylinder, its edges rounded off over `shoulder_mm`.
+
+    `rim_mm` is the radius of the rounded edge *around* the taxels, which presses but feels nothing; only the solid
+    model knows it.
+    """
 
     rows: int = HEAD_ROWS
     columns: int = HEAD_COLUMNS
     pitch_mm: float = HEAD_PITCH_MM
     radius_mm: float = HEAD_RADIUS_MM
     shoulder_mm: float = 0.0
+    rim_mm: float = 3.0
 
     def surface_mm(self) -> FloatArray:
         """(rows, columns, 3) taxel centres in `scanhead`: origin at the apex, z into the tissue, so z <= 0."""
@@ -182,7 +188,10 @@ class SceneLandmarks:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Everything `simulate` needs but the random numbers."""
+    """Everything `simulate` needs but the random numbers.
+
+    What lies below the skin is given either as Gaussian bumps (`lumps`) or as tissue (`body`, `solid_lumps`).
+    """
 
     seed: int = 1
     duration_s: float = 7.0
@@ -190,6 +199,8 @@ class Scene:
     pose_rate_hz: float = 120.0
     background: Background = field(default_factory=Background)
     lumps: tuple[Lump, ...] = ()
+    body: SceneBody | None = None
+    solid_lumps: tuple[SolidLump, ...] = ()
     strokes: Strokes = field(default_factory=Strokes)
     head: Head = field(default_factory=Head)
     noise: Noise = field(default_factory=Noise)
@@ -209,6 +220,17 @@ class Scene:
                 raise BadDataError(f"noise.{noise.name} is {getattr(self.noise, noise.name)}", way_out="give 0 or more")
         self._check_head()
         self._check_level()
+        if self.lumps and self.solid_lumps:
+            raise BadDataError(
+                "some lumps are bumps (amplitude, sigma) and some are tissue (depth_ratio)",
+                way_out="describe all lumps of a scene in one way",
+            )
+        check_solid(self.body or SceneBody(), self.solid_lumps)
+
+    @property
+    def fidelity(self) -> str:
+        """The model the scene is written for: ``"solid"`` when it gives tissue, else ``"empirical-gaussian"``."""
+        return "solid" if self.solid_lumps or (self.body is not None and not self.lumps) else "empirical-gaussian"
 
     def _check_head(self) -> None:
         half = self.head.rows * self.head.pitch_mm / 2
@@ -219,6 +241,11 @@ class Scene:
         if not 0 <= self.head.shoulder_mm <= half:
             raise BadDataError(
                 f"head.shoulder_mm is {self.head.shoulder_mm:g}", way_out=f"it must lie in 0 to {half:g} mm"
+            )
+        if not 0 <= self.head.rim_mm < self.head.radius_mm:
+            raise BadDataError(
+                f"head.rim_mm is {self.head.rim_mm:g}",
+                way_out=f"it must lie in 0 to below radius_mm, {self.head.radius_mm:g} mm",
             )
         for kind in ("dead", "saturated"):
             for row, column in getattr(self.taxels, kind):
