@@ -97,6 +97,28 @@ def read_table(path: Path, schema_name: str) -> Table:
     return table
 
 
+def read_raw(path: Path) -> tuple[list[int], list[dict[str, str]]]:
+    """The cells of a CSV table of any shape as they stand, under its header, with the line of each row."""
+    rows = _split(path, _decode(path))
+    if len(rows) < 2:
+        raise BadDataError("holds no rows", way_out="give a header and at least one row", path=str(path))
+    (_, header), *body = rows
+    for name in header:
+        if header.count(name) > 1:
+            raise _fault(path, 1, name, "appears more than once", way_out="keep one of them")
+    for line, cells in body:
+        _check_length(path, line, cells, header)
+    return [line for line, _ in body], [dict(zip(header, (c.strip() for c in cells), strict=True)) for _, cells in body]
+
+
+def parse_number(path: Path, line: int, column: str, text: str) -> float:
+    """A finite number as text, or the fault of its cell."""
+    try:
+        return _parse_number(text, {"name": column})
+    except _CellError as refusal:
+        raise _fault(path, line, column, refusal.what, way_out=refusal.way_out) from None
+
+
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
     """Check that each row points at a row that exists, as the schema's ``foreignKeys`` say.
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.trial_methods_text import method_lines
+from tactile_bayes.trial.check_intervals import IntervalCheck
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
 _HEADINGS = ("", "found", "MAPE %", "MAPE % found", "MAE mm", "bias % found", "slope", "r2", "r2 found")
 
 
-def trial_text(report: TrialReport) -> str:
-    """The whole report; the research-use line comes last."""
+def trial_text(
+    report: TrialReport, *, checks: Mapping[str, IntervalCheck] | None = None, more: Sequence[str] = ()
+) -> str:
+    """The whole report; `more` lines follow it, and the research-use line comes last."""
     lines = [
         f"Sizes against excision: {_plural(report.masses, 'mass')} of {_plural(report.patients, 'patient')}, "
         f"{_plural(report.readings, 'reading')}{_synthetic(report)}",
@@ -20,9 +24,21 @@ def trial_text(report: TrialReport) -> str:
         *_aligned([_HEADINGS, *(_row(one) for one in report.modalities.values())]),
         "",
         *_notes(report),
+        "",
+        *method_lines(report),
+        *(_check_line(name, one) for name, one in (checks or {}).items()),
+        *more,
         RESEARCH_USE,
     ]
     return "\n".join(lines) + "\n"
+
+
+def _check_line(name: str, check: IntervalCheck) -> str:
+    low, high = check.interval
+    return (
+        f"{name}: in {check.trials} simulated trials of this size, MAPE intervals held the true {check.share:.1%} "
+        f"[{low:.1%}, {high:.1%}] of the time; {check.low_misses} lay above it, {check.high_misses} below"
+    )
 
 
 def _row(report: ModalityReport) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
 def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     """Accuracy of one modality: `mape_percent`, `mae_mm` (a mass not found counts as size 0), the same over detected
-    masses only, and `bias_percent` (detected masses only: 0 has no logarithm)."""
+    masses only, weighted and median percent errors, and `bias_percent` (detected only: 0 has no logarithm)."""
     found = sizes.only_detected()
     bias = figure(geometric_ratio, found, scale="log", confidence=confidence)
     return {
@@ -20,6 +20,8 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
         "mape_detected_percent": figure(mape_percent, found, scale="log", confidence=confidence),
         "mae_mm": figure(mae_mm, sizes, scale="log", confidence=confidence),
         "mae_detected_mm": figure(mae_mm, found, scale="log", confidence=confidence),
+        "weighted_mape_percent": figure(weighted_mape_percent, sizes, scale="log", confidence=confidence),
+        "median_error_percent": figure(median_percent, sizes),
         "bias_percent": bias.mapped(lambda ratio: 100 * (ratio - 1)),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -41,10 +42,13 @@ class Intervals(float):
         return made
 
 
+@lru_cache(maxsize=8)
 def draw_patients(patients: int, *, resamples: int, seed: int) -> FloatArray:
     """(resamples, patients) how often each patient is drawn, with replacement; the same for every figure."""
     rng = np.random.default_rng([seed, patients])
-    return rng.multinomial(patients, np.full(patients, 1 / patients), size=resamples).astype(np.float64)
+    draws = rng.multinomial(patients, np.full(patients, 1 / patients), size=resamples).astype(np.float64)
+    draws.flags.writeable = False
+    return draws
 
 
 def percentile_interval(drawn: FloatArray, *, confidence: float) -> tuple[float, float]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
+from tactile_bayes.trial.check_intervals import IntervalCheck
 from tactile_bayes.trial.figures import Figure
+from tactile_bayes.trial.method_comparison import MethodComparison
+from tactile_bayes.trial.paired import PairedComparison
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
 CONVENTIONS: dict[str, str] = {
@@ -19,6 +24,17 @@ CONVENTIONS: dict[str, str] = {
     "r2_uncentred": "1 - SSE0 / sum of squared sizes",
     "r2_pearson": "squared correlation",
     "within_mass": "mean over masses of the SD of replicates; '_rms': root of the mean variance by degrees of freedom",
+    "weighted_mape_percent": "sum of absolute errors over the sum of ex-vivo sizes, in percent",
+    "median_error_percent": "median absolute error in percent of the ex-vivo size",
+    "method_comparison": "detected masses only; x is the ex-vivo size, differences are size - ex vivo; "
+    "'analytic_intervals' take masses as independent, the others are over patients",
+    "error_ratio": "variance of the ex-vivo error over that of the modality's, for the two Deming lines",
+    "passing_bablok": "shifted median of slopes, middle slopes averaged as angles",
+    "limits": "of agreement, for single readings, 95 % of differences; 'log_ratio' as ln(size / ex vivo)",
+    "repeatability": "change between two readings of one mass in 95 % of pairs, by the within-mass SD of ln size",
+    "calibration": "stated intervals as normal on ln size, the caliper's error added in quadrature",
+    "paired_comparisons": "masses that both modalities looked for; not detected counts as size 0; sign-flip test by "
+    "patient, p_holm corrected for all pairs",
     "intervals": "leave-one-patient-out jackknife with Student's t; shares: Clopper-Pearson",
 }
 
@@ -36,11 +52,34 @@ def as_document(report: TrialReport) -> dict[str, Any]:
         },
         "modalities": {name: _modality_document(one) for name, one in report.modalities.items()},
         "mape_ratio_to_tactile": {name: _figures_document(one) for name, one in report.ratios.items()},
+        "paired_comparisons": [_paired_document(one) for one in report.paired],
         "conventions": CONVENTIONS,
     }
 
 
+def checks_document(checks: Mapping[str, IntervalCheck]) -> dict[str, Any]:
+    """Simulated coverage of the intervals of `mape_percent`, by modality."""
+    return {
+        name: {
+            "trials": one.trials,
+            "covered": one.covered,
+            "share": _rounded(one.share),
+            "share_interval": _rounded_ends(one.interval),
+            "above": one.low_misses,
+            "below": one.high_misses,
+            "undefined": one.undefined,
+            "median_width_ratio": _plain(one.median_width_ratio),
+            "model": _plain(one.model),
+            "true_mape_percent": _rounded(one.model.true_mape_percent),
+        }
+        for name, one in checks.items()
+    }
+
+
 def _modality_document(report: ModalityReport) -> dict[str, Any]:
+    document = _figures_document(report.figures)
+    if report.calibration is None:
+        document["reasons"]["calibration"] = "no reading states an interval or a standard deviation"
     return {
         "n": report.n,
         "detected": report.detected,
@@ -50,7 +89,7 @@ def _modality_document(report: ModalityReport) -> dict[str, Any]:
         "readings_detected": report.readings_detected,
         "masses_not_done": report.masses_not_done,
         "masses_without_reading": report.masses_without_reading,
-        **_figures_document(report.figures),
+        **document,
         "coverage": [
             {
                 "probability": one.probability,
@@ -62,7 +101,42 @@ def _modality_document(report: ModalityReport) -> dict[str, Any]:
             }
             for one in report.coverage
         ],
+        "method_comparison": _methods_document(report.methods),
+        "replicates": {**_figures_document(report.replicates), "variance_components": _plain(report.components)},
+        "calibration": _plain(report.calibration),
     }
+
+
+def _methods_document(methods: MethodComparison) -> dict[str, Any]:
+    return {
+        "masses": methods.n,
+        "error_ratio": methods.error_ratio,
+        **_figures_document(methods.figures),
+        "analytic_intervals": {name: _rounded_ends(ends) for name, ends in methods.analytic.items()},
+        "limits": {name: _plain(one) for name, one in methods.limits.items()},
+        "trends": {name: _plain(one) for name, one in methods.trends.items()},
+        "concordance_parts": _plain(methods.concordance),
+    }
+
+
+def _paired_document(one: PairedComparison) -> dict[str, Any]:
+    figures = {"difference_percent": one.difference_percent, "ratio": one.ratio}
+    plain = {name: getattr(one, name) for name in ("first", "second", "masses", "patients")}
+    numbers = {name: _plain(getattr(one, name)) for name in ("first_percent", "second_percent", "p_value", "p_holm")}
+    return {**plain, **numbers, **_figures_document(figures)}
+
+
+def _plain(value: object) -> Any:
+    """Dataclasses, tuples and numbers as JSON has them; what is not finite becomes null."""
+    if is_dataclass(value):
+        return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(one) for one in value]
+    if isinstance(value, float):
+        return _rounded(value) if math.isfinite(value) else None
+    return value
 
 
 def _figures_document(figures: Mapping[str, Figure]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-Scale = Literal["log", "linear"]
+Scale = Literal["log", "linear", "fisher"]
 Values = TypeVar("Values", float, npt.NDArray[np.float64])
 
 # Below this the spread of so few leave-one-out values says little; a Student t with 6 degrees of freedom would hide it.
@@ -32,7 +32,8 @@ def jackknife_interval(
     left_out
         One function a patient, giving the statistic without that patient.
     scale
-        ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear`` on the figure.
+        ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear`` on the figure,
+        ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1).
     confidence
         Probability of the interval.
 
@@ -74,15 +75,22 @@ def interval_from_values(
     low, high = everything - reach, everything + reach
     if scale == "linear":
         return low, high
+    if scale == "fisher":
+        return math.tanh(low), math.tanh(high)
     if high > math.log(1e300):
         raise UndefinedError("the interval is wider than double precision holds")
     return math.exp(low), math.exp(high)
 
 
 def on_scale(values: Values, scale: Scale) -> Values:
-    """The values as they are, or their logarithms; `UndefinedError` where one has none."""
+    """The values as they are, their logarithms, or Fisher's z; `UndefinedError` where one has none."""
     if scale == "linear":
         return values
+    if scale == "fisher":
+        if np.any(np.abs(np.asarray(values)) >= 1):
+            raise UndefinedError("the coefficient is 1 or -1, or becomes so without one patient")
+        stretched: Values = np.arctanh(values)
+        return stretched
     if np.any(np.asarray(values) <= 0):
         raise UndefinedError("the figure is 0, or becomes 0 without one patient, and has no logarithm")
     logarithms: Values = np.log(values)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import groupby
+from dataclasses import dataclass, field
+from itertools import compress, groupby
 from typing import Any, Protocol
 
 import numpy as np
@@ -42,6 +42,8 @@ class Reading:
     size_mm: float | None = None
     interval: Interval | None = None
     synthetic: bool = False
+    sd_mm: float | None = None
+    reader: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,8 @@ class ModalitySizes:
         The credible intervals that the readings state.
     masses_not_done, masses_without_reading
         Excised masses left out: looked for in no replicate, or not in the table.
+    mass
+        (n,) array, the number of each mass among the excised ones; counted from 0 when not given.
     """
 
     name: str
@@ -87,9 +91,12 @@ class ModalitySizes:
     readings: int = 0
     masses_not_done: int = 0
     masses_without_reading: int = 0
+    mass: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         n = len(self.ex_vivo_mm)
+        if len(self.mass) != n:
+            object.__setattr__(self, "mass", np.arange(n))
         if not (
             self.patient.shape == self.ex_vivo_mm.shape == self.size_mm.shape == (n,) == (len(self.replicates_mm),)
         ):
@@ -114,7 +121,8 @@ class ModalitySizes:
             patient=self.patient[keep],
             ex_vivo_mm=self.ex_vivo_mm[keep],
             size_mm=self.size_mm[keep],
-            replicates_mm=tuple(sizes for sizes, kept in zip(self.replicates_mm, keep, strict=True) if kept),
+            replicates_mm=tuple(compress(self.replicates_mm, keep.tolist())),
+            mass=self.mass[keep],
         )
 
     def take(self, masses: npt.NDArray[np.int64]) -> ModalitySizes:
@@ -125,6 +133,7 @@ class ModalitySizes:
             ex_vivo_mm=self.ex_vivo_mm[masses],
             size_mm=self.size_mm[masses],
             replicates_mm=tuple(self.replicates_mm[i] for i in masses),
+            mass=self.mass[masses],
         )
 
     def only_detected(self) -> ModalitySizes:
@@ -158,12 +167,14 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     """
     names = ("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability")
     readings = []
-    for row, cells in enumerate(zip(*(columns[name] for name in (*names, "synthetic")), strict=True)):
-        patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, synthetic = cells
+    more = [columns.get(name, [None] * len(columns["patient"])) for name in ("sd_mm", "reader", "synthetic")]
+    for row, cells in enumerate(zip(*(columns[name] for name in names), *more, strict=True)):
+        patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, *others = cells
         _check_status(row, status, size_mm, fault=fault)
         interval = _interval(row, status, (low_mm, high_mm, probability), fault=fault)
-        reading = Reading((patient, mass), modality, replicate, status, size_mm, interval, bool(synthetic))
-        readings.append(reading)
+        sd_mm, reader, synthetic = others
+        key = (patient, mass)
+        readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(synthetic), sd_mm, reader))
     return readings
 
 
@@ -213,15 +224,31 @@ def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> 
 
 def _gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> dict[str, ModalitySizes]:
     ordered = sorted(readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
-    number = {patient: index for index, patient in enumerate(sorted({patient for patient, _ in ex_vivo_mm}))}
+    number = patient_numbers(ex_vivo_mm)
+    masses = mass_numbers(ex_vivo_mm)
     return {
-        name: _gather_modality(name, list(group), ex_vivo_mm=ex_vivo_mm, number=number)
+        name: _gather_modality(name, list(group), ex_vivo_mm=ex_vivo_mm, number=number, masses=masses)
         for name, group in groupby(ordered, key=lambda r: r.modality)
     }
 
 
+def patient_numbers(masses: Iterable[MassKey]) -> dict[str, int]:
+    """Each patient's number, in order of the codes."""
+    return {patient: index for index, patient in enumerate(sorted({patient for patient, _ in masses}))}
+
+
+def mass_numbers(masses: Iterable[MassKey]) -> dict[MassKey, int]:
+    """Each mass's number, in order of patient and mass."""
+    return {key: index for index, key in enumerate(sorted(masses))}
+
+
 def _gather_modality(
-    name: str, readings: Sequence[Reading], *, ex_vivo_mm: Mapping[MassKey, float], number: Mapping[str, int]
+    name: str,
+    readings: Sequence[Reading],
+    *,
+    ex_vivo_mm: Mapping[MassKey, float],
+    number: Mapping[str, int],
+    masses: Mapping[MassKey, int],
 ) -> ModalitySizes:
     seen = {reading.key for reading in readings}
     done = [reading for reading in readings if reading.status != "not_done"]
@@ -239,4 +266,5 @@ def _gather_modality(
         readings=len(done),
         masses_not_done=len(seen) - len(by_mass),
         masses_without_reading=len(ex_vivo_mm) - len(seen),
+        mass=np.array([masses[key] for key in by_mass], dtype=np.int64),
     )

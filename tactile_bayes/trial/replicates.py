@@ -29,7 +29,7 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
         "within_mass_log_sd": log_sd,
         "repeatability_low_percent": _swapped(log_sd.mapped(lambda sd: 100 * math.expm1(-_PAIR * sd))),
         "repeatability_high_percent": log_sd.mapped(lambda sd: 100 * math.expm1(_PAIR * sd)),
-        "icc": figure(icc, replicated, scale="linear", confidence=confidence),
+        "icc": figure(icc, replicated, scale="fisher", confidence=confidence),
     }
 
 

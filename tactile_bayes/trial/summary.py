@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from tactile_bayes.trial import accuracy, origin_line, spread
+from tactile_bayes.trial import accuracy, origin_line, replicates, spread
+from tactile_bayes.trial.calibration import Calibration, Prediction, calibration, log_normal, predictions
 from tactile_bayes.trial.comparison import mape_ratios
 from tactile_bayes.trial.coverage import Coverage, coverage
 from tactile_bayes.trial.figures import Figure
+from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
+from tactile_bayes.trial.paired import PairedComparison, paired_comparisons
 from tactile_bayes.trial.proportion import clopper_pearson
-from tactile_bayes.trial.readings import MassKey, ModalitySizes, Reading, gather
+from tactile_bayes.trial.readings import MassKey, ModalitySizes, Reading, gather, mass_numbers, patient_numbers
+from tactile_bayes.trial.replicates import reader_components
+from tactile_bayes.trial.variance_components import Components
 
 FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (accuracy.figures, origin_line.figures, spread.figures)
 
@@ -30,11 +36,19 @@ class ModalityReport:
     masses_without_reading: int
     figures: Mapping[str, Figure]
     coverage: tuple[Coverage, ...]
+    methods: MethodComparison
+    replicates: Mapping[str, Figure]
+    components: Components | None = None
+    calibration: Calibration | None = None
+    prediction: Prediction | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class TrialReport:
-    """All modalities, their percent errors over the tactile one's, and what was counted."""
+    """All modalities, their percent errors over the tactile one's, every pair of them, and what was counted.
+
+    `sizes` are those that the figures were made from; `ex_vivo_sd_mm` is by the number of the mass.
+    """
 
     modalities: Mapping[str, ModalityReport]
     ratios: Mapping[str, Mapping[str, Figure]]
@@ -44,10 +58,18 @@ class TrialReport:
     synthetic_readings: int
     readings: int
     confidence: float
+    paired: tuple[PairedComparison, ...] = ()
+    sizes: Mapping[str, ModalitySizes] = field(default_factory=dict)
+    ex_vivo_sd_mm: Mapping[int, float | None] = field(default_factory=dict)
 
 
 def summarise(
-    readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float], *, confidence: float = 0.95
+    readings: Iterable[Reading],
+    ex_vivo_mm: Mapping[MassKey, float],
+    *,
+    confidence: float = 0.95,
+    error_ratio: float = 1.0,
+    ex_vivo_sd_mm: Mapping[MassKey, float | None] | None = None,
 ) -> TrialReport:
     """Compare each modality's sizes with excision.
 
@@ -58,35 +80,100 @@ def summarise(
     ex_vivo_mm
         Size after excision in mm, by patient and mass; every mass of `readings` must be there.
     confidence
-        Probability of the intervals.
+        Probability of the intervals; `Intervals` to choose how they are made.
+    error_ratio
+        Variance of the error of ex-vivo sizes over that of a modality's, for the Deming lines.
+    ex_vivo_sd_mm
+        Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature.
     """
     readings = list(readings)
     sizes = gather(readings, ex_vivo_mm)
+    beside = _Beside(readings, ex_vivo_mm, ex_vivo_sd_mm or {})
     return TrialReport(
-        modalities={name: modality_report(one, confidence=confidence) for name, one in sizes.items()},
+        modalities={
+            name: modality_report(one, confidence=confidence, error_ratio=error_ratio, beside=beside)
+            for name, one in sizes.items()
+        },
         ratios=mape_ratios(sizes, confidence=confidence),
         patients=len({patient for patient, _ in ex_vivo_mm}),
         masses=len(ex_vivo_mm),
         masses_without_any_reading=len(set(ex_vivo_mm) - {reading.key for reading in readings}),
         synthetic_readings=sum(reading.synthetic for reading in readings),
         readings=len(readings),
-        confidence=confidence,
+        confidence=float(confidence),
+        paired=tuple(paired_comparisons(sizes, confidence=confidence)),
+        sizes=sizes,
+        ex_vivo_sd_mm={number: (ex_vivo_sd_mm or {}).get(key) for key, number in mass_numbers(ex_vivo_mm).items()},
     )
 
 
-def modality_report(sizes: ModalitySizes, *, confidence: float) -> ModalityReport:
+class _Beside:
+    """What single readings say beside their sizes: readers and stated uncertainties, modality by modality."""
+
+    def __init__(
+        self,
+        readings: Iterable[Reading],
+        ex_vivo_mm: Mapping[MassKey, float],
+        ex_vivo_sd_mm: Mapping[MassKey, float | None],
+    ) -> None:
+        self._found: dict[str, list[Reading]] = {}
+        for reading in readings:
+            if reading.size_mm is not None:
+                self._found.setdefault(reading.modality, []).append(reading)
+        self._ex_vivo_mm, self._ex_vivo_sd_mm = ex_vivo_mm, ex_vivo_sd_mm
+        self._masses, self._patients = mass_numbers(ex_vivo_mm), patient_numbers(ex_vivo_mm)
+
+    def components(self, modality: str) -> Components | None:
+        """Variances of the logarithm of size between masses, readers and maps."""
+        found = self._found.get(modality, [])
+        logs = [math.log(one.size_mm) for one in found if one.size_mm is not None]
+        return reader_components(logs, [one.key for one in found], [one.reader for one in found])
+
+    def prediction(self, modality: str) -> Prediction | None:
+        """Stated uncertainties as predictive distributions; None where no reading states one."""
+        stated = [(one, _stated(one)) for one in self._found.get(modality, [])]
+        kept = [(one, distribution) for one, distribution in stated if distribution is not None]
+        if not kept:
+            return None
+        keys = [one.key for one, _ in kept]
+        return predictions(
+            [distribution for _, distribution in kept],
+            [self._ex_vivo_mm[key] for key in keys],
+            [self._ex_vivo_sd_mm.get(key) for key in keys],
+            masses=[self._masses[key] for key in keys],
+            patients=[self._patients[patient] for patient, _ in keys],
+        )
+
+
+def _stated(reading: Reading) -> tuple[float, float] | None:
+    assert reading.size_mm is not None
+    ends = reading.interval
+    if ends is None:
+        return log_normal(None, None, None, reading.size_mm, reading.sd_mm)
+    return log_normal(ends.low_mm, ends.high_mm, ends.probability, reading.size_mm, reading.sd_mm)
+
+
+def modality_report(
+    sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0, beside: _Beside | None = None
+) -> ModalityReport:
     """Counts, all families' figures and the coverage of one modality."""
+    prediction = None if beside is None else beside.prediction(sizes.name)
     n, detected = len(sizes.size_mm), int(sizes.detected.sum())
     return ModalityReport(
         name=sizes.name,
         n=n,
         detected=detected,
-        detected_interval=clopper_pearson(detected, n, confidence=confidence) if n else None,
+        detected_interval=clopper_pearson(detected, n, confidence=float(confidence)) if n else None,
         patients=len(sizes.patients),
         readings=sizes.readings,
         readings_detected=sum(len(group) for group in sizes.replicates_mm),
         masses_not_done=sizes.masses_not_done,
         masses_without_reading=sizes.masses_without_reading,
         figures={name: one for family in FAMILIES for name, one in family(sizes, confidence=confidence).items()},
-        coverage=tuple(coverage(sizes.intervals, confidence=confidence)),
+        coverage=tuple(coverage(sizes.intervals, confidence=float(confidence))),
+        methods=compare_methods(sizes, confidence=confidence, error_ratio=error_ratio),
+        replicates=replicates.figures(sizes, confidence=confidence),
+        components=None if beside is None else beside.components(sizes.name),
+        calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
+        prediction=prediction,
     )

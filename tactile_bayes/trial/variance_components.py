@@ -51,13 +51,18 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
     theta = np.abs(_least(problem.criterion, start))
     residual = problem.residual_variance(theta)
     return Components(
-        mass=float(theta[0] ** 2 * residual),
-        reader=float(theta[1] ** 2 * residual) if readers > 1 else None,
+        mass=_variance(theta[0], residual),
+        reader=_variance(theta[1], residual) if readers > 1 else None,
         map=residual,
         n=len(y),
         masses=int(mass.max()) + 1,
         readers=readers,
     )
+
+
+def _variance(ratio: float, residual: float) -> float:
+    """The variance at this ratio of SDs; 0 where the search has gone to its lower end."""
+    return 0.0 if ratio < 1e-6 else float(ratio**2 * residual)
 
 
 class _Problem:

@@ -1,0 +1,48 @@
+"""What `validate` and `plan` read: the tables of a trial, tidy or wide, and the estimates that they name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.tables import Table
+    from tactile_bayes.trial.readings import MassKey, Reading
+
+
+@dataclass(frozen=True, slots=True)
+class TrialInputs:
+    """A trial ready to be summarised, and every file that went into it by role."""
+
+    readings: list[Reading]
+    ex_vivo_mm: Mapping[MassKey, float]
+    ex_vivo_sd_mm: Mapping[MassKey, float | None]
+    files: dict[str, Path]
+
+
+def load_trial(trial: Path, excision: Path, columns: Path | None) -> TrialInputs:
+    """Read and check both tables; `columns` maps a wide one."""
+    from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
+    from tactile_bayes.files.size_posterior import fill_from_posteriors
+    from tactile_bayes.files.tables import check_references, read_table
+    from tactile_bayes.trial.readings import readings_from_columns
+
+    wide_excision = columns is not None and "excision" in read_mapping(columns)
+    sizes: Table = (
+        read_wide_excision(excision, columns)
+        if columns is not None and wide_excision
+        else read_table(excision, "excision.table.json")
+    )
+    table = read_table(trial, "trial.table.json") if columns is None else read_wide(trial, columns)
+    check_references(table, "trial.table.json", targets={"excision": sizes})
+    filled, posteriors = fill_from_posteriors(table.columns, trial.parent, fault=table.error)
+    keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
+    files = {"trial": trial, "excision": excision} | ({} if columns is None else {"columns": columns})
+    return TrialInputs(
+        readings=readings_from_columns(filled, fault=table.error),
+        ex_vivo_mm=dict(zip(keys, sizes.columns["ex_vivo_mm"], strict=True)),
+        ex_vivo_sd_mm=dict(zip(keys, sizes.columns["sd_mm"], strict=True)),
+        files=files | {f"posterior_{number}": path for number, path in enumerate(posteriors, start=1)},
+    )

@@ -1,0 +1,131 @@
+"""Sizes from what `estimate` wrote: its JSON, or the draws in its netCDF."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.schema import check_document
+
+PROBABILITY = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class StatedSize:
+    """Largest size in mm with its interval; None throughout where there was no estimate."""
+
+    size_mm: float | None = None
+    low_mm: float | None = None
+    high_mm: float | None = None
+    probability: float | None = None
+
+
+def read_stated_size(path: Path) -> StatedSize:
+    """The largest size that an estimate states.
+
+    Raises
+    ------
+    BadDataError
+        When the file is neither `estimate --json` of one map nor a posterior, or holds no size.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(8)
+    except OSError as error:
+        raise unreadable(path, error) from None
+    return _from_json(path) if head.lstrip().startswith((b"{", b"[")) else _from_netcdf(path)
+
+
+def fill_from_posteriors(
+    columns: Mapping[str, list[Any]], folder: Path, *, fault: Callable[..., BadDataError]
+) -> tuple[dict[str, list[Any]], list[Path]]:
+    """The columns of a trial table with sizes and intervals from the files in its ``posterior`` column.
+
+    Parameters
+    ----------
+    folder
+        Relative paths start here: the folder of the table.
+    fault
+        Makes the error for a cell, as `Table.error` does.
+
+    Returns
+    -------
+    New columns, and the files that were read, in order.
+    """
+    filled = {name: list(values) for name, values in columns.items()}
+    paths = []
+    for row, name in enumerate(filled.get("posterior", [])):
+        if not name:
+            continue
+        path = folder / name
+        _check_blank(filled, row, fault=fault)
+        stated = read_stated_size(path)
+        _check_status(filled["status"][row], stated, row, fault=fault)
+        for column in ("size_mm", "low_mm", "high_mm", "probability"):
+            filled[column][row] = getattr(stated, column)
+        paths.append(path)
+    return filled, paths
+
+
+def _check_blank(columns: Mapping[str, list[Any]], row: int, *, fault: Callable[..., BadDataError]) -> None:
+    for column in ("size_mm", "low_mm", "high_mm", "probability", "sd_mm"):
+        if columns[column][row] is not None:
+            raise fault(
+                row,
+                column,
+                f"is {columns[column][row]:g} beside a posterior",
+                way_out="leave it blank: the file says it",
+            )
+
+
+def _check_status(status: str, stated: StatedSize, row: int, *, fault: Callable[..., BadDataError]) -> None:
+    if status == "detected" and stated.size_mm is None:
+        way_out = "give status not_detected, or not_done"
+        raise fault(row, "posterior", "names an estimate without a size while status is detected", way_out=way_out)
+    if status != "detected" and stated.size_mm is not None:
+        way_out = "give status detected, or leave posterior blank"
+        raise fault(row, "posterior", f"names an estimate with a size while status is {status}", way_out=way_out)
+
+
+def _from_json(path: Path) -> StatedSize:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise BadDataError(f"not a JSON file ({error})", way_out="give `estimate --json`", path=str(path)) from None
+    if isinstance(document, list):
+        if len(document) != 1:
+            what = f"holds {len(document)} estimates"
+            raise BadDataError(what, way_out="write each map's estimate to a file of its own", path=str(path))
+        document = document[0]
+    check_document(document, "estimate.schema.json", path=path)
+    size = document["max_size_mm"]
+    if size is None:
+        return StatedSize()
+    return StatedSize(size["median"], size["low"], size["high"], size["probability"])
+
+
+def _from_netcdf(path: Path) -> StatedSize:
+    import netCDF4
+
+    try:
+        with netCDF4.Dataset(path) as dataset:
+            group = dataset.groups.get("posterior")
+            draws = None if group is None else group.variables.get("max_size_mm")
+            values = None if draws is None else np.asarray(draws[:], dtype=np.float64).ravel()
+    except OSError:
+        raise BadDataError(
+            "is neither JSON nor netCDF", way_out="give what `estimate` wrote with --json or -o", path=str(path)
+        ) from None
+    values = np.zeros(0) if values is None else values[np.isfinite(values) & (values > 0)]
+    if len(values) < 2:
+        way_out = "estimate with --size-calibration, so that the posterior holds sizes"
+        raise BadDataError("holds no draws of max_size_mm", way_out=way_out, path=str(path))
+    low, median, high = np.quantile(values, [0.5 - PROBABILITY / 2, 0.5, 0.5 + PROBABILITY / 2])
+    return StatedSize(float(median), float(low), float(high), PROBABILITY)

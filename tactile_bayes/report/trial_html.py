@@ -1,0 +1,247 @@
+"""A trial report as one page that needs nothing else: tables, pictures, settings, hashes; no script, no network."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.trial_figures import calibration_figure, differences_figure, sizes_figure
+from tactile_bayes.report.trial_methods_text import shown
+from tactile_bayes.trial.figures import Figure
+from tactile_bayes.trial.summary import ModalityReport, TrialReport
+
+_STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;color:#1b1b1b;max-width:72rem;margin:2rem auto;padding:0 1.2rem}
+h1{font-size:1.5rem;margin:0 0 .2rem}h2{font-size:1.12rem;margin:2rem 0 .5rem;border-bottom:1px solid #ccc}
+table{border-collapse:collapse;font-size:.86rem;margin:.6rem 0;font-variant-numeric:tabular-nums}
+th,td{padding:.22rem .7rem .22rem 0;text-align:left;vertical-align:top;border-bottom:1px solid #e4e4e4}
+th{font-weight:600}td small{color:#5a5a5a;white-space:nowrap}img{max-width:100%;height:auto}
+.wide{overflow-x:auto}.note{color:#5a5a5a;font-size:.86rem}pre{font-size:.76rem;overflow-x:auto;background:#f6f6f4;padding:.8rem}
+.mark{background:#fff3d6;padding:.35rem .7rem;border-left:4px solid #c8641e}code{font-size:.8rem;overflow-wrap:anywhere}
+@media print{body{margin:0;max-width:none}h2{break-after:avoid}img,tr{break-inside:avoid}}
+"""
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+_MAIN = {
+    "mape_percent": ("MAPE %", ".1f"),
+    "mape_detected_percent": ("MAPE % found", ".1f"),
+    "weighted_mape_percent": ("weighted %", ".1f"),
+    "median_error_percent": ("median %", ".1f"),
+    "mae_mm": ("MAE mm", ".2f"),
+    "bias_percent": ("bias % found", "+.1f"),
+    "slope_through_origin": ("slope through 0", ".2f"),
+    "r2_centred": ("r2 centred", ".2f"),
+    "r2_uncentred": ("r2 uncentred", ".2f"),
+    "r2_pearson": ("r2 Pearson", ".2f"),
+}
+_METHODS = {
+    "ols_slope": ("least squares slope", ".2f"),
+    "ols_intercept_mm": ("intercept mm", ".1f"),
+    "deming_slope": ("Deming slope", ".2f"),
+    "deming_intercept_mm": ("intercept mm", ".1f"),
+    "weighted_deming_slope": ("weighted Deming slope", ".2f"),
+    "weighted_deming_intercept_mm": ("intercept mm", ".1f"),
+    "passing_bablok_slope": ("Passing-Bablok slope", ".2f"),
+    "passing_bablok_intercept_mm": ("intercept mm", ".1f"),
+    "concordance": ("concordance", ".2f"),
+}
+
+
+def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -> str:
+    """The whole page.
+
+    Parameters
+    ----------
+    document
+        What the JSON report holds; its provenance is shown.
+    text
+        The text report, kept at the end for those who copy from it.
+    """
+    title = "Sizes against excision"
+    parts = [
+        "<!doctype html>",
+        '<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{title}</h1>",
+        *_opening(report),
+        *_errors(report),
+        *_agreement(report),
+        *_replicates(report),
+        *_calibrations(report),
+        *_comparisons(report),
+        *_origin(document),
+        f"<h2>As text</h2><pre>{html.escape(text)}</pre>",
+        f'<p class="mark">{html.escape(RESEARCH_USE)}</p></body></html>',
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _opening(report: TrialReport) -> Iterator[str]:
+    yield (
+        f"<p>{report.masses} masses of {report.patients} patients, {report.readings} readings. "
+        f"In brackets: {100 * report.confidence:g} % intervals over patients.</p>"
+    )
+    if report.synthetic_readings:
+        share = "All" if report.synthetic_readings == report.readings else str(report.synthetic_readings)
+        yield f'<p class="mark">{share} readings are synthetic: made by a generator, not measured.</p>'
+
+
+def _errors(report: TrialReport) -> Iterator[str]:
+    yield "<h2>Errors</h2>"
+    rows = [[one.name, _found(one), *_cells(one.figures, _MAIN)] for one in report.modalities.values()]
+    yield _table(["", "found", *(words for words, _ in _MAIN.values())], rows)
+    yield (
+        '<p class="note">A mass not found counts as size 0, an error of 100 %, except in columns that say "found". '
+        "r2 centred is 1 - SSE0/SST of the line through zero, below 0 where it fails.</p>"
+    )
+    for name, ratios in report.ratios.items():
+        yield (
+            f"<p>{html.escape(name)}: percent error {shown(ratios['ratio'], '.2f')} times the tactile one's "
+            f"({shown(ratios['ratio_detected'], '.2f')} over masses found).</p>"
+        )
+    yield _picture(sizes_figure(report), "Size against ex-vivo size for each modality, with identity and fitted line")
+
+
+def _agreement(report: TrialReport) -> Iterator[str]:
+    ratio = next((one.methods.error_ratio for one in report.modalities.values()), 1.0)
+    yield "<h2>Agreement</h2>"
+    rows = [[one.name, *_cells(one.methods.figures, _METHODS)] for one in report.modalities.values()]
+    yield _table(["", *(words for words, _ in _METHODS.values())], rows)
+    yield (
+        '<p class="note">Masses found only; limits are for single readings. '
+        f"Error ratio of the Deming lines (ex vivo over modality): {ratio:g}.</p>"
+    )
+    limits = [(one.name, key, two) for one in report.modalities.values() for key, two in one.methods.limits.items()]
+    yield _table(
+        ["", "scale", "bias", "lower limit", "upper limit", "SD of one difference"],
+        [
+            [
+                name,
+                "mm" if key == "mm" else "ln ratio",
+                _with(two.bias, two.bias_interval),
+                _with(two.low, two.low_interval),
+                _with(two.high, two.high_interval),
+                f"{two.sd:.3g}",
+            ]
+            for name, key, two in limits
+        ],
+    )
+    yield _picture(differences_figure(report), "Difference to the ex-vivo size against the mean of both, with limits")
+
+
+def _replicates(report: TrialReport) -> Iterator[str]:
+    replicated = [one for one in report.modalities.values() if one.replicates["within_mass_log_sd"].value is not None]
+    if not replicated:
+        return
+    yield "<h2>Replicates</h2>"
+    rows = []
+    for one in replicated:
+        parts = one.components
+        sds = [None, None, None] if parts is None else [parts.mass, parts.reader, parts.map]
+        rows.append(
+            [
+                one.name,
+                *_cells(
+                    one.figures, {"within_mass_cv_rms_percent": ("", ".1f"), "within_mass_cv_percent": ("", ".1f")}
+                ),
+                shown(one.replicates["repeatability_low_percent"], ".0f"),
+                shown(one.replicates["repeatability_high_percent"], "+.0f"),
+                shown(one.replicates["icc"], ".2f"),
+                *("-" if sd is None else f"{100 * sd**0.5:.0f}" for sd in sds),
+            ]
+        )
+    heads = [
+        "",
+        "wCV % (RMS)",
+        "wCV % (mean of SDs)",
+        "repeatability down %",
+        "up %",
+        "ICC",
+        "SD masses %",
+        "readers %",
+    ]
+    yield _table([*heads, "maps %"], rows)
+    yield '<p class="note">The mean of SDs is low for few replicates. SDs are of the logarithm of size.</p>'
+
+
+def _calibrations(report: TrialReport) -> Iterator[str]:
+    for one in report.modalities.values():
+        if one.calibration is None or one.prediction is None:
+            continue
+        found = one.calibration
+        yield f"<h2>Stated uncertainty: {html.escape(one.name)}</h2>"
+        yield (
+            f"<p>{found.n} readings of {found.masses} masses; CRPS {found.crps_mm:.2f} mm, interval score "
+            f"{found.interval_score_mm:.1f} mm. Advice: {html.escape(found.advice)}.</p>"
+        )
+        yield _picture(calibration_figure(one.prediction, found), "Integral transforms and coverage")
+
+
+def _comparisons(report: TrialReport) -> Iterator[str]:
+    if not report.paired:
+        return
+    yield "<h2>Modalities compared on common masses</h2>"
+    yield _table(
+        ["", "masses", "difference of MAPE, points", "ratio", "p", "p Holm"],
+        [
+            [
+                f"{one.first} - {one.second}",
+                str(one.masses),
+                shown(one.difference_percent, "+.1f"),
+                shown(one.ratio, ".2f"),
+                "-" if one.p_value is None else f"{one.p_value:.4f}",
+                "-" if one.p_holm is None else f"{one.p_holm:.4f}",
+            ]
+            for one in report.paired
+        ],
+    )
+
+
+def _origin(document: Mapping[str, Any]) -> Iterator[str]:
+    provenance = document["provenance"]
+    yield "<h2>Settings and origin</h2>"
+    rows = [[key, json.dumps(value)] for key, value in provenance["settings"].items()]
+    rows += [["seed", str(provenance["seed"])], ["program", f"{provenance['program']} {provenance['version']}"]]
+    yield _table(["setting", "value"], rows)
+    yield _table(["input", "sha256"], [[one["role"], f"<code>{one['sha256']}</code>"] for one in provenance["inputs"]])
+    if not any(one["role"] == "protocol" for one in provenance["inputs"]):
+        yield '<p class="note">No pre-specified analysis was given (--protocol).</p>'
+
+
+def _cells(figures: Mapping[str, Figure], wanted: Mapping[str, tuple[str, str]]) -> list[str]:
+    return [shown(figures[key], spec) for key, (_, spec) in wanted.items()]
+
+
+def _with(value: float, ends: tuple[float, float] | None) -> str:
+    return f"{value:.3g}" if ends is None else f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}]"
+
+
+def _found(report: ModalityReport) -> str:
+    share = f"{report.detected}/{report.n}"
+    ends = report.detected_interval
+    return share if ends is None else f"{share} [{100 * ends[0]:.0f}, {100 * ends[1]:.0f} %]"
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{html.escape(one)}</th>" for one in heads)
+    body = "".join(f"<tr>{''.join(f'<td>{_cell(one)}</td>' for one in row)}</tr>" for row in rows)
+    return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
+
+
+def _cell(text: str) -> str:
+    """The text, with an interval in brackets set small below the number."""
+    if text.startswith("<code>"):
+        return text
+    value, bracket, rest = text.partition(" [")
+    return html.escape(value) + (f"<br><small>[{html.escape(rest)}</small>" if bracket else "")
+
+
+def _picture(png: bytes, words: str) -> str:
+    data = base64.b64encode(png).decode("ascii")
+    return f'<p><img alt="{html.escape(words)}" src="data:image/png;base64,{data}"></p>'

@@ -1,0 +1,91 @@
+"""The second table of a trial report: modalities as methods of measurement, repeatability, calibration, comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from tactile_bayes.trial.figures import Figure
+from tactile_bayes.trial.paired import PairedComparison
+from tactile_bayes.trial.summary import ModalityReport, TrialReport
+
+_LINES = {
+    "ols": "least squares",
+    "deming": "Deming",
+    "weighted_deming": "weighted Deming",
+    "passing_bablok": "Passing-Bablok",
+}
+
+
+def method_lines(report: TrialReport) -> Iterator[str]:
+    """Lines of text, none longer than 150 characters."""
+    yield "Detected masses as measurements (size on ex vivo; differences are size - ex vivo):"
+    for one in report.modalities.values():
+        yield from _modality_lines(one)
+    for pair in report.paired:
+        yield _pair_line(pair)
+    if report.paired:
+        yield "p: sign-flip test by patient on the masses both looked for; p Holm: corrected for all pairs."
+
+
+def _modality_lines(report: ModalityReport) -> Iterator[str]:
+    figures, name = report.methods.figures, report.name
+    for key, words in _LINES.items():
+        slope, intercept = figures[f"{key}_slope"], figures[f"{key}_intercept_mm"]
+        if slope.value is not None:
+            ratio = f", error ratio {report.methods.error_ratio:g}" if "deming" in key else ""
+            yield f"{name}: {words}{ratio}: slope {shown(slope, '.2f')}, intercept {shown(intercept, '.1f')} mm"
+    if figures["concordance"].value is not None:
+        yield f"{name}: concordance {shown(figures['concordance'], '.2f')}"
+    yield from _limits_lines(report)
+    yield from _replicate_lines(report)
+    if report.calibration is not None:
+        found = report.calibration
+        yield (
+            f"{name}: stated uncertainty: CRPS {found.crps_mm:.2f} mm, "
+            f"interval score {found.interval_score_mm:.1f} mm; {found.advice}"
+        )
+
+
+def _limits_lines(report: ModalityReport) -> Iterator[str]:
+    for key, unit in (("mm", "mm"), ("log_ratio", "in ln ratio")):
+        one = report.methods.limits.get(key)
+        if one is None:
+            continue
+        ends = (f"{one.low:.3g}{_ends(one.low_interval)}", f"{one.high:.3g}{_ends(one.high_interval)}")
+        yield f"{report.name}: limits of agreement {unit}: bias {one.bias:.3g}, {ends[0]} to {ends[1]}"
+
+
+def _replicate_lines(report: ModalityReport) -> Iterator[str]:
+    figures = report.replicates
+    if figures["repeatability_high_percent"].value is None:
+        return
+    low, high = shown(figures["repeatability_low_percent"], ".0f"), shown(figures["repeatability_high_percent"], "+.0f")
+    yield f"{report.name}: two readings of one mass differ by {low} to {high} % at most in 95 % of pairs"
+    parts = report.components
+    if parts is not None:
+        readers = "" if parts.reader is None else f", readers {100 * parts.reader**0.5:.0f}"
+        icc = shown(figures["icc"], ".2f")
+        yield (
+            f"{report.name}: SD of ln size, %: masses {100 * parts.mass**0.5:.0f}{readers}, maps "
+            f"{100 * parts.map**0.5:.0f}; ICC {icc}"
+        )
+
+
+def _pair_line(pair: PairedComparison) -> str:
+    head = f"{pair.first} - {pair.second} on {pair.masses} common masses: "
+    if pair.difference_percent.value is None:
+        return head + f"no comparison: {pair.difference_percent.reason}"
+    test = "" if pair.p_value is None or pair.p_holm is None else f"; p {pair.p_value:.4f}, p Holm {pair.p_holm:.4f}"
+    difference = shown(pair.difference_percent, "+.1f")
+    return head + f"MAPE {difference} points, ratio {shown(pair.ratio, '.2f')}{test}"
+
+
+def shown(figure: Figure, spec: str) -> str:
+    """The value with its interval in brackets."""
+    if figure.value is None:
+        return "-"
+    return f"{figure.value:{spec}}{_ends(figure.interval, spec)}"
+
+
+def _ends(interval: tuple[float, float] | None, spec: str = ".3g") -> str:
+    return "" if interval is None else f" [{interval[0]:{spec}}, {interval[1]:{spec}}]"

@@ -1,0 +1,231 @@
+"""Whether stated uncertainties are honest: probability integral transforms, scores, and what would mend them.
+
+A stated uncertainty becomes a predictive distribution of the size that the caliper will read: normal on the logarithm
+of size, through the stated interval (or mean and SD), widened in quadrature by the caliper's own error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_bayes.trial.jackknife import MIN_PATIENTS
+from tactile_bayes.trial.proportion import clopper_pearson
+from tactile_bayes.trial.readings import FloatArray
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+BINS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Predictive distributions of log ex-vivo sizes, one a reading, beside what was found.
+
+    Attributes
+    ----------
+    median_log, sd_log
+        (n,) arrays of each prediction: the logarithm of its median in mm and its SD, caliper error included.
+    found_log
+        (n,) array: logarithm of the ex-vivo size in mm.
+    mass, patient
+        (n,) arrays of numbers.
+    """
+
+    median_log: FloatArray
+    sd_log: FloatArray
+    found_log: FloatArray
+    mass: FloatArray
+    patient: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.found_log)
+
+    @property
+    def z(self) -> FloatArray:
+        """(n,) standardised errors: standard normal when the uncertainties are honest."""
+        return (self.found_log - self.median_log) / self.sd_log
+
+
+@dataclass(frozen=True, slots=True)
+class LevelCoverage:
+    """Central intervals of one nominal probability: `covered` of the readings, with an exact interval by masses."""
+
+    probability: float
+    covered: int
+    n: int
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """How honest the stated uncertainties are.
+
+    Attributes
+    ----------
+    pit
+        Histogram of the integral transforms: counts in `BINS` equal bins; level when honest.
+    ecdf_band
+        Half-width of the simultaneous band about the transforms' distribution function (Kolmogorov, by masses).
+    ecdf_distance
+        Largest distance of that function from the diagonal; above the band, the uncertainties are refuted.
+    crps_mm
+        Mean continuous ranked probability score of the size in mm: an absolute error for whole distributions.
+    interval_score_mm
+        Mean interval score at 95 %: width, and 40 mm for each mm outside.
+    scale
+        Factor by which SDs should be multiplied to be honest in the mean square, with an interval by masses.
+    shift_percent
+        Median of the found sizes over the predicted, less 100 %.
+    """
+
+    n: int
+    masses: int
+    levels: tuple[LevelCoverage, ...]
+    pit: tuple[int, ...]
+    ecdf_band: float
+    ecdf_distance: float
+    crps_mm: float
+    interval_score_mm: float
+    scale: float
+    scale_interval: tuple[float, float]
+    shift_percent: float
+    advice: str
+
+
+def calibration(prediction: Prediction, *, confidence: float) -> Calibration | None:
+    """Judge predictions; None without any.
+
+    Notes
+    -----
+    Readings of one mass share its ex-vivo size, so n readings on m masses count as m trials wherever chance is judged.
+    """
+    if len(prediction) == 0:
+        return None
+    from scipy.special import kolmogi, ndtr
+
+    z = prediction.z
+    pit = ndtr(z)
+    masses = len(np.unique(prediction.mass))
+    ordered = np.sort(pit)
+    steps = np.arange(len(pit) + 1) / len(pit)
+    distance = float(max(np.max(steps[1:] - ordered), np.max(ordered - steps[:-1])))
+    scale, ends = _scale(z, prediction.mass, confidence=confidence)
+    shift = 100 * math.expm1(float(np.median(prediction.found_log - prediction.median_log)))
+    band = float(kolmogi(1 - confidence)) / math.sqrt(masses)
+    return Calibration(
+        n=len(prediction),
+        masses=masses,
+        levels=tuple(_level(z, masses, level, confidence=confidence) for level in LEVELS),
+        pit=tuple(int(count) for count in np.histogram(pit, bins=BINS, range=(0, 1))[0]),
+        ecdf_band=band,
+        ecdf_distance=distance,
+        crps_mm=float(np.mean(crps_log_normal(prediction))),
+        interval_score_mm=float(np.mean(interval_score(prediction, probability=0.95))),
+        scale=scale,
+        scale_interval=ends,
+        shift_percent=shift,
+        advice=_advice(scale, ends, masses, distance > band),
+    )
+
+
+def crps_log_normal(prediction: Prediction) -> FloatArray:
+    r"""(n,) continuous ranked probability scores in mm of log-normal predictions.
+
+    Notes
+    -----
+    With :math:`\omega = (\ln y - \mu)/\sigma`,
+
+    .. math:: y(2\Phi(\omega) - 1) - 2e^{\mu + \sigma^2/2}(\Phi(\omega - \sigma) + \Phi(\sigma/\sqrt 2) - 1)
+
+    Baran & Lerch (2015), Q. J. R. Meteorol. Soc. 141, 2289.
+    """
+    from scipy.special import ndtr
+
+    w, sd, found = prediction.z, prediction.sd_log, np.exp(prediction.found_log)
+    mean = np.exp(prediction.median_log + sd**2 / 2)
+    score: FloatArray = found * (2 * ndtr(w) - 1) - 2 * mean * (ndtr(w - sd) + ndtr(sd / math.sqrt(2)) - 1)
+    return score
+
+
+def interval_score(prediction: Prediction, *, probability: float) -> FloatArray:
+    """(n,) interval scores in mm: Gneiting & Raftery (2007), J. Am. Stat. Assoc. 102, 359, eq. 43."""
+    from scipy.special import ndtri
+
+    reach = float(ndtri(0.5 + 0.5 * probability)) * prediction.sd_log
+    low, high = np.exp(prediction.median_log - reach), np.exp(prediction.median_log + reach)
+    found = np.exp(prediction.found_log)
+    outside = np.maximum(low - found, 0) + np.maximum(found - high, 0)
+    score: FloatArray = high - low + 2 / (1 - probability) * outside
+    return score
+
+
+def log_normal(
+    low_mm: float | None, high_mm: float | None, probability: float | None, size_mm: float, sd_mm: float | None
+) -> tuple[float, float] | None:
+    """Median (log of mm) and SD of the logarithm that a reading states: by its interval, else by size and SD."""
+    from scipy.special import ndtri
+
+    if low_mm is not None and high_mm is not None and probability is not None and 0 < low_mm < high_mm:
+        reach = float(ndtri(0.5 + 0.5 * probability))
+        return (math.log(low_mm) + math.log(high_mm)) / 2, (math.log(high_mm) - math.log(low_mm)) / (2 * reach)
+    if sd_mm:
+        return math.log(size_mm) - math.log1p((sd_mm / size_mm) ** 2) / 2, math.sqrt(math.log1p((sd_mm / size_mm) ** 2))
+    return None
+
+
+def predictions(
+    stated: Sequence[tuple[float, float]],
+    ex_vivo_mm: Sequence[float],
+    ex_vivo_sd_mm: Sequence[float | None],
+    *,
+    masses: Sequence[int],
+    patients: Sequence[int],
+) -> Prediction:
+    """Stated medians and SDs with the caliper's relative error added in quadrature."""
+    found = np.array(ex_vivo_mm, dtype=np.float64)
+    caliper = np.array([sd or 0.0 for sd in ex_vivo_sd_mm]) / (found if len(found) else 1.0)
+    medians, sds = (np.array([one[i] for one in stated], dtype=np.float64) for i in (0, 1))
+    return Prediction(
+        median_log=medians,
+        sd_log=np.sqrt(sds**2 + np.log1p(caliper**2)),
+        found_log=np.log(found),
+        mass=np.array(masses, dtype=np.float64),
+        patient=np.array(patients, dtype=np.float64),
+    )
+
+
+def _level(z: FloatArray, masses: int, level: float, *, confidence: float) -> LevelCoverage:
+    from scipy.special import ndtri
+
+    covered = int(np.sum(np.abs(z) <= float(ndtri(0.5 + 0.5 * level))))
+    share = clopper_pearson(covered * masses / len(z), masses, confidence=confidence)
+    return LevelCoverage(level, covered, len(z), share)
+
+
+def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float, tuple[float, float]]:
+    """Root mean square of z, and its chi-squared interval with one degree of freedom a mass."""
+    from scipy.special import chdtri
+
+    masses = len(np.unique(mass))
+    mean = float(np.mean(z**2))
+    tail = 0.5 - 0.5 * confidence
+    low, high = masses * mean / float(chdtri(masses, tail)), masses * mean / float(chdtri(masses, 1 - tail))
+    return math.sqrt(mean), (math.sqrt(low), math.sqrt(high))
+
+
+def _advice(scale: float, ends: tuple[float, float], masses: int, refuted: bool) -> str:
+    if masses < MIN_PATIENTS:
+        return f"too few masses ({masses}) to judge; at least {MIN_PATIENTS} are needed"
+    if ends[0] <= 1 <= ends[1]:
+        return (
+            "widths agree with the errors, but their shape or centre does not: look at the PIT histogram"
+            if refuted
+            else "no change: the widths agree with the errors found"
+        )
+    word = "too narrow" if scale > 1 else "too wide"
+    return (
+        f"stated uncertainties are {word}: multiply the SD of log size by {scale:.2f} ({ends[0]:.2f} to {ends[1]:.2f})"
+    )

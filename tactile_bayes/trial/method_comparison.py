@@ -1,0 +1,228 @@
+"""Lines, concordance and limits of agreement of one modality against excision, with intervals over patients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+
+from tactile_bayes.trial import bland_altman
+from tactile_bayes.trial.bland_altman import Limits, Trend
+from tactile_bayes.trial.concordance import Concordance, concordance
+from tactile_bayes.trial.figures import Figure, Statistic, figure
+from tactile_bayes.trial.jackknife import Scale, UndefinedError
+from tactile_bayes.trial.lines import Line, deming, least_squares, weighted_deming
+from tactile_bayes.trial.passing_bablok import PassingBablok, passing_bablok
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+from tactile_bayes.trial.sums import SumStatistic, columns, ratio
+
+# Lines that are not sums are fitted anew without each patient; beyond so many masses that takes too long.
+MOST_REFITTED = 300
+# Sizes beyond these have squares that double precision does not hold.
+_SMALLEST, _LARGEST = 1e-100, 1e100
+
+Ends = tuple[float, float]
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class MethodComparison:
+    """What the detected masses say of one modality as a method of measurement.
+
+    Attributes
+    ----------
+    error_ratio
+        Variance of the error of ex-vivo sizes over that of the modality's, as the Deming lines took it.
+    figures
+        Intercepts, slopes, concordance and limits with intervals over patients.
+    analytic
+        Customary intervals of the same figures, as if masses were independent; None where there is none.
+    limits
+        ``mm`` for differences, ``log_ratio`` for logarithms of ratios; of single readings, replicates allowed for.
+    trends
+        Slope of the differences on the ex-vivo size (``on_ex_vivo``) and on the mean of both (``on_mean``).
+    """
+
+    n: int
+    error_ratio: float
+    figures: Mapping[str, Figure]
+    analytic: Mapping[str, Ends | None] = field(default_factory=dict)
+    limits: Mapping[str, Limits] = field(default_factory=dict)
+    trends: Mapping[str, Trend] = field(default_factory=dict)
+    concordance: Concordance | None = None
+
+
+def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0) -> MethodComparison:
+    """Compare the detected sizes of one modality with excision."""
+    found = sizes.only_detected()
+    x, y = found.ex_vivo_mm, found.size_mm
+    figures = _figures(found, confidence=confidence, error_ratio=error_ratio)
+    if len(x) < 2 or not _squarable(x, y):
+        return MethodComparison(len(x), error_ratio, figures)
+    return MethodComparison(
+        n=len(x),
+        error_ratio=error_ratio,
+        figures=figures,
+        analytic=_analytic(x, y, confidence=float(confidence), error_ratio=error_ratio),
+        limits=_limits(found, confidence=float(confidence)),
+        trends=_trends(x, y, confidence=float(confidence)),
+        concordance=_or_none(lambda: concordance(x, y, confidence=float(confidence))),
+    )
+
+
+def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float) -> dict[str, Figure]:
+    figures: dict[str, Figure] = {}
+    for name, statistic, scale in _statistics(error_ratio):
+        wanted = scale if isinstance(statistic, SumStatistic) or len(found.size_mm) <= MOST_REFITTED else None
+        figures[name] = figure(_guarded(statistic), found, scale=wanted, confidence=confidence)
+    return figures
+
+
+def _statistics(error_ratio: float) -> list[tuple[str, Statistic, Scale]]:
+    """Every figure with its name and the scale of its interval."""
+    demings = partial(_deming_slope, error_ratio=error_ratio)
+    fits: tuple[tuple[str, Callable[[FloatArray, FloatArray], Line | PassingBablok]], ...] = (
+        ("weighted_deming", partial(weighted_deming, error_ratio=error_ratio)),
+        ("passing_bablok", passing_bablok),
+    )
+    return [
+        ("ols_intercept_mm", SumStatistic(_terms, _intercept_with(_ols_slope), _NO_LINE), "linear"),
+        ("ols_slope", SumStatistic(_terms, _ols_slope, _NO_LINE), "linear"),
+        ("deming_intercept_mm", SumStatistic(_terms, _intercept_with(demings), _NO_LINE), "linear"),
+        ("deming_slope", SumStatistic(_terms, demings, _NO_LINE), "linear"),
+        *((f"{name}_intercept_mm", _part_of(fit, "intercept"), "linear") for name, fit in fits),
+        *((f"{name}_slope", _part_of(fit, "slope"), "linear") for name, fit in fits),
+        ("concordance", SumStatistic(_terms, _concordance, "concordance needs sizes that vary"), "fisher"),
+        ("difference_mean_mm", SumStatistic(_terms, _bias), "linear"),
+        ("difference_sd_mm", SumStatistic(_terms, _sd, "one mass has no spread"), "log"),
+    ]
+
+
+_NO_LINE = "the ex-vivo sizes or the sizes do not vary, so no line is determined"
+
+
+def _terms(sizes: ModalitySizes) -> FloatArray:
+    """1, x, y, x', y', x'x', x'y', y'y' with ' about the means."""
+    x, y = sizes.ex_vivo_mm, sizes.size_mm
+    if len(x) == 0:
+        raise UndefinedError("no mass was detected")
+    dx, dy = _centred(x), _centred(y)
+    return columns(1.0, x, y, dx, dy, dx * dx, dx * dy, dy * dy)
+
+
+def _centred(values: FloatArray) -> FloatArray:
+    off = values - values.mean()
+    return np.zeros_like(off) if np.ptp(values) <= 1e-12 * np.abs(values).max() else off
+
+
+def _squares(sums: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sums of squares of x, of y and of products about the means of the masses summed."""
+    n, a, b = sums[..., 0], sums[..., 3], sums[..., 4]
+    return sums[..., 5] - a * a / n, sums[..., 7] - b * b / n, sums[..., 6] - a * b / n
+
+
+def _ols_slope(sums: FloatArray) -> FloatArray:
+    u, _, p = _squares(sums)
+    return ratio(p, u)
+
+
+def _deming_slope(sums: FloatArray, *, error_ratio: float) -> FloatArray:
+    u, q, p = _squares(sums)
+    d = error_ratio * q - u
+    root = np.hypot(d, 2 * np.sqrt(error_ratio) * p)
+    return np.where(d < 0, ratio(2 * p, root - d), ratio(d + root, 2 * error_ratio * p))
+
+
+def _intercept_with(slope: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
+    def intercept(sums: FloatArray) -> FloatArray:
+        n = sums[..., 0]
+        found: FloatArray = ratio(sums[..., 2], n) - slope(sums) * ratio(sums[..., 1], n)
+        return found
+
+    return intercept
+
+
+def _concordance(sums: FloatArray) -> FloatArray:
+    u, q, p = _squares(sums)
+    bias = _bias(sums)
+    return np.where((u == 0) | (q == 0), np.nan, ratio(2 * p, u + q + sums[..., 0] * bias**2))
+
+
+def _bias(sums: FloatArray) -> FloatArray:
+    return ratio(sums[..., 2] - sums[..., 1], sums[..., 0])
+
+
+def _sd(sums: FloatArray) -> FloatArray:
+    u, q, p = _squares(sums)
+    return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 0] - 1), 0.0))
+
+
+def _part_of(fit: Callable[[FloatArray, FloatArray], Line | PassingBablok], part: str) -> Statistic:
+    def statistic(sizes: ModalitySizes) -> float:
+        return float(getattr(fit(sizes.ex_vivo_mm, sizes.size_mm), part))
+
+    return statistic
+
+
+def _guarded(statistic: Statistic) -> Statistic:
+    """The statistic, refusing what has no squares."""
+    if isinstance(statistic, SumStatistic):
+        return SumStatistic(lambda sizes: statistic.terms(_checked(sizes)), statistic.finish, statistic.undefined)
+    return lambda sizes: statistic(_checked(sizes))
+
+
+def _checked(sizes: ModalitySizes) -> ModalitySizes:
+    if len(sizes.size_mm) and not _squarable(sizes.ex_vivo_mm, sizes.size_mm):
+        raise UndefinedError("the sizes are too large or too small for double precision")
+    return sizes
+
+
+def _squarable(x: FloatArray, y: FloatArray) -> bool:
+    both = np.concatenate([x, y])
+    return bool(both.min() > _SMALLEST and both.max() < _LARGEST)
+
+
+def _analytic(x: FloatArray, y: FloatArray, *, confidence: float, error_ratio: float) -> dict[str, Ends | None]:
+    ends: dict[str, Ends | None] = {}
+    for name, fit in (("ols", least_squares), ("deming", partial(deming, error_ratio=error_ratio))):
+        line = _or_none(partial(fit, x, y))
+        both = None if line is None else line.intervals(confidence=confidence)
+        ends[f"{name}_intercept_mm"], ends[f"{name}_slope"] = both or (None, None)
+    robust = _or_none(lambda: passing_bablok(x, y, confidence=confidence))
+    finite = robust is not None and bool(np.all(np.isfinite([*robust.slope_interval, *robust.intercept_interval])))
+    ends["passing_bablok_intercept_mm"] = robust.intercept_interval if robust and finite else None
+    ends["passing_bablok_slope"] = robust.slope_interval if robust and finite else None
+    agreement = _or_none(lambda: concordance(x, y, confidence=confidence))
+    ends["concordance"] = None if agreement is None else agreement.interval
+    return ends
+
+
+def _limits(found: ModalitySizes, *, confidence: float) -> dict[str, Limits]:
+    x, y = [np.array([e]) for e in found.ex_vivo_mm], list(found.replicates_mm)
+    logs = [np.log(e) for e in x], [np.log(group) for group in y]
+    if all(len(group) == 1 for group in y):
+        plain = {"mm": found.size_mm - found.ex_vivo_mm, "log_ratio": np.log(found.size_mm / found.ex_vivo_mm)}
+        return {name: bland_altman.limits(off, confidence=confidence) for name, off in plain.items()}
+    return {
+        "mm": bland_altman.limits_unlinked(x, y, confidence=confidence),
+        "log_ratio": bland_altman.limits_unlinked(*logs, confidence=confidence),
+    }
+
+
+def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[str, Trend]:
+    against = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
+    trends = {
+        name: _or_none(partial(bland_altman.trend, y - x, size, confidence=confidence))
+        for name, size in against.items()
+    }
+    return {name: one for name, one in trends.items() if one is not None}
+
+
+def _or_none(compute: Callable[[], _T]) -> _T | None:
+    try:
+        return compute()
+    except UndefinedError:
+        return None

@@ -1,0 +1,307 @@
+r"""What the next mass may bring: a Bayesian model of each modality's errors, with error in the ex-vivo sizes too.
+
+For mass i of patient g with true log size :math:`\xi_i`, centred at the mean of the trial,
+
+.. math::
+   \ln e_i &= \xi_i + \epsilon_i, \quad \epsilon_i \sim N(0, c_i^2) \\
+   \ln y_{ij} &= \xi_i + \beta + (\gamma - 1)\,\xi_i + u_g + b_i + w_{ij}
+
+with bias :math:`\beta`, slope :math:`\gamma` on the logarithm, patient effects :math:`u_g \sim N(0, \rho^2)`, mass
+effects :math:`b_i \sim N(0, \tau^2)` and replicate noise :math:`w_{ij} \sim N(0, \omega^2)`. The effects are
+integrated out exactly: all that is left is normal, patient by patient. Masses not found enter through their share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from tactile_bayes.trial.jackknife import MIN_PATIENTS
+from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, gather, mass_numbers
+
+# Half-normal prior SDs of the patient, mass and replicate SDs on the logarithm; normal ones of bias and slope - 1.
+PRIOR_SD = 0.5
+PRIOR_BIAS, PRIOR_SLOPE = 0.5, 0.5
+# Caliper error as a share of the size, where the table gives none: +-5 % in Wellman & Howe (1999), figure 10.
+CALIPER = 0.05
+
+
+class Draws(Protocol):
+    """What a sampler returns."""
+
+    @property
+    def theta(self) -> FloatArray:
+        """(chain, draw, p) draws."""
+        ...
+
+    @property
+    def diagnostics(self) -> Mapping[str, float]:
+        """Figures of convergence."""
+        ...
+
+
+class Sampler(Protocol):
+    """Draws from a vectorised log density about its mode."""
+
+    def __call__(
+        self, log_density: Any, centre: FloatArray, covariance: FloatArray, /, *, rng: np.random.Generator
+    ) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """One modality: draws of its parameters and of the percent error that the next mass would have on average.
+
+    Attributes
+    ----------
+    summaries
+        Median, low and high end of each figure, by name.
+    mape_percent
+        (n,) draws of the expected percent error of the next mass, misses included.
+    """
+
+    name: str
+    masses: int
+    patients: int
+    summaries: Mapping[str, tuple[float, float, float]]
+    mape_percent: FloatArray
+    diagnostics: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class NextMass:
+    """All modalities, and for every pair the probability that the first errs less on the next mass."""
+
+    posteriors: Mapping[str, Posterior]
+    probability_less_error: Mapping[str, float]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    probability: float = 0.95
+
+    def as_document(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "modalities": {
+                name: {
+                    "masses": one.masses,
+                    "patients": one.patients,
+                    **{key: dict(zip(("median", "low", "high"), map(_round, ends), strict=True))
+                       for key, ends in one.summaries.items()},
+                }
+                for name, one in self.posteriors.items()
+            },
+            "interval": {"kind": "eti", "probability": self.probability},
+            "probability_less_error": {name: _round(p) for name, p in self.probability_less_error.items()},
+            "left_out": dict(self.left_out),
+            "diagnostics": {
+                name: {key: _round(value) for key, value in one.diagnostics.items()}
+                for name, one in self.posteriors.items()
+            },
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """Text for people."""
+        lines = ["Bayesian errors-in-variables model, beside the table above and not instead of it:"]
+        for name, one in self.posteriors.items():
+            error, bias, slope = (one.summaries[key] for key in ("mape_percent", "bias_percent", "log_slope"))
+            lines.append(
+                f"{name}: next mass: expected error {_shown(error, '.1f')} %, bias {_shown(bias, '+.1f')} %, "
+                f"slope of ln size {_shown(slope, '.2f')}"
+            )
+        lines += [f"probability that {pair}: {p:.3f}" for pair, p in self.probability_less_error.items()]
+        return [*lines, *(f"{name}: no model: {reason}" for name, reason in self.left_out.items())]
+
+
+def next_mass(
+    readings: Sequence[Reading],
+    ex_vivo_mm: Mapping[MassKey, float],
+    ex_vivo_sd_mm: Mapping[MassKey, float | None],
+    *,
+    sample: Sampler,
+    rng: np.random.Generator,
+    probability: float = 0.95,
+) -> NextMass:
+    """Fit the model to each modality and compare them.
+
+    Parameters
+    ----------
+    sample
+        Draws from a log density; `posterior.ensemble.ensemble` in the program.
+    probability
+        Of the equal-tailed intervals.
+
+    Notes
+    -----
+    The expected error is that of one reading of a mass drawn from the sizes of this trial, of a new patient. Modalities
+    are fitted one by one, so that the probability that one errs less takes their errors as independent.
+    """
+    sizes = gather(readings, ex_vivo_mm)
+    numbers = mass_numbers(ex_vivo_mm)
+    caliper = {numbers[key]: (sd if sd else CALIPER * ex_vivo_mm[key]) / ex_vivo_mm[key]
+               for key, sd in ((key, ex_vivo_sd_mm.get(key)) for key in ex_vivo_mm)}  # fmt: skip
+    posteriors: dict[str, Posterior] = {}
+    left_out: dict[str, str] = {}
+    for name, one in sizes.items():
+        found = one.only_detected()
+        if len(found.patients) < MIN_PATIENTS:
+            left_out[name] = f"needs at least {MIN_PATIENTS} patients with a mass found (has {len(found.patients)})"
+            continue
+        posteriors[name] = _fit(one, caliper, sample=sample, rng=rng, probability=probability)
+    return NextMass(posteriors, _compared(posteriors), left_out, probability)
+
+
+def _compared(posteriors: Mapping[str, Posterior]) -> dict[str, float]:
+    names = list(posteriors)
+    pairs = [(one, other) for i, one in enumerate(names) for other in names[i + 1 :]]
+    return {
+        f"{one} errs less than {other}": _below(posteriors[one].mape_percent, posteriors[other].mape_percent)
+        for one, other in pairs
+    }
+
+
+def _below(a: FloatArray, b: FloatArray) -> float:
+    """P(A < B) for independent draws, over all pairs of them."""
+    return float(np.mean(np.searchsorted(np.sort(a), b, side="left")) / len(a))
+
+
+def _fit(
+    sizes: ModalitySizes,
+    caliper: Mapping[int, float],
+    *,
+    sample: Sampler,
+    rng: np.random.Generator,
+    probability: float,
+) -> Posterior:
+    found = sizes.only_detected()
+    model = LogModel(found, np.array([caliper[int(mass)] for mass in found.mass]))
+    centre, covariance = model.start()
+    drawn = sample(model.log_density, centre, covariance, rng=rng)
+    theta = np.asarray(drawn.theta).reshape(-1, len(centre))
+    misses = rng.beta(len(sizes.size_mm) - len(found.size_mm) + 0.5, len(found.size_mm) + 0.5, len(theta))
+    if len(found.size_mm) == len(sizes.size_mm):
+        misses = np.zeros(len(theta))
+    error = expected_error_percent(model, theta, misses)
+    sds = np.exp(theta[:, 2:])
+    tails = [0.5, 0.5 - probability / 2, 0.5 + probability / 2]
+    figures = {
+        "mape_percent": error,
+        "bias_percent": 100 * np.expm1(theta[:, 0]),
+        "log_slope": theta[:, 1],
+        "patient_sd": sds[:, 0],
+        "mass_sd": sds[:, 1],
+        "replicate_sd": sds[:, 2],
+        "miss_share": misses,
+    }
+    quantiles = {name: np.quantile(values, tails) for name, values in figures.items()}
+    return Posterior(
+        name=sizes.name,
+        masses=len(found.size_mm),
+        patients=len(found.patients),
+        summaries={name: (float(q[0]), float(q[1]), float(q[2])) for name, q in quantiles.items()},
+        mape_percent=error,
+        diagnostics=dict(drawn.diagnostics),
+    )
+
+
+class LogModel:
+    """Likelihood and prior of one modality; masses with equal numbers of replicates need only their means.
+
+    Parameters
+    ----------
+    found
+        The detected masses.
+    caliper
+        (n,) relative SD of each ex-vivo size.
+    """
+
+    def __init__(self, found: ModalitySizes, caliper: FloatArray) -> None:
+        self.log_e = np.log(found.ex_vivo_mm)
+        self.centre = float(self.log_e.mean())
+        self.spread = max(float(self.log_e.std(ddof=1)), 1e-3)
+        self._x = self.log_e - self.centre
+        self._caliper2 = caliper**2
+        logs = [np.log(group) for group in found.replicates_mm]
+        self._number = np.array([len(group) for group in logs], dtype=np.float64)
+        self._y = np.array([group.mean() for group in logs]) - self.centre
+        self._within = float(sum(np.sum((group - group.mean()) ** 2) for group in logs))
+        self._freedom = float(np.sum(self._number - 1))
+        _, self._patient = np.unique(found.patient, return_inverse=True)
+        self._patients = int(self._patient.max()) + 1
+
+    def start(self) -> tuple[FloatArray, FloatArray]:
+        """A guess of the mode and of the covariance about it."""
+        off = self._y - self._x
+        residual = max(float(off.std()), 0.02)
+        within = math.sqrt(self._within / self._freedom) if self._freedom else 0.1
+        centre = np.array([off.mean(), 1.0, math.log(0.5 * residual), math.log(residual), math.log(max(within, 0.01))])
+        n = len(off)
+        spreads = np.array([residual / math.sqrt(n), residual / self.spread / math.sqrt(n), 0.7, 0.4, 0.2])
+        if not self._freedom:
+            spreads[4] = 0.7
+        return centre, np.diag(spreads**2)
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """(m,) unnormalised log posterior of (m, 5) rows: bias, slope and three log SDs."""
+        bias, slope, *logs = theta.T
+        with np.errstate(over="ignore"):
+            rho2, tau2, omega2 = (np.exp(2 * np.clip(one, -20, 5)) for one in logs)
+        # the true size given the ex-vivo one: normal about a shrunken value
+        prior2 = max(self.spread**2 - float(np.mean(self._caliper2)), 0.25 * self.spread**2)
+        keep = prior2 / (prior2 + self._caliper2)
+        mean = bias[:, None] + slope[:, None] * keep * self._x
+        variance = slope[:, None] ** 2 * keep * self._caliper2 + tau2[:, None] + omega2[:, None] / self._number[None, :]
+        off = (self._y - mean) / variance
+        log_like = -0.5 * np.sum((self._y - mean) * off + np.log(variance), axis=1)
+        log_like += self._patients_part(rho2, off, 1 / variance)
+        log_like -= 0.5 * (self._within / omega2 + self._freedom * np.log(omega2))
+        return np.asarray(log_like + _log_prior(bias, slope, logs, (rho2, tau2, omega2)))
+
+    def _patients_part(self, rho2: FloatArray, off: FloatArray, precision: FloatArray) -> FloatArray:
+        """What a shared patient effect adds to independent masses (Woodbury, patient by patient)."""
+        sums = np.zeros((2, len(rho2), self._patients))
+        for row, values in enumerate((off, precision)):
+            np.add.at(sums[row].T, self._patient, values.T)
+        within = 1 + rho2[:, None] * sums[1]
+        part: FloatArray = 0.5 * np.sum(rho2[:, None] * sums[0] ** 2 / within - np.log(within), axis=1)
+        return part
+
+
+def _log_prior(
+    bias: FloatArray, slope: FloatArray, logs: Sequence[FloatArray], variances: Sequence[FloatArray]
+) -> FloatArray:
+    """Normal priors of bias and slope, half-normal ones of the SDs with the Jacobian of their logarithms."""
+    prior = -0.5 * ((bias / PRIOR_BIAS) ** 2 + ((slope - 1) / PRIOR_SLOPE) ** 2)
+    for log_sd, variance in zip(logs, variances, strict=True):
+        prior = prior - 0.5 * variance / PRIOR_SD**2 + log_sd
+        prior = np.where((log_sd < -12) | (log_sd > 4), -np.inf, prior)
+    return np.asarray(prior)
+
+
+def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArray) -> FloatArray:
+    r"""(n,) mean of :math:`100 |y/\xi - 1|` for one reading of a new mass, a miss counting 100.
+
+    On the logarithm the error is normal; its size-dependent mean is averaged over normal sizes like the trial's.
+    """
+    at, weight = np.polynomial.hermite_e.hermegauss(15)
+    sd = np.sqrt(np.sum(np.exp(2 * theta[:, 2:]), axis=1))[:, None]
+    mean = theta[:, :1] + (theta[:, 1:2] - 1) * model.spread * at[None, :]
+    folded = np.exp(mean + sd**2 / 2) * _erf((mean / sd + sd) / math.sqrt(2)) - _erf(mean / sd / math.sqrt(2))
+    error: FloatArray = 100 * ((1 - misses) * (folded @ weight / weight.sum()) + misses)
+    return error
+
+
+def _erf(values: FloatArray) -> FloatArray:
+    from scipy.special import erf
+
+    return np.asarray(erf(values))
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.9g}")
+
+
+def _shown(ends: tuple[float, float, float], spec: str) -> str:
+    return f"{ends[0]:{spec}} [{ends[1]:{spec}}, {ends[2]:{spec}}]"
