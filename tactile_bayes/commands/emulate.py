@@ -63,11 +63,13 @@ def command(
     from tactile_bayes.files.scan_mcap import read_scan
     from tactile_bayes.hardware.emulated import Faults
     from tactile_bayes.hardware.emulator import Emulator
+    from tactile_bayes.hardware.reading import ask_for_priority
 
     faults = Faults(drop, corrupt, stall, disconnect, hold)
     device = _device(kind, read_scan(scan), protocol, faults, path=scan)
     link = _link(tcp)
     click.echo(link.url)
+    ask_for_priority()  # a real device does not wait for this computer's other programs
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, _leave)
     emulator = Emulator(device, link, faults=faults, rng=np.random.default_rng(seed), speed=speed)

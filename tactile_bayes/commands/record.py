@@ -14,8 +14,8 @@ from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 
 if TYPE_CHECKING:
     from tactile_bayes.hardware.readings import HelloReading
-    from tactile_bayes.hardware.recorder import Line, Recorder, Report
-    from tactile_bayes.scan import HeadGeometry, Landmarks
+    from tactile_bayes.hardware.recorder import Line, Observer, Recorder, Report
+    from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
 
 _FILE = click.Path(path_type=Path)
 _CODE = "A code, not a name."
@@ -56,6 +56,11 @@ _CODE = "A code, not a name."
 @click.option("--lubricant", metavar="TEXT", help="What was put on the skin.")
 @click.option("--examiner", metavar="CODE", help=_CODE)
 @click.option("--subject", metavar="CODE", help=_CODE)
+@click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
+@click.option(
+    "--serve", metavar="HOST:PORT", help="Show it to a browser on this computer, with a tone for the pressure."
+)
+@click.option("--size-calibration", type=_FILE, metavar="SIZE.json", help="For the live view's size estimate.")
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @click.pass_context
 def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
@@ -105,6 +110,9 @@ class Request:
     lubricant: str | None
     examiner: str | None
     subject: str | None
+    live: bool
+    serve: str | None
+    size_calibration: Path | None
     force: bool
 
     def session(self, hello: HelloReading) -> dict[str, str]:
@@ -141,6 +149,7 @@ def _record(request: Request) -> tuple[Report, bool]:
         hello, lines = _connect(request, stack)
         _check_fit(hello, head, request)
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
+        observer = _look_on(request, head, calibration, stack)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
         writer = RecordingWriter(
             stream,
@@ -156,7 +165,7 @@ def _record(request: Request) -> tuple[Report, bool]:
             shared_clock=request.clock == "shared",
             invert_rotation=request.invert_rotation,
             duration_s=request.duration_s,
-            observer=None,
+            observer=observer,
         )
         _place(landmarks, writer)
         stopper = stack.enter_context(Stopper(recorder))
@@ -166,6 +175,21 @@ def _record(request: Request) -> tuple[Report, bool]:
         except OSError as error:
             raise full_disk(request.output, error) from None
     return report, stopper.interrupted
+
+
+def _look_on(
+    request: Request, head: HeadGeometry, calibration: ElementCalibration, stack: ExitStack
+) -> Observer | None:
+    """Start the live view, if one was asked for."""
+    if not (request.live or request.serve):
+        return None
+    from tactile_bayes.commands.live_view import live_view
+
+    view = live_view(
+        head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
+    )
+    observer: Observer = stack.enter_context(view)
+    return observer
 
 
 def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:

@@ -18,7 +18,7 @@ from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware.emulated import Device, Faults
 
 # A device's own buffer: what does not fit is dropped record by record, as firmware does.
-BUFFER_BYTES: Final = 64 * 1024
+BUFFER_BYTES: Final = 256 * 1024
 _READ: Final = 4096
 _IDLE_S: Final = 0.2
 
@@ -200,9 +200,12 @@ class Emulator:
         self._follow_device()
         if self._begun is not None:
             self._send_due((self._clock() - self._begun) * self._speed)
+        self._pass_on()
+        return self._begun is None and self._next > 0
+
+    def _pass_on(self) -> None:
         if self._waiting:
             del self._waiting[: self._link.write(bytes(self._waiting))]
-        return self._begun is None and self._next > 0
 
     def _patience_s(self) -> float:
         if self._begun is None or self._next >= len(self._device.times_s):
@@ -235,6 +238,7 @@ class Emulator:
                 return
             self._send(self._device.record(self._next), moment)
             self._next += 1
+            self._pass_on()  # at once: when this process was late, many are due and must not meet in the buffer
         if self._next >= len(times):
             self._waiting += self._device.end(self.served.sent, self.served.dropped)
             self._begun = None

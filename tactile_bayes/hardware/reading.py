@@ -7,6 +7,7 @@ u32, length u16, bytes``; a length of 0 says that the device has gone, and the p
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import select
@@ -49,10 +50,20 @@ def read_device(device: int, pipe: int) -> None:
             return
 
 
+def ask_for_priority() -> None:
+    """Be served before programs that only compute, where the system allows it; a reader sleeps most of the time."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except (AttributeError, OSError):
+        with contextlib.suppress(OSError):
+            os.nice(-10)
+
+
 def main() -> None:
     """Freeze the garbage collector and read."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the recorder, which still needs what is on its way
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    ask_for_priority()
     gc.freeze()
     gc.disable()
     read_device(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,228 @@
+"""The process of a live view: sees what a recording shows, keeps a map, draws it, and lets another one estimate.
+
+It is started by `record` and never makes it wait; if it dies, the recording goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.hardware.live import LiveMap, LiveState
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.scan import ElementCalibration, HeadGeometry
+
+DRAWINGS_PER_S = 10.0
+_SHOW, _HIDE = "\x1b[?25h\x1b[?1049l", "\x1b[?1049h\x1b[?25l"
+
+
+@contextlib.contextmanager
+def live_view(
+    head: HeadGeometry,
+    calibration: ElementCalibration,
+    *,
+    terminal: bool,
+    serve: str | None,
+    size_calibration: Path | None,
+) -> Iterator[Any]:
+    """Start the view's process; what comes out is an observer for the recorder."""
+    from tactile_bayes.files.scan_parts import calibration_document, head_document
+    from tactile_bayes.hardware.feed import Feed
+    from tactile_bayes.hardware.serve import address_of
+
+    if serve:
+        address_of(serve)  # tell a mistake before anything is recorded
+    setup = {
+        "head": head_document(head),
+        "calibration": calibration_document(calibration),
+        "terminal": terminal,
+        "serve": serve,
+        "size_calibration": str(size_calibration) if size_calibration else None,
+    }
+    theirs, ours = os.pipe()
+    command = [sys.executable, "-m", "tactile_bayes.commands.live_view", str(theirs)]
+    process = subprocess.Popen(command, pass_fds=(theirs,), stdin=subprocess.PIPE, text=True)
+    os.close(theirs)
+    assert process.stdin is not None
+    with process.stdin as start:
+        start.write(json.dumps(setup))
+    feed = Feed(ours)
+    try:
+        yield feed
+    finally:
+        feed.close()
+        try:
+            process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+class Estimator:
+    """Estimates the size of the newest map in a process of its own, again and again."""
+
+    def __init__(self, calibration: str | None) -> None:
+        self._calibration = calibration
+        self._pool: ProcessPoolExecutor | None = None
+        self._running: Future[str] | None = None
+        self._begun: float = 0.0
+        self.text = ""
+        self.done = 0
+        self.seconds = 0.0
+
+    def warm_up(self) -> None:
+        """Start the process and let it import what it needs, before there is a map."""
+        import multiprocessing
+
+        self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
+        self._running, self._begun = self._pool.submit(str), time.monotonic()
+
+    def look(self, tactile_map: TactileMap | None) -> None:
+        """Take the answer that has come, and ask anew."""
+        if self._running is not None and self._running.done():
+            with contextlib.suppress(Exception):  # the estimate's process died: the view goes on without
+                self.text = self._running.result()
+                self.done += bool(self.text)
+            self.seconds, self._running = time.monotonic() - self._begun, None
+        if self._running is None and tactile_map is not None:
+            self._ask(tactile_map)
+
+    def _ask(self, tactile_map: TactileMap) -> None:
+        self._begun = time.monotonic()
+        with contextlib.suppress(RuntimeError):  # a broken pool takes no work
+            if self._pool is not None:
+                self._running = self._pool.submit(estimate_text, tactile_map, self._calibration)
+
+    def close(self) -> None:
+        """Let its process go."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _prepare() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(OSError):
+        os.nice(5)  # of all that runs during a recording this can wait best
+    import tactile_bayes.files.size_json
+    import tactile_bayes.posterior.estimate  # noqa: F401
+
+
+def estimate_text(tactile_map: TactileMap, calibration_path: str | None) -> str:
+    """The size in a line, by the quick method; the reason when there is none."""
+    import numpy as np
+
+    from tactile_bayes.errors import TactileBayesError
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+    from tactile_bayes.posterior.fit import FitOptions
+    from tactile_bayes.presets import INTERVAL
+
+    try:
+        calibration = read_size_calibration(Path(calibration_path)) if calibration_path else None
+        fit = FitOptions(calibration.recipe.background, calibration.recipe.radius_mm) if calibration else FitOptions()
+        options = EstimateOptions(method="laplace", fit=fit)
+        found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
+    except TactileBayesError as error:
+        return f"no estimate: {error}"
+    if found.status != "estimate" or found.map_posterior is None:
+        return f"no estimate: {found.reason}"
+    if found.size is not None:
+        return _interval("largest size", found.size.max_size_mm, INTERVAL)
+    widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
+    return _interval("map width sigma", widths, INTERVAL)
+
+
+def _interval(name: str, draws: FloatArray, probability: float) -> str:
+    import numpy as np
+
+    tail = (1 - probability) / 2
+    low, middle, high = np.nanquantile(draws, [tail, 0.5, 1 - tail])
+    return f"{name} {middle:.1f} mm ({low:.1f} to {high:.1f}, {100 * probability:g} % equal-tailed)"
+
+
+def run(pipe: int, setup: dict[str, Any]) -> None:
+    """Look on until the recording ends."""
+    from tactile_bayes.files.scan_parts import calibration_from_document, head_from_document
+    from tactile_bayes.hardware.feed import FeedReader
+    from tactile_bayes.hardware.live import LiveMap
+    from tactile_bayes.hardware.serve import LiveServer, address_of
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the recording, and that ends the view
+    reader = FeedReader(pipe)
+    live = LiveMap(head_from_document(setup["head"]), calibration_from_document(setup["calibration"]))
+    estimator = Estimator(setup["size_calibration"])
+    estimator.warm_up()
+    with contextlib.ExitStack() as stack:
+        stack.callback(estimator.close)
+        showing: list[Callable[[LiveState], None]] = []
+        if setup["serve"]:
+            server = LiveServer(*address_of(setup["serve"]))
+            stack.callback(server.close)
+            print(f"live view: {server.url}", file=sys.stderr, flush=True)
+            showing.append(server.show)
+        if setup["terminal"]:
+            showing.append(stack.enter_context(terminal_view()))
+        _look(reader, live, estimator, showing)
+
+
+def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callable[[LiveState], None]]) -> None:
+    drawn = 0.0
+    while not reader.ended:
+        live.take(reader.read(1 / DRAWINGS_PER_S / 2))
+        now = time.monotonic()
+        if now - drawn < 1 / DRAWINGS_PER_S:
+            continue
+        drawn = now
+        state = live.state(size=estimator.text)
+        estimator.look(state.tactile_map)
+        for show in showing:
+            show(state)
+
+
+@contextlib.contextmanager
+def terminal_view() -> Iterator[Callable[[LiveState], None]]:
+    """Draws on a terminal; a line a second where it cannot be drawn on."""
+    from tactile_bayes.report.live_text import colours_wanted, live_line, live_text
+
+    out = sys.stderr
+    if not out.isatty() or os.environ.get("TERM", "dumb") in ("dumb", ""):
+        last = 0.0
+
+        def tell(state: LiveState) -> None:
+            nonlocal last
+            if time.monotonic() - last >= 1.0:
+                last = time.monotonic()
+                print(live_line(state), file=out, flush=True)
+
+        yield tell
+        return
+    colour = colours_wanted(os.environ)
+
+    def draw(state: LiveState) -> None:
+        columns, lines = shutil.get_terminal_size()
+        text = live_text(state, columns=columns - 1, lines=lines - 1, colour=colour)
+        out.write("\x1b[H" + text.replace("\n", "\x1b[K\r\n") + "\x1b[J")
+        out.flush()
+
+    out.write(_HIDE)
+    try:
+        yield draw
+    finally:
+        out.write(_SHOW)
+        out.flush()
+
+
+if __name__ == "__main__":
+    run(int(sys.argv[1]), json.load(sys.stdin))

@@ -1,0 +1,181 @@
+"""The map as it grows during a recording, and how hard the head presses: what a live view shows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.hardware.feed import Seen, SeenFrame, SeenPose
+from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.poses import poses_at
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.presets import PRESSURE_WINDOW_KPA
+from tactile_bayes.scan import ElementCalibration, HeadGeometry, TrackerPoses
+
+# Frames used after which the plane is fitted anew: the first ones lie on a line.
+REFIT_AT: Final = (100, 200, 400, 800, 1600, 3200, 6400)
+_KEPT_POSES: Final = 400
+_PATIENCE_NS: Final = 150_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveState:
+    """Everything a view draws.
+
+    Parameters
+    ----------
+    tactile_map
+        So far; None before there is one.
+    pressure_kpa
+        Mean of the last frame; NaN before the first.
+    window_kpa
+        Where frames count.
+    frames, frames_lost, poses
+        By the recorder's account.
+    duration_s
+        Recorded so far.
+    used_share
+        Of the frames that the map has used.
+    latency_ms
+        From the recorder to this state, of its youngest frame.
+    size
+        The current estimate in words.
+    """
+
+    tactile_map: TactileMap | None = None
+    pressure_kpa: float = float("nan")
+    window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
+    frames: int = 0
+    frames_lost: int = 0
+    poses: int = 0
+    duration_s: float = 0.0
+    used_share: float = 0.0
+    latency_ms: float = 0.0
+    size: str = ""
+
+    @property
+    def tone(self) -> str:
+        """``low``, ``in``, ``high``, or ``off`` before the first frame."""
+        if not np.isfinite(self.pressure_kpa):
+            return "off"
+        low, high = self.window_kpa
+        return "low" if self.pressure_kpa < low else "high" if self.pressure_kpa > high else "in"
+
+    @property
+    def covered_mm2(self) -> float:
+        """Area of the cells with data."""
+        if self.tactile_map is None:
+            return 0.0
+        return float(self.tactile_map.covered.sum()) * self.tactile_map.recipe.cell_mm**2
+
+
+@dataclass(slots=True)
+class LiveMap:
+    """Takes what a `Feed` sends and makes a map of it.
+
+    Parameters
+    ----------
+    head, calibration
+        Of the recording.
+    """
+
+    head: HeadGeometry
+    calibration: ElementCalibration
+    window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
+    _frames: list[SeenFrame] = field(default_factory=list)
+    _poses: list[SeenPose] = field(default_factory=list)
+    _report: dict[str, Any] = field(default_factory=dict)
+    _map: MapAccumulator | None = None
+    _refits: int = 0
+    _pressure_kpa: float = float("nan")
+    _host_ns: int = 0
+
+    def take(self, seen: Iterable[Seen]) -> None:
+        """Add what was seen; frames wait until the tracker has passed them."""
+        youngest = None
+        for one in seen:
+            match one:
+                case SeenFrame():
+                    self._frames.append(one)
+                    youngest = one
+                case SeenPose():
+                    self._poses.append(one)
+                case dict():
+                    self._report = one
+        if youngest is not None:
+            pressure = self.calibration.to_kpa(youngest.counts[None])
+            self._pressure_kpa = float(np.nanmean(pressure)) if np.isfinite(pressure).any() else float("nan")
+            self._host_ns = youngest.host_ns
+        self._map_ready_frames()
+        del self._poses[:-_KEPT_POSES]
+
+    def _map_ready_frames(self) -> None:
+        if not self._frames or len(self._poses) < 2:
+            del self._frames[:-_KEPT_POSES]
+            return
+        last_ns = self._poses[-1].device_ns
+        overdue_ns = self._frames[-1].device_ns - _PATIENCE_NS
+        ready = [one for one in self._frames if one.device_ns <= max(last_ns, overdue_ns)]
+        if not ready:
+            return
+        del self._frames[: len(ready)]
+        poses = TrackerPoses(
+            np.array([max(0, one.device_ns) / 1e9 for one in self._poses]),
+            np.array([one.position_mm for one in self._poses]),
+            np.array([one.quaternion_wxyz for one in self._poses]),
+        )
+        found = poses_at(poses, np.array([one.device_ns / 1e9 for one in ready]))
+        if self._map is None:
+            if not found.known.any():
+                return
+            instrument = Instrument(self.head, self.calibration, pressure_window_kpa=self.window_kpa)
+            self._map = MapAccumulator(MapGrid.under(self.head, found), instrument)
+        self._map.add(np.stack([one.counts for one in ready]), found)
+        self._refit()
+
+    def _refit(self) -> None:
+        """Put the map on the best plane of the frames so far, now and then."""
+        if self._map is None or self._refits >= len(REFIT_AT):
+            return
+        if self._map.figures["frames_used"] < REFIT_AT[self._refits]:
+            return
+        self._refits += 1
+        try:
+            self._map = self._map.rebuild()
+        except BadDataError:
+            return  # still too nearly a line: the plane under the head will do until the next time
+
+    def state(self, *, size: str = "") -> LiveState:
+        """As it is now."""
+        figures = self._map.figures if self._map else {"frames_used": 0.0, "frames_total": 0.0}
+        report = self._report
+        return LiveState(
+            tactile_map=self._map.snapshot() if self._map and figures["frames_used"] else None,
+            pressure_kpa=self._pressure_kpa,
+            window_kpa=self.window_kpa,
+            frames=report.get("frames", 0),
+            frames_lost=report.get("frames_lost", 0),
+            poses=report.get("poses", 0),
+            duration_s=(report.get("last_ns", 0) - report.get("first_ns", 0)) / 1e9,
+            used_share=figures["frames_used"] / max(1.0, figures["frames_total"]),
+            latency_ms=(time.monotonic_ns() - self._host_ns) / 1e6 if self._host_ns else 0.0,
+            size=size,
+        )
+
+
+def grey_levels(values: FloatArray) -> FloatArray:
+    """Map values to 0..1 between their 2 % and 98 % quantiles; NaN stays."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return np.full(values.shape, np.nan)
+    low, high = (float(q) for q in np.quantile(finite, [0.02, 0.98]))
+    scaled: FloatArray = (
+        np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.where(np.isfinite(values), 0.5, np.nan)
+    )
+    return scaled

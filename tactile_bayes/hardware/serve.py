@@ -1,0 +1,170 @@
+"""Serve the live view to a browser on this computer: one page, one websocket, one secret in the address.
+
+The page loads nothing from anywhere else. The websocket takes only pages of its own origin, so that no other site that
+is open in the browser can look on.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import json
+import math
+import secrets
+import threading
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.hardware.live import LiveState, grey_levels
+
+_PAGE: Final = Path(__file__).with_name("live_page.html")
+_SECURITY: Final = (
+    "default-src 'none'; connect-src 'self' ws://{host}; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
+    "frame-ancestors 'none'; base-uri 'none'"
+)
+
+
+def address_of(text: str) -> tuple[str, int]:
+    """HOST:PORT of a server that only this computer can reach.
+
+    Raises
+    ------
+    UsageError
+        When it is not one, or not of this computer: the data are a patient's.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isdigit() or int(port) > 65535:
+        raise UsageError(f"--serve {text!r} is not HOST:PORT; give 127.0.0.1:0 for any free port")
+    host = "127.0.0.1" if host in ("localhost", "") else host.strip("[]")
+    try:
+        loopback = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = False
+    if not loopback:
+        raise UsageError(
+            f"--serve {text} can be reached from other computers; give 127.0.0.1:PORT and use an SSH tunnel"
+        )
+    return host, int(port)
+
+
+class LiveServer:
+    """Shows states to whoever has the address.
+
+    Parameters
+    ----------
+    host, port
+        Where to listen; port 0 takes a free one.
+    token
+        The secret in the address; a random one by default.
+    """
+
+    def __init__(self, host: str, port: int, *, token: str | None = None) -> None:
+        try:
+            from websockets.sync.server import serve
+        except ImportError:
+            raise UsageError("--serve needs the package websockets; pip install 'tactile-bayes[live]'") from None
+        self._token = token or secrets.token_urlsafe(24)
+        self._news = threading.Condition()
+        self._text, self._number, self._over = "", 0, False
+        try:
+            self._server = serve(self._talk, host, port, process_request=self._admit, compression=None)
+        except OSError as error:
+            raise UsageError(f"--serve {host}:{port}: {error.strerror}; give another port, 0 for any") from None
+        name, number = self._server.socket.getsockname()[:2]
+        self._authority = f"[{name}]:{number}" if ":" in name else f"{name}:{number}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser."""
+        return f"http://{self._authority}/?token={self._token}"
+
+    def show(self, state: LiveState) -> None:
+        """Send a state to every page."""
+        text = json.dumps(document(state), allow_nan=False)
+        with self._news:
+            self._text, self._number = text, self._number + 1
+            self._news.notify_all()
+
+    def close(self) -> None:
+        """Tell the pages that it is over, and stop."""
+        with self._news:
+            self._over = True
+            self._news.notify_all()
+        self._server.shutdown()
+
+    def _admit(self, connection: Any, request: Any) -> Any:
+        """The page or a refusal; None lets a websocket through."""
+        address = urlsplit(request.path)
+        given = parse_qs(address.query).get("token", [""])[0]
+        if not hmac.compare_digest(given.encode(), self._token.encode()):
+            return connection.respond(HTTPStatus.FORBIDDEN, "give the whole address that `record` printed\n")
+        if request.headers.get("Host") != self._authority:
+            return connection.respond(HTTPStatus.FORBIDDEN, "not under this name\n")
+        if address.path == "/":
+            return self._page(connection)
+        if address.path != "/live":
+            return connection.respond(HTTPStatus.NOT_FOUND, "nothing here\n")
+        if request.headers.get("Origin") != f"http://{self._authority}":
+            return connection.respond(HTTPStatus.FORBIDDEN, "not from another site\n")
+        return None
+
+    def _page(self, connection: Any) -> Any:
+        nonce = secrets.token_urlsafe(16)
+        page = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce)
+        response = connection.respond(HTTPStatus.OK, page)
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = "text/html; charset=utf-8"
+        response.headers["Content-Security-Policy"] = _SECURITY.format(host=self._authority, nonce=nonce)
+        response.headers["Referrer-Policy"] = "no-referrer"
+        response.headers["Cache-Control"] = "no-store"
+        return response
+
+    def _talk(self, connection: Any) -> None:
+        """Send each new state until the page or the recording goes."""
+        from websockets.exceptions import ConnectionClosed
+
+        seen = 0
+        while True:
+            with self._news:
+                while self._number == seen and not self._over:
+                    self._news.wait()
+                text, seen, over = self._text, self._number, self._over
+            if over:
+                return
+            try:
+                connection.send(text)
+            except ConnectionClosed:
+                return
+
+
+def document(state: LiveState) -> dict[str, Any]:
+    """A state as the page takes it."""
+    known = math.isfinite(state.pressure_kpa)
+    return {
+        "tone": state.tone,
+        "pressure_kpa": round(state.pressure_kpa, 2) if known else None,
+        "window_kpa": list(state.window_kpa),
+        "figures": (
+            f"{state.duration_s:.1f} s, {state.frames} frames, {state.frames_lost} lost, {state.poses} poses, "
+            f"{state.covered_mm2 / 100:.1f} cm² covered"
+        ),
+        "size": state.size or "no size estimate yet",
+        "map": _map_document(state),
+    }
+
+
+def _map_document(state: LiveState) -> dict[str, Any] | None:
+    if state.tactile_map is None:
+        return None
+    levels = grey_levels(state.tactile_map.mean)
+    rows, columns = levels.shape
+    known = np.isfinite(levels)
+    whole = np.rint(np.where(known, levels, 0.0) * 255).astype(int)
+    cells = [value if shown else None for value, shown in zip(whole.ravel().tolist(), known.ravel(), strict=True)]
+    return {"rows": rows, "columns": columns, "levels": cells}

@@ -1,0 +1,124 @@
+"""The live page in a headless Chromium: what it shows and what it sounds."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated_devices import short_scan
+from test_hw_live import seen_of
+from websockets.sync.client import ClientConnection, connect
+
+from tactile_bayes.hardware.live import LiveMap
+from tactile_bayes.hardware.serve import LiveServer
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed"),
+]
+
+
+class Page:
+    """One page of a browser, over its debugging protocol."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        self._numbers = itertools.count(1)
+
+    def call(self, method: str, **parameters):
+        number = next(self._numbers)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=20))
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def value(self, code: str):
+        result = self.call("Runtime.evaluate", expression=code, returnByValue=True, userGesture=True)
+        return result["result"].get("value")
+
+    def until(self, code: str):
+        for _ in range(200):
+            found = self.value(code)
+            if found:
+                return found
+            time.sleep(0.05)
+        raise AssertionError(f"never true: {code}")
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    process = subprocess.Popen(
+        [
+            str(BROWSER),
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--remote-debugging-port=0",
+            f"--user-data-dir={tmp_path / 'profile'}",
+            "--window-size=900,900",
+            "about:blank",
+        ],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stderr is not None
+    found = None
+    while found is None:
+        found = re.search(r"ws://\S+", process.stderr.readline())
+    browser = found[0]
+    with connect(browser, max_size=None) as socket:
+        target = Page(socket).call("Target.createTarget", url="about:blank")["targetId"]
+        with connect(re.sub(r"/devtools/.*", f"/devtools/page/{target}", browser), max_size=None) as tab:
+            yield Page(tab)
+    process.terminate()
+    process.wait()
+    process.stderr.close()
+
+
+def test_the_page_shows_the_map_and_its_tone_tells_low_in_range_and_high(page, tmp_path):
+    scan = short_scan(1.0)
+    live = LiveMap(scan.head, scan.element_calibration)
+    live.take(seen_of(scan))
+    state = live.state(size="largest size 15.0 mm (13.1 to 17.2, 95 % equal-tailed)")
+    server = LiveServer("127.0.0.1", 0)
+    try:
+        page.call("Page.navigate", url=server.url)
+        page.until("document.readyState === 'complete' && socket.readyState === 1")
+        page.value("element('sound').click()")
+        for kpa, tone, hz in ((3.0, "low", 220), (9.5, "in", 440), (17.0, "high", 880), (8.0, "in", 440)):
+            server.show(replace(state, pressure_kpa=kpa))
+            page.until(f"document.body.dataset.tone === '{tone}'")
+            page.until(f"window.tone().running && Math.abs(window.tone().hz - {hz}) < 1")
+        server.show(replace(state, pressure_kpa=float("nan")))
+        page.until("document.body.dataset.tone === 'off'")
+        server.show(state)
+        page.until("document.body.dataset.tone === 'in'")
+        rows, columns = state.tactile_map.mean.shape
+        assert page.value("[element('map').height, element('map').width]") == [rows, columns]
+        assert page.value("element('size').textContent") == state.size
+        bright = page.value(
+            "(() => { const c = element('map').getContext('2d'); const d = c.getImageData(0, 0, "
+            f"{columns}, {rows}).data; let n = 0; for (let i = 0; i < d.length; i += 4) "
+            "if (d[i] > 200 && d[i + 1] > 200 && d[i + 3] === 255) n++; return n; })()"
+        )
+        assert 0 < bright < np.isfinite(state.tactile_map.mean).sum() / 4
+        shot = base64.b64decode(page.call("Page.captureScreenshot")["data"])
+        (tmp_path / "page.png").write_bytes(shot)
+        assert len(shot) > 5000
+    finally:
+        server.close()
+    page.until("document.body.dataset.tone === 'off'")

@@ -1,0 +1,218 @@
+"""The live view: what it sees, what it draws, who may look."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from emulated_devices import head_and_tracker, short_scan
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.hardware.feed import Feed, FeedReader, SeenFrame, SeenPose
+from tactile_bayes.hardware.live import LiveMap, LiveState, grey_levels
+from tactile_bayes.hardware.readings import PoseReading
+from tactile_bayes.hardware.recorder import Report
+from tactile_bayes.hardware.serve import LiveServer, address_of, document
+from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator
+from tactile_bayes.mapping.poses import poses_at
+from tactile_bayes.report.live_text import colours_wanted, live_line, live_text
+
+
+@pytest.fixture(scope="module")
+def scan():
+    return short_scan(1.0)
+
+
+@pytest.fixture
+def pipe():
+    theirs, ours = os.pipe()
+    return FeedReader(theirs), Feed(ours)
+
+
+def pose_of(scan, index: int) -> PoseReading:
+    position, turn = scan.poses.position_mm[index], scan.poses.quaternion_wxyz[index]
+    return PoseReading(tuple(position.tolist()), tuple(turn.tolist()))
+
+
+def seen_of(scan) -> list:
+    """A scan as a view would see it, in order of time."""
+    frames = [
+        SeenFrame(counts, round(time * 1e9), 1)
+        for counts, time in zip(scan.frames.counts, scan.frames.time_s, strict=True)
+    ]
+    poses = [SeenPose(round(scan.poses.time_s[i] * 1e9), *pose_of(scan, i)[:2]) for i in range(len(scan.poses))]
+    return sorted([*frames, *poses], key=lambda one: one.device_ns)
+
+
+@pytest.fixture(scope="module")
+def state(scan) -> LiveState:
+    live = LiveMap(scan.head, scan.element_calibration)
+    seen = seen_of(scan)
+    for start in range(0, len(seen), 25):
+        live.take(seen[start : start + 25])
+    live.take([{"frames": 200, "frames_lost": 3, "poses": 120, "first_ns": 0, "last_ns": 995_000_000}])
+    return live.state(size="largest size 15.0 mm")
+
+
+def test_what_is_fed_is_seen(scan, pipe):
+    reader, feed = pipe
+    feed.frame(scan.frames.counts[3], 15_000_000)
+    feed.pose(pose_of(scan, 2), 16_666_667)
+    feed.told(Report(frames=4, landmarks=["xiphoid"]))
+    frame, pose, report = reader.read(1.0)
+    np.testing.assert_array_equal(frame.counts, scan.frames.counts[3])
+    assert (frame.device_ns, pose.device_ns) == (15_000_000, 16_666_667)
+    assert pose.position_mm == pose_of(scan, 2).position_mm
+    assert (report["frames"], report["landmarks"]) == (4, ["xiphoid"])
+    feed.close()
+    assert reader.read(1.0) == []
+    assert reader.ended
+
+
+def test_a_view_that_does_not_look_costs_nothing_but_its_own_frames(scan, pipe):
+    reader, feed = pipe
+    for i in range(3000):
+        feed.frame(scan.frames.counts[0], i)
+    assert feed.missed > 0
+    seen = [one for _ in range(100) for one in reader.read(0.0)]
+    assert len(seen) == 3000 - feed.missed
+    assert [one.device_ns for one in seen] == list(range(len(seen)))
+
+
+def test_a_view_that_has_gone_does_not_stop_the_recording(scan, pipe):
+    reader, feed = pipe
+    os.close(reader.pipe)
+    feed.frame(scan.frames.counts[0], 0)
+    assert feed.missed == 1
+
+
+def test_the_live_map_is_the_map_of_all_frames_on_its_plane(scan, state):
+    assert state.tactile_map is not None
+    live = LiveMap(scan.head, scan.element_calibration)
+    live.take(seen_of(scan))
+    grid = live._map.grid
+    whole = MapAccumulator(grid, Instrument(scan.head, scan.element_calibration))
+    known = scan.frames.time_s <= scan.poses.time_s[-1]  # the rest is still waiting for the tracker
+    whole.add(scan.frames.counts[known], poses_at(scan.poses, scan.frames.time_s[known]))
+    np.testing.assert_array_equal(live.state().tactile_map.mean, whole.snapshot().mean)
+
+
+@pytest.mark.parametrize(
+    ("kpa", "tone", "said"),
+    [(3.0, "low", "press harder"), (9.0, "in", "in range"), (16.0, "high", "press less"), (np.nan, "off", "waiting")],
+)
+def test_the_tone_follows_the_window(kpa, tone, said):
+    state = LiveState(pressure_kpa=kpa)
+    assert state.tone == tone
+    assert said in live_line(state)
+    assert document(state)["tone"] == tone
+    json.dumps(document(state), allow_nan=False)
+
+
+@pytest.mark.parametrize(("columns", "lines"), [(110, 40), (60, 20), (30, 8)])
+@pytest.mark.parametrize("colour", [True, False])
+def test_a_screen_fits_and_says_what_matters(state, columns, lines, colour):
+    text = live_text(state, columns=columns, lines=lines, colour=colour)
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    assert ("\x1b" in text) == colour
+    assert len(plain.splitlines()) <= lines
+    assert max(map(len, plain.splitlines())) <= columns
+    assert "200 frames, 3 lost" in plain
+    assert "largest size 15.0 mm"[:columns] in plain
+    assert "Research use only"[:columns] in plain
+
+
+def test_the_picture_is_brightest_at_the_lump(state):
+    levels = grey_levels(state.tactile_map.mean)
+    row, column = np.unravel_index(np.nanargmax(np.where(np.isnan(levels), -1, levels)), levels.shape)
+    assert abs(state.tactile_map.x_mm[column] - np.mean(state.tactile_map.x_mm)) < 12
+    assert abs(state.tactile_map.y_mm[row] - np.mean(state.tactile_map.y_mm)) < 12
+
+
+@pytest.mark.parametrize(
+    ("environment", "wanted"),
+    [
+        ({"TERM": "xterm-256color"}, True),
+        ({"TERM": "xterm-256color", "NO_COLOR": "1"}, False),
+        ({"TERM": "xterm", "NO_COLOR": ""}, True),
+        ({"TERM": "dumb"}, False),
+        ({}, False),
+    ],
+)
+def test_colours_are_left_out_where_they_are_not_wanted(environment, wanted):
+    assert colours_wanted(environment) is wanted
+
+
+def test_record_shows_a_line_a_second_where_it_cannot_draw(run_cli, tmp_path, scan):
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.scan_mcap import write_scan
+
+    write_scan(tmp_path / "like.mcap", scan, provenance=Provenance("test", {}))
+    with head_and_tracker(short_scan(2.0)) as devices:
+        words = [*devices, "--like", "like.mcap", "--live", "--serve", "127.0.0.1:0"]
+        done = run_cli("record", "-o", "a.mcap", *words, cwd=tmp_path, env={"TERM": "dumb"})
+    assert done.returncode == 0, done.stderr
+    assert "frames lost 0" in done.stdout
+    assert re.search(r"kPa in range; \d+ frames, 0 lost", done.stderr)
+    assert re.search(r"live view: http://127\.0\.0\.1:\d+/\?token=\S{32}", done.stderr)
+
+
+@pytest.fixture
+def server():
+    server = LiveServer("127.0.0.1", 0)
+    yield server
+    server.close()
+
+
+def get(url: str, **headers: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=5) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_the_page_is_for_those_who_know_the_address(server):
+    status, page = get(server.url)
+    assert status == 200
+    assert "Research use only" in page
+    assert not re.search(r"(src|href)=", page)  # it loads nothing
+    assert get(server.url.split("?")[0])[0] == 403
+    assert get(server.url[:-1] + "x")[0] == 403
+    assert get(server.url.replace("/?", "/other?"))[0] == 404
+    assert get(server.url, Host="evil.example")[0] == 403
+
+
+def test_the_websocket_takes_its_own_page_only(server, state):
+    origin = server.url.split("/?")[0]
+    address = server.url.replace("http", "ws").replace("/?", "/live?")
+    with connect(address, origin=origin) as socket:
+        server.show(state)
+        assert json.loads(socket.recv(timeout=5))["tone"] == "in"
+    for wrong in ({"uri": address, "origin": "http://evil.example"}, {"uri": address, "origin": None}):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(**wrong)
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(address.split("token")[0] + "token=guess", origin=origin)
+
+
+@pytest.mark.parametrize("text", ["0.0.0.0:8000", "192.168.1.7:80", "example.org:80", "8000", "127.0.0.1:x", "::1"])
+def test_only_this_computer_can_be_served(text):
+    with pytest.raises(UsageError):
+        address_of(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [("127.0.0.1:0", ("127.0.0.1", 0)), ("localhost:8000", ("127.0.0.1", 8000)), ("[::1]:9", ("::1", 9))],
+)
+def test_an_address_of_this_computer(text, address):
+    assert address_of(text) == address
