@@ -44,6 +44,10 @@ def press_harder(readings):
     readings[:] = np.minimum(readings * 2.6, 65000).astype(np.uint16)
 
 
+def stick_for_a_time(readings):
+    readings[20:110] = readings[20]
+
+
 def sometimes_full(readings):
     readings[:: len(readings) // 20] = 65535
 
@@ -52,6 +56,7 @@ FAULTS = {
     "zero": (fill(0), "dead"),
     "noise of its cable": (cable_noise, "dead"),
     "one value": (fill(16000), "stuck"),
+    "one value for most of the time": (stick_for_a_time, "stuck"),
     "twice the pressure and more": (press_harder, "hot"),
     "flickering": (flicker, "hot"),
     "full scale": (fill(65535), "saturated"),
@@ -68,6 +73,10 @@ def test_a_bad_taxel_is_found_and_named(change, fault):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_good_array_over_a_lump_has_no_fault(seed):
     assert find_faults(noisy_scan(seed)) == ()
+
+
+def test_a_taxel_that_sticks_for_a_moment_is_left_alone():
+    assert find_faults(spoilt(lambda readings: readings.__setitem__(slice(20, 40), readings[20]))) == ()
 
 
 def test_an_edge_that_bears_nothing_is_no_single_fault():

@@ -20,6 +20,8 @@ FLICKER_KPA = 1.0
 SATURATED_SHARE = 0.1
 # Fewer frames than this say nothing about what never changes.
 MIN_FRAMES = 10
+# One that repeats its last count in a larger share of the frames, where most do so in less than half of that, is stuck.
+STILL_SHARE = 0.5
 # Below this level (kPa) the head is in the air, and a low reading is no fault.
 CONTACT_KPA = 1.0
 _CHUNK = 512
@@ -43,6 +45,7 @@ class _Levels(NamedTuple):
     highest: NDArray[np.uint16]
     mean_kpa: FloatArray
     flicker_kpa: FloatArray
+    still_share: FloatArray
     saturated_share: FloatArray
 
 
@@ -51,7 +54,8 @@ def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
 
     - dead: gain 0, or never anything but one count while the level is next to nothing, or a level below a tenth of
       both its row's and its column's median;
-    - stuck: one count throughout, while most taxels change;
+    - stuck: one count throughout, while most taxels change; or one that repeats its last count in over half of the
+      frames, while most hardly ever do (it sticks for a time and comes back);
     - hot: over twice the level of its row and column, or flickering over ten times as much as most;
     - saturated: full scale in over a tenth of the frames.
 
@@ -78,7 +82,8 @@ def _classify(scan: Scan, levels: _Levels) -> NDArray[np.str_]:
     flicker = (levels.flicker_kpa > FLICKER_RATIO * np.median(levels.flicker_kpa)) & (levels.flicker_kpa > FLICKER_KPA)
     faults = np.full(mean.shape, "", dtype="<U9")
     faults[((mean > HOT_RATIO * high) & (mean > usual + CONTACT_KPA)) | flicker] = "hot"
-    faults[constant & moving] = "stuck"
+    sticks = (levels.still_share > STILL_SHARE) & bool(np.median(levels.still_share) < STILL_SHARE / 2)
+    faults[(constant & moving) | (sticks & (len(scan.frames) >= MIN_FRAMES))] = "stuck"
     faults[levels.saturated_share > SATURATED_SHARE] = "saturated"
     faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
     return faults
@@ -95,13 +100,15 @@ def _levels(scan: Scan) -> _Levels:
     """Stream over the counts once."""
     counts, calibration = scan.frames.counts, scan.element_calibration
     total = np.zeros(counts.shape[1:])
-    steps = np.zeros(counts.shape[1:])
+    steps, still = np.zeros(counts.shape[1:]), np.zeros(counts.shape[1:])
     saturated = np.zeros(counts.shape[1:], dtype=np.int64)
     last = counts[:1].astype(np.float64)
     for start in range(0, len(counts), _CHUNK):
         chunk = counts[start : start + _CHUNK].astype(np.float64)
         total += chunk.sum(axis=0)
-        steps += np.abs(np.diff(chunk, axis=0, prepend=last)).sum(axis=0)  # not squared: one spike is no flicker
+        change = np.abs(np.diff(chunk, axis=0, prepend=last))
+        steps += change.sum(axis=0)  # not squared: one spike is no flicker
+        still += (change == 0).sum(axis=0)
         saturated += (chunk >= calibration.saturation_count).sum(axis=0)
         last = chunk[-1:]
     n = len(counts)
@@ -110,5 +117,6 @@ def _levels(scan: Scan) -> _Levels:
         counts.max(axis=0),
         calibration.gain_kpa_per_count * (total / n) + calibration.offset_kpa,
         calibration.gain_kpa_per_count * (steps / max(n - 1, 1)),
+        (still - 1) / max(n - 1, 1),  # the first frame was compared with itself
         saturated / n,
     )
