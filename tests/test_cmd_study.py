@@ -144,7 +144,7 @@ def test_what_cannot_be_is_said_in_one_line(name: str, run_cli: Run, tmp_path: P
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("d_mm,depth_ratio,stiffness_ratio\n10,0.5,100\n", ["depth_ratio is 0.5", "stands out of the skin"]),
+        ("d_mm,depth_ratio,stiffness_ratio\n10,0.5,100\n", ["depth_ratio is 0.5", "at least 0.52"]),
         ("d_mm,depth_ratio,stiffness_ratio\n10,1,0\n", ["line 2", "stiffness_ratio", "above 0"]),
         ("d_mm,depth_ratio,stiffness_ratio\n10,1,8\n10,1,8\n", ["g.csv", "appears twice"]),
         ("d_mm,depth_ratio\n10,1\n", ["stiffness_ratio", "is missing"]),

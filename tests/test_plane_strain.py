@@ -250,6 +250,24 @@ def test_seats_lead_smoothly_from_one_end_to_the_other() -> None:
     np.testing.assert_allclose(found[-2], found[-1], rtol=2e-3)
 
 
+EXTREMES = {
+    "hardly any skin": Body(25, 0.52),
+    "hardly in the gland": Body(15, 1.0, 0.99985),
+    "as good as resting": Body(15, 1.0, 1 - 1e-7),
+    "hardly off the centre": Body(15, 1.0, 1e-9),
+    "hardly above the wall": Body(25, 2.0, 0.99, 62.7),
+    "larger than the head": Body(60, 0.6),
+    "tiny and deep": Body(2, 10.0),
+}
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extreme_bodies_have_a_surface(name: str) -> None:
+    surface = condense(EXTREMES[name], fineness=1)
+    assert np.linalg.eigvalsh(surface.with_lump(100.0)).min() > 0
+    assert np.linalg.eigvalsh(surface.with_lump(0.01)).min() > 0
+
+
 @pytest.mark.parametrize("length", [0.01, 100.0])
 def test_only_ratios_of_lengths_matter(length: float) -> None:
     """A body scaled in all lengths has the same compliance per length."""
@@ -261,7 +279,7 @@ def test_only_ratios_of_lengths_matter(length: float) -> None:
 
 
 IMPOSSIBLE: dict[str, tuple[Callable[[], object], list[str]]] = {
-    "lump out of the skin": (lambda: Body(15, 0.5), ["depth_ratio is 0.5", "above 0.5"]),
+    "lump out of the skin": (lambda: Body(15, 0.5), ["depth_ratio is 0.5", "at least 0.52"]),
     "no lump": (lambda: Body(0, 1), ["d_mm is 0", "above 0"]),
     "lump in the wall": (lambda: Body(15, 1, thickness_mm=22.0), ["thickness_mm is 22", "above 22.5 mm"]),
     "seat": (lambda: Body(15, 1, 1.2), ["seat is 1.2", "between 0 (centred) and 1 (resting)"]),

@@ -76,7 +76,10 @@ def test_only_what_lies_within_the_radius_is_fitted() -> None:
 
 
 def test_a_bump_wider_than_the_window_is_reported_at_its_edge() -> None:
-    assert fit_line(line_of(0.01, 200.0), 48.0).sigma_mm == pytest.approx(36.0)
+    found = fit_line(line_of(0.5, 200.0), 48.0)
+    assert found.sigma_mm == pytest.approx(36.0)
+    assert not found.resolved
+    assert fit_line(line_of(0.5, 20.0), 48.0).resolved
 
 
 def test_the_papers_grid_is_150_cases_of_30_geometries() -> None:

@@ -65,8 +65,8 @@ def command(
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses.
 
     A head slides over each lump in a layered, two-dimensional body; its frames become a map, and Eq 5 is fitted to it
-    with the background at 1. Cases with an amplitude below 0.02 are marked as not detectable. With -o an interrupted
-    study goes on where it stopped.
+    with the background at 1. Cases with an amplitude below 0.02 or a width that is not resolved are marked as not
+    detectable. With -o an interrupted study goes on where it stopped.
 
     A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
     lump's centre on the fat-gland boundary, 1 (resting) its lowest point.
@@ -234,7 +234,8 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
 
     ends = np.log([LEAST_WIDTH_IN_CELLS * line.cell_mm, WIDEST_IN_RADII * radius_mm])
     found = fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
-    return LineFit(found.height, float(np.exp(found.parameter)), float(np.sqrt(found.sse / len(x))))
+    resolved = bool(ends[0] + 1e-6 < found.parameter < ends[1] - 1e-6)
+    return LineFit(found.height, float(np.exp(found.parameter)), float(np.sqrt(found.sse / len(x))), resolved)
 
 
 def table_text(rows: list[StudyRow]) -> str:

@@ -10,6 +10,9 @@ FAT_KPA = 5.0
 GLAND_RATIO = 10.0
 POISSON = 0.495
 THICKNESS_MM = 70.0
+LEAST_DEPTH_RATIO = 0.52
+# A lump that reaches less than this far into the gland, in radii, rests on it: the mesh could not tell its nodes apart.
+_RESTS = 1e-4
 SEATS = {"centred": 0.0, "resting": 1.0}
 """Named seats. Where the lump's centre lies on the fat-gland boundary, and where the lump only touches it."""
 
@@ -54,10 +57,11 @@ class Body:
     d_mm
         Diameter of the lump.
     depth_ratio
-        h/d: depth of the lump's centre below the skin over its diameter, above 0.5.
+        h/d: depth of the lump's centre below the skin over its diameter, at least 0.52 (at 0.5 it touches the skin).
     seat
         How far the lump stands out of the gland, 0 to 1. The fat-gland boundary lies at depth ``h + seat d/2``: through
-        the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat).
+        the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat). Within 1e-4
+        of 1 it is 1.
     thickness_mm
         Depth of the chest wall; None takes 70 mm, or ``h + 0.6 d + 2 mm`` where that is deeper.
     fat_kpa, gland_ratio, poisson
@@ -78,9 +82,11 @@ class Body:
 
     def __post_init__(self) -> None:
         _require(0 < self.d_mm < 1e4, "d_mm", self.d_mm, "above 0, in mm")
-        limit = "above 0.5, or the lump stands out of the skin"
-        _require(0.5 < self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
+        limit = f"at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
+        _require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
         _require(0 <= self.seat <= 1, "seat", self.seat, "between 0 (centred) and 1 (resting)")
+        if self.seat > 1.0 - _RESTS:
+            object.__setattr__(self, "seat", 1.0)
         if self.thickness_mm is None:
             deep = self.centre_mm + 0.6 * self.d_mm + 2.0
             object.__setattr__(self, "thickness_mm", max(THICKNESS_MM, deep))

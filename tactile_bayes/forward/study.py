@@ -18,7 +18,7 @@ PAPER_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 PAPER_DEPTH_RATIOS = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
 PAPER_STIFFNESS_RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
 FIT_RADIUS_MM = 48.0
-# A bump lower than this share of the background is not called detectable.
+# A bump lower than this share of the background is not called detectable, nor one whose width is not resolved.
 DETECTABLE = 0.02
 HARD_RATIO = 100.0
 
@@ -106,11 +106,14 @@ class LineFit:
         a and sigma of Eq 5.
     rms
         Root mean square of what the Gaussian leaves, in units of the background.
+    resolved
+        Whether the width lies within what the fit looks at, and not at an end of it.
     """
 
     amplitude: float
     sigma_mm: float
     rms: float
+    resolved: bool = True
 
 
 Fit = Callable[[TactileLine, float], LineFit]
@@ -182,7 +185,7 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
                 found.amplitude,
                 found.sigma_mm,
                 found.rms,
-                bool(found.amplitude >= DETECTABLE),
+                bool(found.amplitude >= DETECTABLE and found.resolved),
             )
         )
     return rows
