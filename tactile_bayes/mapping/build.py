@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray, Plane, inverse, patient_from_base
 from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress, sources_of
 from tactile_bayes.mapping.convention import hint
-from tactile_bayes.mapping.engine import choose_engine
+from tactile_bayes.mapping.engine import Engine, choose_engine
 from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
 from tactile_bayes.mapping.latency import estimate_latency
@@ -92,54 +93,74 @@ def build_map(
         )
     _check_same_examination(parts)
     loops = choose_engine(engine, readings=sum(scan.frames.counts.size for scan in parts))
-
-    def select(chosen: list[Scan], late_ms: float) -> list[SelectedFrames]:
-        found = [
-            select_frames(
-                scan,
-                pressure_window_kpa=pressure_window_kpa,
-                latency_ms=late_ms,
-                max_pose_gap_ms=max_pose_gap_ms,
-                engine=loops,
-            )
-            for scan in chosen
-        ]
-        refuse_without_frames(found, pressure_window_kpa=pressure_window_kpa)
-        return found
-
+    rules = _Rules(_window(pressure_window_kpa), max_pose_gap_ms, loops)
     figures: dict[str, float] = {}
     late_ms = 0.0 if isinstance(latency_ms, str) else float(latency_ms)
-    selections = select(parts, late_ms)
+    selections = rules.select(parts, late_ms)
     if flat_field:
-        flats = [find_flat_field(part) for part in selections if part.used.any()]
-        figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
-        figures["flat_field_sd"] = float(np.mean([flat.spread for flat in flats]))
-        used = [scan for scan, part in zip(parts, selections, strict=True) if part.used.any()]
-        parts = [flat.applied(scan) for flat, scan in zip(flats, used, strict=True)]
-        selections = select(parts, late_ms)
-    plane = _plane(selections)
+        selections = _flattened(selections, rules, late_ms, figures)
     if isinstance(latency_ms, str):
-        found = estimate_latency(
-            selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm, max_pose_gap_ms=max_pose_gap_ms
-        )
-        late_ms = found.latency_ms
-        figures |= {"latency_sd_ms": found.sd_ms, "latency_frames": float(found.frames)}
-        selections = select(parts, late_ms)
-        plane = _plane(selections)
+        late_ms = _latency(selections, rules, cell_mm, figures)
+        selections = rules.select([part.scan for part in selections], late_ms)
+    plane = _plane(selections)
     if plane_radius_mm is not None:
         radius = None if isinstance(plane_radius_mm, str) else plane_radius_mm
-        plane, more = local_plane(selections, plane, radius_mm=radius, engine=loops)
-        figures |= more
+        plane, near = local_plane(selections, plane, radius_mm=radius, engine=loops)
+        figures.update(near)
     sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
     if register_strokes:
         levels = [source.selection.level_kpa[source.selection.used] for source in sources]
         sources, strokes = find_shifts(sources, levels, cell_mm=cell_mm, engine=loops)
-        figures |= stroke_figures(strokes)
+        figures.update(stroke_figures(strokes))
     done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
-    recipe = MapRecipe(
-        "scan", normalise, float(cell_mm), _window(pressure_window_kpa), late_ms, flat_field, register_strokes
-    )
+    recipe = MapRecipe("scan", normalise, float(cell_mm), rules.window_kpa, late_ms, flat_field, register_strokes)
     return _as_map(done, selections, plane, recipe, figures)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rules:
+    """Which frames are used, whatever the latency."""
+
+    window_kpa: tuple[float, float]
+    max_pose_gap_ms: float
+    engine: Engine
+
+    def select(self, scans: list[Scan], late_ms: float) -> list[SelectedFrames]:
+        """Decide about every frame; refuse scans of which none is left."""
+        found = [
+            select_frames(
+                scan,
+                pressure_window_kpa=self.window_kpa,
+                latency_ms=late_ms,
+                max_pose_gap_ms=self.max_pose_gap_ms,
+                engine=self.engine,
+            )
+            for scan in scans
+        ]
+        refuse_without_frames(found, pressure_window_kpa=self.window_kpa)
+        return found
+
+
+def _flattened(
+    selections: list[SelectedFrames], rules: _Rules, late_ms: float, figures: dict[str, float]
+) -> list[SelectedFrames]:
+    """The scans with the head's own response taken off, decided about anew; those without a used frame drop out."""
+    used = [part for part in selections if part.used.any()]
+    flats = [find_flat_field(part) for part in used]
+    figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
+    figures["flat_field_sd"] = float(np.mean([flat.spread for flat in flats]))
+    return rules.select([flat.applied(part.scan) for flat, part in zip(flats, used, strict=True)], late_ms)
+
+
+def _latency(selections: list[SelectedFrames], rules: _Rules, cell_mm: float, figures: dict[str, float]) -> float:
+    found = estimate_latency(
+        selections,
+        plane_from_base=_plane(selections).plane_from_base,
+        cell_mm=cell_mm,
+        max_pose_gap_ms=rules.max_pose_gap_ms,
+    )
+    figures |= {"latency_sd_ms": found.sd_ms, "latency_frames": float(found.frames)}
+    return found.latency_ms
 
 
 def _plane(selections: list[SelectedFrames]) -> Plane:
