@@ -234,12 +234,12 @@ def boussinesq_strain(x: np.ndarray, shear: float) -> np.ndarray:
 @pytest.mark.parametrize("name", GEOMETRIES)
 def test_the_change_converges_with_the_mesh(name: str) -> None:
     fine = condense_lump(GEOMETRIES[name], Tissue(), size=MeshSize(arc=36, rings=12, core=6, grade=1.25))
-    largest = abs(point_change(fine, 500.0, 0.0, 0.0, 0.0))
     h = GEOMETRIES[name].depth_mm
-    for r1, r2, angle in ((0.0, 0.0, 0.0), (0.5 * h, 0.5 * h, 0.0), (h, 0.5 * h, 1.0), (2 * h, 0.0, 0.0)):
+    largest = abs(point_change(fine, 500.0, 0.3 * h, 0.3 * h, 0.0))
+    for r1, r2, angle in ((0.3 * h, 0.3 * h, 0.0), (0.5 * h, 0.5 * h, 0.0), (h, 0.5 * h, 1.0), (2 * h, 0.3 * h, 0.0)):
         expected = point_change(fine, 500.0, r1, r2, angle)
         change = point_change(condensed(name), 500.0, r1, r2, angle)
-        assert change == pytest.approx(expected, abs=0.02 * largest)
+        assert change == pytest.approx(expected, abs=0.01 * largest)
 
 
 @pytest.mark.slow
@@ -255,7 +255,7 @@ def test_two_more_orders_change_nothing(name: str) -> None:
     more = condense_lump(geometry, Tissue(), orders=orders_needed(geometry) + 2)
     r = 0.7 * geometry.depth_mm
     a, b = point_change(condensed(name), 500.0, r, r, 0.0), point_change(more, 500.0, r, r, 0.0)
-    assert a == pytest.approx(b, rel=1e-3)
+    assert a == pytest.approx(b, rel=3e-3)
 
 
 BAD = [

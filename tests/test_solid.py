@@ -15,7 +15,7 @@ from tactile_bayes.forward.axisymmetric import Tissue, condense_lump
 from tactile_bayes.forward.head_contact import ContactStiffness, press
 from tactile_bayes.forward.head_face import HeadFace, head_face
 from tactile_bayes.forward.layered import LayeredBody, taxel_compliance
-from tactile_bayes.forward.lump_mesh import LumpGeometry
+from tactile_bayes.forward.lump_mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.scene import Head, rotation_from_vector
 from tactile_bayes.forward.solid import PlacedLump, SkinPerturbation, SolidHead, skin_perturbation, solid_head
 
@@ -144,6 +144,19 @@ def test_averaging_over_a_square_is_averaging() -> None:
     np.testing.assert_allclose((quick * quick_signs) @ quick.T, exact, atol=1e-2 * np.abs(exact).max())
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [(7.5, 15.0, 15.0), (5.0, 6.0, 6.0), (12.5, 15.0, 30.0), (2.5, 5.0, 8.0)])
+def test_half_the_mesh_size_changes_a_frame_by_a_hundredth_of_the_bump(place: tuple[float, float, float]) -> None:
+    radius, depth, fat = place
+    frames = []
+    for size in (MeshSize(), MeshSize(arc=30, rings=10, core=5, grade=1.25)):
+        lump = condense_lump(LumpGeometry(radius, radius, depth, fat, 70.0), Tissue(), size=size)
+        placed = PlacedLump(skin_perturbation(lump, 500.0), 0.0, 0.0)
+        frames.append(on_fat(fat).frame([placed], rotation=LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=9.5).pressure_kpa)
+    plain = on_fat(fat).frame([], rotation=LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=9.5).pressure_kpa
+    assert np.abs(frames[0] - frames[1]).max() <= 0.01 * np.abs(frames[1] - plain).max()
+
+
 def raster_map(d: float, h: float, fat_mm: float, ratio: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cell centres and values of a map by the recipe of the shared phantom table; a quarter of the raster is solved."""
     thickness = max(70.0, h + 0.6 * d + 2.0)
@@ -185,7 +198,7 @@ QUICK = [("centred", 15.0, 1.0), ("resting", 20.0, 1.0)]
 # Where a lump is shallow or small against a taxel, what the pitch does not resolve decides: wider limits.
 SLOW = [
     *[("centred", d, q) for d in (10.0, 15.0, 20.0, 25.0) for q in (0.8, 1.0, 1.2)],
-    *[("resting", d, q) for d in (10.0, 15.0, 20.0, 25.0) for q in (0.8, 1.0, 1.2, 1.5)],
+    *[("resting", d, q) for d in (10.0, 15.0, 20.0, 25.0) for q in (0.8, 1.0, 1.2)],
 ]
 CASES = [*QUICK, *[pytest.param(*case, marks=pytest.mark.slow) for case in SLOW if case not in QUICK]]
 
