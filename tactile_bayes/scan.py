@@ -188,12 +188,22 @@ class TrackerPoses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Points touched just before the scan, in `base`, mm."""
+    """Points touched just before the scan, in `base`, mm.
+
+    Parameters
+    ----------
+    sternal_notch_mm, xiphoid_mm : (3,) arrays
+    spread_mm
+        Largest distance between touches of one landmark, where they were touched again; None where they were not.
+    """
 
     sternal_notch_mm: FloatArray
     xiphoid_mm: FloatArray
+    spread_mm: float | None = None
 
     def __post_init__(self) -> None:
+        if self.spread_mm is not None and not 0 <= self.spread_mm < np.inf:
+            raise BadDataError(f"spread_mm is {self.spread_mm}", way_out="give a distance of 0 mm or more")
         for name in ("sternal_notch_mm", "xiphoid_mm"):
             object.__setattr__(self, name, _check_finite(getattr(self, name), name=name, shape=(3,)))
 

@@ -67,7 +67,7 @@ def test_the_table_says_what_was_used_and_what_was_left_out(folder, run_cli):
     assert table["left out"] == "5 mean pressure below the window of 5 to 14 kPa"
     assert re.fullmatch(r"rms 0\.0 mm, 0\.0 deg from the head's face", table["plane"])
     assert table["resolves"] == "lumps of map width sigma 1.3 mm or more"
-    assert table["patient axes"] == "from the landmarks, repeats within 0.0 mm of their mean"
+    assert table["patient axes"] == "from the landmarks, repeats within 0.0 mm"
     assert lines[-1] == RESEARCH_USE
 
 

@@ -115,6 +115,10 @@ def test_repeated_landmarks_tell_their_spread():
     assert found.quality["landmark_spread_mm"] == pytest.approx(3.0)
     assert "repeats within 3.0 mm" in map_text(found)
     assert "landmark_spread_mm" not in build_map(replace(scan, landmarks=marks[0])).quality
+    again = build_map(replace(scan, landmarks=replace(marks[0], spread_mm=4.5)))
+    assert again.quality["landmark_spread_mm"] == 4.5
+    with pytest.raises(BadDataError, match=r"spread_mm is -1\.0; give a distance"):
+        replace(marks[0], spread_mm=-1.0)
 
 
 def test_advice_names_the_width_and_what_finer_cells_would_cost():

@@ -273,4 +273,6 @@ def _patient_from_plane(scans: list[Scan], plane: Plane) -> tuple[FloatArray | N
         )
     base = patient_from_base(mean[0], mean[1], normal=plane.plane_from_base[2, :3])
     transform: FloatArray = base @ inverse(plane.plane_from_base)
-    return transform, {"landmark_spread_mm": shift} if len(touched) > 1 else {}
+    repeats = [marks.spread_mm for marks in touched if marks.spread_mm is not None]
+    repeats += [shift] if len(touched) > 1 else []
+    return transform, {"landmark_spread_mm": max(repeats)} if repeats else {}

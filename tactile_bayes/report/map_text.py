@@ -120,7 +120,7 @@ def _plane(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     moved = f"{quality['span_x_mm']:.0f} x {quality['span_y_mm']:.0f} mm"
     yield "head", f"turned by {quality['yaw_sd_deg']:.1f} deg (SD), moved {moved}"
     repeats = quality.get("landmark_spread_mm")
-    spread = "" if repeats is None else f", repeats within {repeats:.1f} mm of their mean"
+    spread = "" if repeats is None else f", repeats within {repeats:.1f} mm"
     axes = f"from the landmarks{spread}" if tactile_map.patient_from_plane is not None else "none: no landmarks"
     yield "patient axes", axes
 
