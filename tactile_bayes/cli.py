@@ -24,6 +24,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate", "Make a scan with known truth from a scene."),
     "record": ("record", "Record a scan head and a tracker into a scan file."),
     "repair": ("repair", "Close a scan file that was cut off: what is intact is kept."),
+    "replay": ("replay", "Play a scan through the path of a recording, with the live view."),
+    "devices": ("devices", "List the serial ports with a guess at what is on them."),
     "emulate": ("emulate", "Serve a scan as a scan head or a tracker would send it."),
     "show": ("show", "Say what any of our files is and how good it is."),
 }

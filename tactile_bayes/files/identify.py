@@ -5,11 +5,15 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import unreadable
+
+if TYPE_CHECKING:
+    from tactile_bayes.scan import Scan
 
 _MCAP = b"\x89MCAP0\r\n"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -61,11 +65,24 @@ def _scan(path: Path) -> dict[str, Any]:
         "frame_rate_hz": float((len(time) - 1) / (time[-1] - time[0]))
         if len(time) > 1 and time[-1] > time[0]
         else None,
+        **_recording(file.account, file.topics, scan),
         "landmarks": scan.landmarks is not None,
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
         "session": dict(scan.session),
         "provenance": dict(file.provenance),
     }
+
+
+def _recording(account: Mapping[str, str], topics: Mapping[str, int], scan: Scan) -> dict[str, Any]:
+    """What is missing: by the gaps between the frames' times, and by the recorder's account if it came to give one."""
+    import numpy as np
+
+    steps = np.diff(scan.frames.time_s)
+    period = float(np.median(steps)) if len(steps) else 0.0
+    missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
+    names = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "overrun_bytes", "ended_by", "fault")
+    told = {name: account[name] for name in names if account.get(name)}
+    return {"frames_missing": missing, "notes": topics.get("/log", 0)} | ({"recording": told} if told else {})
 
 
 def _netcdf(path: Path) -> dict[str, Any]:

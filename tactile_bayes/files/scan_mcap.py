@@ -322,6 +322,7 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
         topics=records.topic_counts(),
         provenance=provenance,
         schema=SCAN_SCHEMA,
+        account=records.metadata.get("recording", {}),
     )
 
 

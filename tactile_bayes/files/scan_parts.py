@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,6 +37,8 @@ class ScanFile:
         What made the file, as `Provenance.as_dict` wrote it.
     schema
         Schema id of the file.
+    account
+        What a recording that ended in order said of itself; empty for other scans and for one that was cut off.
     """
 
     scan: Scan
@@ -46,6 +48,7 @@ class ScanFile:
     topics: Mapping[str, int]
     provenance: Mapping[str, Any]
     schema: str
+    account: Mapping[str, str] = field(default_factory=dict)
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:

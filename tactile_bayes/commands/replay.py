@@ -1,0 +1,80 @@
+"""`replay`: a scan through the same path as a recording."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from tactile_bayes.errors import DeviceError
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.command("replay")
+@click.argument("scan", metavar="SCAN.mcap", type=_FILE)
+@click.option("-o", "--output", metavar="OUT.mcap", type=_FILE, help="Keep what is recorded on the way.")
+@click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
+@click.option("--serve", metavar="HOST:PORT", help="Show it to a browser here, with a tone.")
+@click.option("--size-calibration", type=_FILE, metavar="SIZE.json", help="For the live view's size estimate.")
+@click.option("--speed", type=click.FloatRange(0.01, 100.0), default=1.0, show_default=True, help="Times the own rate.")
+@click.option("--force", is_flag=True, help="Overwrite the output.")
+@click.pass_context
+def command(
+    ctx: click.Context,
+    scan: Path,
+    output: Path | None,
+    live: bool,
+    serve: str | None,
+    size_calibration: Path | None,
+    speed: float,
+    force: bool,
+) -> None:
+    """Play a scan as if it were being recorded: emulated devices, reading processes, recorder, live view.
+
+    Example: tactile-bayes replay scan.mcap --live
+    """
+    from tactile_bayes.commands import record
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.scan_mcap import read_scan
+
+    if output is not None:
+        refuse_existing(output, force=force)
+    found = read_scan(scan)
+    with tempfile.TemporaryDirectory() as folder, _emulated(scan, "head", speed) as head:
+        shared = {"like": scan, "head_url": head, "clock": "shared", "live": live, "serve": serve, "force": force}
+        more = {"output": output or Path(folder) / "replayed.mcap", "size_calibration": size_calibration}
+        if found.landmarks is not None:
+            more["landmarks"] = scan
+        if not len(found.poses):
+            ctx.invoke(record.command, **shared, **more)
+            return
+        with _emulated(scan, "tracker", speed) as tracker:
+            ctx.invoke(record.command, **shared, **more, tracker_url=tracker, tracker_protocol="open")
+
+
+@contextmanager
+def _emulated(scan: Path, kind: str, speed: float) -> Iterator[str]:
+    """One emulated device in a process of its own; its URL."""
+    words = ["emulate", kind, str(scan), "--speed", str(speed)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactile_bayes", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        url = process.stdout.readline().strip()
+        if not url:
+            raise DeviceError(f"the emulated {kind} did not start; try `tactile-bayes emulate {kind} {scan}`")
+        yield url
+    finally:
+        process.terminate()
+        process.wait()
+        process.stdout.close()
