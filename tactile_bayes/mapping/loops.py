@@ -74,15 +74,15 @@ def scatter_loop(
     cells : (rows x columns + 1, 2) int64
         Count x 2^`PACK_BITS` + sum, and sum of squares, of each cell. Invalid readings go to the last row.
     """
-    index, steps = np.empty(counts.shape[1], np.int32), np.empty(counts.shape[1], np.int32)
+    index, steps = np.empty(counts.shape[1], np.uint32), np.empty(counts.shape[1], np.int32)
     one = np.int64(1) << np.int64(PACK_BITS)
-    nowhere, clipped, negative = np.int32(cells.shape[0] - 1), 0, 0
+    nowhere, clipped, negative = np.uint32(cells.shape[0] - 1), 0, 0
     for f in range(counts.shape[0]):
         row = counts[f]
         for k in range(counts.shape[1]):
             u = turn[f, 0, 0] * taxels[0, k] + turn[f, 0, 1] * taxels[1, k] + turn[f, 0, 2] * taxels[2, k] + shift[f, 0]
             v = turn[f, 1, 0] * taxels[0, k] + turn[f, 1, 1] * taxels[1, k] + turn[f, 1, 2] * taxels[2, k] + shift[f, 1]
-            index[k] = np.int32(v) * columns + np.int32(u)
+            index[k] = np.uint32(np.int32(v) * columns + np.int32(u))
         highest = row[0]
         for k in range(counts.shape[1]):
             highest = max(highest, row[k])
