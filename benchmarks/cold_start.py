@@ -60,6 +60,7 @@ CASES: tuple[Case, ...] = (
     _estimate("optimise", "numpy"),
     _estimate("laplace", "numpy"),
     _estimate("ensemble", "emcee and arviz"),
+    Case("plan", ("plan", "--patients", "24", "--maps", "3", "--trials", "50"), "numpy"),
     Case("validate", ("validate", str(DEMO / "trial.csv"), "--excision", str(DEMO / "excision.csv")), "numpy"),
     Case("show", ("show", "map.nc"), "numpy", ("map",)),
     Case("demo", ("demo", "-o", "demo", "--force"), "emcee and arviz"),

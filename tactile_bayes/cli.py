@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("calibrate", "Learn a calibration: `calibrate size`, `calibrate array`."),
     "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
     "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
+    "plan": ("plan", "Plan a trial: power and the worth of more maps, by simulation."),
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
     "simulate": ("simulate", "Make a scan with known truth from a scene."),

@@ -17,6 +17,7 @@ from tactile_bayes.trial.sums import ratio
 # Up to so many patients every pattern of signs is tried; beyond, this many random ones.
 MOST_EXACT = 14
 FLIPS = 9_999
+_AT_ONCE = 111
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
-def sign_flip(by_patient: FloatArray, *, seed: int) -> float | None:
+def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float | None:
     """Two-sided p value of a sum of patients' differences, each as likely up as down.
 
     Parameters
@@ -76,6 +77,8 @@ def sign_flip(by_patient: FloatArray, *, seed: int) -> float | None:
         Sum over each patient's masses of the difference of absolute errors.
     seed
         Of the random patterns, when there are too many to try all.
+    flips
+        How many random patterns.
 
     Notes
     -----
@@ -93,10 +96,10 @@ def sign_flip(by_patient: FloatArray, *, seed: int) -> float | None:
         return float(np.mean(np.abs((1 - 2 * patterns) @ differences) >= observed))
     rng = np.random.default_rng([seed, len(differences)])
     beyond = 1
-    for _ in range(0, FLIPS, 1111):
-        signs = 1 - 2 * rng.integers(0, 2, (min(1111, FLIPS), len(differences)), dtype=np.int8)
+    for start in range(0, flips, _AT_ONCE):
+        signs = 1 - 2 * rng.integers(0, 2, (min(_AT_ONCE, flips - start), len(differences)), dtype=np.int8)
         beyond += int(np.sum(np.abs(signs @ differences) >= observed))
-    return beyond / (FLIPS + 1)
+    return beyond / (flips + 1)
 
 
 def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, seed: int) -> PairedComparison:

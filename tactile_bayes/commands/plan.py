@@ -1,0 +1,147 @@
+"""`plan`: how large a trial must be, and how many maps a mass are worth making."""
+
+from __future__ import annotations
+
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.errors import UsageError
+
+if TYPE_CHECKING:
+    from tactile_bayes.trial.planning import PlanCase
+
+SCHEMA = "tactile-bayes/plan/1"
+_FILE = click.Path(path_type=Path)
+_SD = click.FloatRange(0)
+_ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other_miss")
+
+
+@click.command("plan")
+@click.option(
+    "--patients",
+    type=click.IntRange(8),
+    multiple=True,
+    default=(16, 24, 32, 48),
+    show_default=True,
+    help="With one mass each.",
+)
+@click.option(
+    "--maps", type=click.IntRange(1), multiple=True, default=(1, 3, 5), show_default=True, help="Tactile maps a mass."
+)
+@click.option("--tactile-bias", type=float, default=0.02, show_default=True, help="Mean of ln(size / ex vivo).")
+@click.option("--mass-sd", type=_SD, default=0.18, show_default=True, help="SD of ln size shared by a mass's maps.")
+@click.option("--map-sd", type=_SD, default=0.15, show_default=True, help="SD of ln size of single maps.")
+@click.option("--other-bias", type=float, default=-0.08, show_default=True, help="Of the modality compared with.")
+@click.option("--other-sd", type=_SD, default=0.40, show_default=True, help="SD of ln size of that modality.")
+@click.option(
+    "--other-miss", type=click.FloatRange(0, 1), default=0.04, show_default=True, help="Share of masses it misses."
+)
+@click.option("--pilot", metavar="TRIAL.csv", type=_FILE, help="Take the errors from this trial; needs --excision.")
+@click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
+@click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot compared with.")
+@click.option("--trials", type=click.IntRange(50), default=1000, show_default=True, help="Simulated for each design.")
+@click.option("--seed", type=click.IntRange(0), default=1999, show_default=True, help="Of the simulation.")
+@click.option("--workers", type=click.IntRange(0), default=1, show_default=True, help="Local processes.")
+@click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
+@click.option("-o", "--output", metavar="PLAN.json", type=_FILE, help="Write the plan as JSON to this file.")
+@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+def command(
+    patients: tuple[int, ...],
+    maps: tuple[int, ...],
+    pilot: Path | None,
+    excision: Path | None,
+    against: str,
+    trials: int,
+    seed: int,
+    workers: int,
+    as_json: bool,
+    output: Path | None,
+    force: bool,
+    **errors: float,
+) -> None:
+    """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
+
+    Each design is simulated with log-normal errors. Power is the share of trials in which the tactile percent error is
+    the smaller one and a sign-flip test by patient finds p < 0.05. SDs are of ln size: 0.15 is about 15 %.
+
+    Example: tactile-bayes plan --patients 24 --patients 40 --maps 3 --maps 5 -o plan.json
+    """
+    from tactile_bayes.files.atomic import refuse_existing, write_text
+    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.trial.planning import designs
+
+    if output:
+        refuse_existing(output, force=force)
+    files: dict[str, Path] = {}
+    if pilot is not None:
+        if excision is None:
+            raise UsageError("--pilot needs --excision; give the pilot's excision table")
+        errors, files = _from_pilot(pilot, excision, against), {"pilot": pilot, "excision": excision}
+    cases = list(designs(sorted(set(patients)), sorted(set(maps)), **errors, trials=trials, seed=seed))
+    document = _document(cases, _simulate(cases, workers=workers), errors, files)
+    check_document(document, "plan.schema.json", path=output or Path("the plan"))
+    if output:
+        write_text(output, dump_json(document), force=force)
+    click.echo(dump_json(document) if as_json else _text(document), nl=False)
+
+
+def _from_pilot(pilot: Path, excision: Path, against: str) -> dict[str, float]:
+    from tactile_bayes.commands.trial_inputs import load_trial
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.trial.planning import assumptions_from
+    from tactile_bayes.trial.readings import gather
+
+    inputs = load_trial(pilot, excision, None)
+    sizes = gather(inputs.readings, inputs.ex_vivo_mm)
+    for name in ("tactile", against):
+        if name not in sizes:
+            way_out = f"it has {', '.join(sizes)}; choose one with --against"
+            raise BadDataError(f"holds no readings by {name}", way_out=way_out, path=str(pilot))
+    found = assumptions_from(sizes["tactile"], sizes[against])
+    if found is None:
+        way_out = "give the errors by options"
+        raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(pilot))
+    return found
+
+
+def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
+    from tactile_bayes.batch import open_executor, run_batch
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.trial.planning import run_case
+
+    with open_executor(workers=workers) as executor, progress_bar("designs") as progress:
+        outcomes = run_batch(run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
+    for outcome in outcomes:
+        if outcome.value is None:
+            raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
+    return [outcome.value for outcome in outcomes if outcome.value is not None]
+
+
+def _document(
+    cases: list[PlanCase], results: list[dict[str, Any]], errors: dict[str, float], files: dict[str, Path]
+) -> dict[str, Any]:
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.trial.planning import map_gains
+
+    by_design = {(case.patients, case.maps): result for case, result in zip(cases, results, strict=True)}
+    assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
+    settings = {"trials": cases[0].trials, "errors": assumed}
+    return {
+        "schema": SCHEMA,
+        "errors": assumed,
+        "designs": [{"patients": n, "maps": m, **result} for (n, m), result in by_design.items()],
+        "gains": map_gains(by_design),
+        "provenance": Provenance("plan", settings, hash_inputs(**files), seed=cases[0].seed).as_dict(),
+        "research_use": RESEARCH_USE,
+    }
+
+
+def _text(document: dict[str, Any]) -> str:
+    from tactile_bayes.report.plan_text import plan_text
+
+    return plan_text(document)

@@ -1,0 +1,41 @@
+"""A plan as text for people: one line a design, then what further maps bring."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+
+def plan_text(document: Mapping[str, Any]) -> str:
+    """The whole plan; the research-use line comes last."""
+    errors = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in document["errors"].items())
+    lines = [
+        f"Assumed errors of ln size: {errors}",
+        "",
+        "patients  maps  power                tactile MAPE %  other MAPE %  tactile interval  ratio interval",
+        *(_design_line(one) for one in document["designs"]),
+        "",
+        *_gain_lines(document),
+        "power: tactile error smaller and p < 0.05, in brackets the simulation's own 95 % interval.",
+        "intervals: median factor from lower to upper end.",
+        str(document["research_use"]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _design_line(one: Mapping[str, Any]) -> str:
+    low, high = one["power_interval"]
+    power = f"{one['power']:.3f} [{low:.3f}, {high:.3f}]"
+    widths = [f"x {one[key]:.2f}" if one[key] else "-" for key in ("tactile_width_ratio", "ratio_width_ratio")]
+    return (
+        f"{one['patients']:>8}  {one['maps']:>4}  {power:<19}  {one['tactile_percent']:>14.1f}  "
+        f"{one['other_percent']:>12.1f}  {widths[0]:>16}  {widths[1]:>14}"
+    )
+
+
+def _gain_lines(document: Mapping[str, Any]) -> Iterator[str]:
+    for one in document["gains"]:
+        yield (
+            f"{one['patients']} patients, from {one['from_maps']} to {one['to_maps']} maps: power "
+            f"{one['power_gain']:+.3f}, tactile MAPE {one['tactile_percent_change']:+.1f} points"
+        )

@@ -1,0 +1,203 @@
+"""A trial before it is run: power, widths of intervals and the worth of more maps a mass, by simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.trial.accuracy import mape_percent
+from tactile_bayes.trial.check_intervals import ErrorModel
+from tactile_bayes.trial.comparison import mape_ratio
+from tactile_bayes.trial.figures import figure
+from tactile_bayes.trial.paired import sign_flip
+from tactile_bayes.trial.proportion import clopper_pearson
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+
+# Ex-vivo sizes, log-normal: median and SD of the logarithm, near those that the paper's figures imply.
+MEDIAN_MM, SIZE_LOG_SD = 16.0, 0.38
+FLIPS = 999
+LEVEL = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class PlanCase:
+    """One design under one assumption of errors: everything that its simulation depends on.
+
+    Attributes
+    ----------
+    patients, maps
+        Patients with one mass each, and tactile maps a mass.
+    tactile_bias, mass_sd, map_sd
+        Of ln(size / ex vivo): mean, SD shared by all maps of a mass, SD of single maps.
+    other_bias, other_sd, other_miss
+        The same for the modality compared with, read once, and its probability of missing a mass.
+    """
+
+    patients: int
+    maps: int
+    tactile_bias: float
+    mass_sd: float
+    map_sd: float
+    other_bias: float
+    other_sd: float
+    other_miss: float
+    trials: int
+    seed: int
+    confidence: float = 0.95
+
+    @property
+    def key(self) -> str:
+        """Unique among the designs of one plan."""
+        return f"{self.patients} patients, {self.maps} maps"
+
+
+@dataclass(frozen=True, slots=True)
+class PlanResult:
+    """What trials of one design find.
+
+    Attributes
+    ----------
+    power
+        Share of trials with a smaller tactile error and a sign-flip test below 5 %.
+    power_interval
+        Exact 95 % interval of that share: the simulation's own error.
+    tactile_percent, other_percent
+        Mean percent errors over the trials.
+    tactile_width_ratio, ratio_width_ratio
+        Median upper over lower end of the interval of the tactile error, and of the ratio of errors.
+    """
+
+    power: float
+    power_interval: tuple[float, float]
+    tactile_percent: float
+    other_percent: float
+    tactile_width_ratio: float | None
+    ratio_width_ratio: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self) | {"power_interval": list(self.power_interval)}
+
+
+def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) -> Iterator[PlanCase]:
+    """Every number of patients with every number of maps."""
+    for n in patients:
+        for m in maps:
+            yield PlanCase(patients=n, maps=m, **assumptions)
+
+
+def run_case(case: PlanCase) -> dict[str, Any]:
+    """Simulate the trials of one design; plain data, so that it can travel between processes."""
+    found = [_trial(case, trial) for trial in range(case.trials)]
+    wins = sum(one.won for one in found)
+    return PlanResult(
+        power=wins / case.trials,
+        power_interval=clopper_pearson(wins, case.trials, confidence=0.95),
+        tactile_percent=float(np.mean([one.tactile for one in found])),
+        other_percent=float(np.mean([one.other for one in found])),
+        tactile_width_ratio=_median([one.tactile_width for one in found]),
+        ratio_width_ratio=_median([one.ratio_width for one in found]),
+    ).as_dict()
+
+
+def map_gains(results: Mapping[tuple[int, int], PlanResult | Mapping[str, Any]]) -> list[dict[str, float | int]]:
+    """What each further map brings at the same number of patients: change of power and of tactile error.
+
+    Parameters
+    ----------
+    results
+        By patients and maps.
+    """
+    gains: list[dict[str, float | int]] = []
+    ordered = sorted(results)
+    for before, after in pairwise(ordered):
+        if before[0] != after[0]:
+            continue
+        old, new = _plain(results[before]), _plain(results[after])
+        gains.append(
+            {
+                "patients": after[0],
+                "from_maps": before[1],
+                "to_maps": after[1],
+                "power_gain": new["power"] - old["power"],
+                "tactile_percent_change": new["tactile_percent"] - old["tactile_percent"],
+            }
+        )
+    return gains
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    won: bool
+    tactile: float
+    other: float
+    tactile_width: float | None
+    ratio_width: float | None
+
+
+def _trial(case: PlanCase, number: int) -> _Found:
+    """One trial; designs that differ in maps alone meet the same masses, which makes their difference sharp."""
+    n, rng = case.patients, np.random.default_rng([case.seed, case.patients, number])
+    ex_vivo = MEDIAN_MM * np.exp(rng.normal(0, SIZE_LOG_SD, n))
+    shared = rng.normal(case.tactile_bias, case.mass_sd, n)
+    other = ex_vivo * np.exp(rng.normal(case.other_bias, case.other_sd, n))
+    other[rng.random(n) < case.other_miss] = 0.0
+    maps = ex_vivo * np.exp(shared + rng.normal(0, case.map_sd, (case.maps, n))).mean(axis=0)
+    tactile_sizes, other_sizes = _sizes("tactile", ex_vivo, maps), _sizes("other", ex_vivo, other)
+    off = np.abs(maps / ex_vivo - 1) - np.abs(other / ex_vivo - 1)
+    p = sign_flip(off, seed=number, flips=FLIPS)
+    error = figure(mape_percent, tactile_sizes, scale="log", confidence=case.confidence)
+    ratio = mape_ratio(other_sizes, tactile_sizes, confidence=case.confidence)
+    return _Found(
+        won=p is not None and p < LEVEL and float(off.sum()) < 0,
+        tactile=mape_percent(tactile_sizes),
+        other=mape_percent(other_sizes),
+        tactile_width=_width(error.interval),
+        ratio_width=_width(ratio.interval),
+    )
+
+
+def _sizes(name: str, ex_vivo_mm: FloatArray, size_mm: FloatArray) -> ModalitySizes:
+    n = len(ex_vivo_mm)
+    return ModalitySizes(name, np.arange(n), ex_vivo_mm, size_mm, (np.zeros(0),) * n)
+
+
+def _width(ends: tuple[float, float] | None) -> float | None:
+    return None if ends is None or ends[0] <= 0 else ends[1] / ends[0]
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    return float(np.median(known)) if known else None
+
+
+def _plain(result: PlanResult | Mapping[str, Any]) -> Mapping[str, Any]:
+    return result.as_dict() if isinstance(result, PlanResult) else result
+
+
+def assumptions_from(tactile: ModalitySizes, other: ModalitySizes) -> dict[str, float] | None:
+    """Errors like those of a pilot trial: bias, SDs between and within masses, share missed."""
+    from tactile_bayes.trial.check_intervals import observed_errors
+    from tactile_bayes.trial.figures import Figure
+    from tactile_bayes.trial.replicates import log_sd_within
+
+    models: list[ErrorModel | None] = [observed_errors(tactile), observed_errors(other)]
+    if models[0] is None or models[1] is None:
+        return None
+    within: Figure = figure(log_sd_within, tactile.only_replicated())
+    map_sd = within.value or 0.0
+    replicates = [len(group) for group in tactile.replicates_mm if len(group)]
+    shared = models[0].mass_sd ** 2 - map_sd**2 / float(np.mean(replicates))
+    return {
+        "tactile_bias": models[0].bias,
+        "mass_sd": math.sqrt(max(shared, 0.0)),
+        "map_sd": map_sd,
+        "other_bias": models[1].bias,
+        "other_sd": models[1].mass_sd,
+        "other_miss": models[1].miss,
+    }

@@ -1,0 +1,56 @@
+"""The command `plan`: what it prints and writes, its pilot, and its refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+import tactile_bayes
+from tactile_bayes.commands.plan import command
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.schema import read_json
+from tactile_bayes.presets import RESEARCH_USE
+
+DEMO = Path(tactile_bayes.__file__).parent / "demo"
+SMALL = ("--patients", 12, "--maps", 1, "--maps", 3, "--trials", 50)
+
+
+def plan(*args: object) -> Result:
+    return CliRunner().invoke(command, [str(arg) for arg in args])
+
+
+def test_the_same_plan_gives_the_same_bytes(tmp_path: Path) -> None:
+    printed = plan(*SMALL, "--json", "-o", tmp_path / "a.json")
+    again = plan(*SMALL, "--json", "--workers", 0)
+    assert (printed.exit_code, again.exit_code) == (0, 0), printed.output
+    assert printed.stdout_bytes == again.stdout_bytes == (tmp_path / "a.json").read_bytes()
+    document = read_json(tmp_path / "a.json", "plan.schema.json")
+    assert [(one["patients"], one["maps"]) for one in document["designs"]] == [(12, 1), (12, 3)]
+    assert [(one["from_maps"], one["to_maps"]) for one in document["gains"]] == [(1, 3)]
+    assert document["research_use"] == RESEARCH_USE
+
+
+def test_the_text_names_designs_and_gains() -> None:
+    lines = plan(*SMALL).stdout.splitlines()
+    assert any("12 patients, from 1 to 3 maps" in line for line in lines)
+    assert lines[-1] == RESEARCH_USE
+    assert max(map(len, lines)) < 150
+
+
+def test_a_pilot_gives_the_errors() -> None:
+    pilot = ("--pilot", DEMO / "trial.csv", "--excision", DEMO / "excision.csv")
+    errors = json.loads(plan(*SMALL, *pilot, "--json").stdout)["errors"]
+    assert errors["map_sd"] == pytest.approx(0.15, rel=0.1)  # what the generator of the demo drew
+    assert errors["other_miss"] == pytest.approx(1 / 25)
+
+
+def test_refusals_name_the_way_out() -> None:
+    assert isinstance(plan(*SMALL, "--pilot", DEMO / "trial.csv").exception, UsageError)
+    pilot = ("--pilot", DEMO / "trial.csv", "--excision", DEMO / "excision.csv")
+    error = plan(*SMALL, *pilot, "--against", "mri").exception
+    assert isinstance(error, BadDataError)
+    assert "choose one with --against" in str(error)
+    assert plan("--patients", 7).exit_code == 2

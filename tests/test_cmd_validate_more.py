@@ -1,0 +1,273 @@
+"""`validate` beyond the plain table: wide tables, estimates, protocols, intervals, the page and the paper's check."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import tactile_bayes
+from tactile_bayes.commands.validate import command
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.presets import RESEARCH_USE
+
+DEMO = Path(tactile_bayes.__file__).parent / "demo"
+TRIAL, EXCISION = DEMO / "trial.csv", DEMO / "excision.csv"
+
+
+def validate(*args: object) -> Result:
+    return CliRunner().invoke(command, [str(arg) for arg in args])
+
+
+def document(*args: object) -> dict:
+    result = validate(*args, "--json")
+    assert result.exit_code == 0, (result.output, result.exception)
+    return json.loads(result.stdout)
+
+
+def refusal(*args: object) -> str:
+    error = validate(*args).exception
+    assert isinstance(error, BadDataError | UsageError), error
+    assert "\n" not in str(error)
+    return str(error)
+
+
+WIDE = (
+    "record_id,ex_mm,us_cm,map1,map2,map1_low,map1_high\nP1,10,1.2,11,12,9,14\nP2,20,NV,19,,15,24\nP3,15,,16,14,12,20\n"
+)
+MAPPING = """
+patient = "record_id"
+not_detected = ["NV"]
+[excision]
+size = "ex_mm"
+[[reading]]
+modality = "ultrasound"
+size = "us_cm"
+unit = "cm"
+[[reading]]
+modality = "tactile"
+size = "map1"
+low = "map1_low"
+high = "map1_high"
+probability = 0.9
+[[reading]]
+modality = "tactile"
+replicate = 2
+size = "map2"
+"""
+
+
+def wide(folder: Path, table: str = WIDE, mapping: str = MAPPING) -> tuple[object, ...]:
+    (folder / "wide.csv").write_text(table)
+    (folder / "map.toml").write_text(mapping)
+    return folder / "wide.csv", "--excision", folder / "wide.csv", "--columns", folder / "map.toml"
+
+
+def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
+    found = document(*wide(tmp_path))["modalities"]
+    assert (found["ultrasound"]["n"], found["ultrasound"]["detected"], found["ultrasound"]["masses_not_done"]) == (
+        2,
+        1,
+        1,
+    )
+    assert found["ultrasound"]["mape_detected_percent"] == pytest.approx(20)  # 1.2 cm of 10 mm
+    assert found["tactile"]["readings"] == 5
+    assert found["tactile"]["coverage"][0]["probability"] == 0.9
+
+
+@pytest.mark.parametrize(
+    ("table", "mapping", "words"),
+    [
+        (WIDE.replace("1.2", "0"), MAPPING, 'line 2, column us_cm: is 0; does 0 mean that the mass was not found'),
+        (WIDE.replace("1.2", "about 1"), MAPPING, "line 2, column us_cm: 'about 1' is not a number"),
+        (WIDE.replace("P2", "P1"), MAPPING, "stands on line 2 already"),
+        (WIDE.replace("P2", ""), MAPPING, "line 3"),
+        (WIDE, MAPPING.replace("map2", "map3"), "column map3: is missing"),
+        (WIDE, MAPPING.replace("probability = 0.9", ""), "without probability"),
+        (WIDE, MAPPING + "colour = 1\n", "map.toml"),
+        (WIDE, "patient = [", "is not TOML"),
+    ],
+)  # fmt: skip
+def test_a_wide_tables_faults_are_named(tmp_path: Path, table: str, mapping: str, words: str) -> None:
+    assert words in refusal(*wide(tmp_path, table, mapping))
+
+
+def estimates(folder: Path, size: dict | None) -> Path:
+    quantity = dict.fromkeys(
+        ("min_size_mm", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm", "centre_mm", "angle_deg",
+         "background", "noise_sd", "detected_probability", "variance_share")
+    )  # fmt: skip
+    made = {"schema": "tactile-bayes/estimate/1", "status": "estimate" if size else "no_estimate", "reason": "",
+            "max_size_mm": size, **quantity, "diagnostics": {}, "candidates": [], "left_out": [], "prior": {},
+            "research_use": "x", "provenance": {}}  # fmt: skip
+    path = folder / "estimate.json"
+    path.write_text(json.dumps(made))
+    return path
+
+
+SIZE = {"median": 12.0, "mean": 12.1, "sd": 1.0, "low": 10.0, "high": 14.0, "probability": 0.9, "kind": "eti"}
+
+
+def with_posterior(folder: Path, cells: str) -> tuple[object, ...]:
+    (folder / "t.csv").write_text(
+        f"patient,mass,modality,replicate,size_mm,status,posterior\nP1,1,tactile,1,{cells}\nP2,1,tactile,1,9,detected,\n"
+    )
+    (folder / "e.csv").write_text("patient,mass,ex_vivo_mm\nP1,1,10\nP2,1,9\n")
+    return folder / "t.csv", "--excision", folder / "e.csv"
+
+
+def test_an_estimates_size_and_interval_are_read_directly(tmp_path: Path) -> None:
+    path = estimates(tmp_path, SIZE)
+    found = document(*with_posterior(tmp_path, ",detected,estimate.json"))
+    tactile = found["modalities"]["tactile"]
+    assert tactile["mape_percent"] == pytest.approx(10)
+    assert (tactile["coverage"][0]["probability"], tactile["coverage"][0]["covered"]) == (0.9, 1)
+    roles = {one["role"]: one["sha256"] for one in found["provenance"]["inputs"]}
+    assert roles["posterior_1"] == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_posteriors_draws_are_read_directly(tmp_path: Path) -> None:
+    import netCDF4
+
+    draws = np.random.default_rng(0).lognormal(math.log(12), 0.1, (2, 500))
+    with netCDF4.Dataset(tmp_path / "p.nc", "w") as dataset:
+        group = dataset.createGroup("posterior")
+        for name, length in (("chain", 2), ("draw", 500)):
+            group.createDimension(name, length)
+        group.createVariable("max_size_mm", "f8", ("chain", "draw"))[:] = draws
+    tactile = document(*with_posterior(tmp_path, ",detected,p.nc"))["modalities"]["tactile"]
+    assert tactile["mape_percent"] == pytest.approx(100 * (np.median(draws) / 10 - 1) / 2)
+    assert tactile["coverage"][0]["probability"] == 0.95
+
+
+@pytest.mark.parametrize(
+    ("size", "cells", "words"),
+    [
+        (SIZE, "12,detected,estimate.json", "line 2, column size_mm: is 12 beside a posterior"),
+        (SIZE, ",not_detected,estimate.json", "with a size while status is not_detected"),
+        (None, ",detected,estimate.json", "without a size while status is detected"),
+        (SIZE, ",detected,gone.json", "cannot be read"),
+        (SIZE, ",detected,t.csv", "neither JSON nor netCDF"),
+    ],
+)
+def test_a_posterior_that_contradicts_its_row_is_refused(tmp_path: Path, size: dict, cells: str, words: str) -> None:
+    estimates(tmp_path, size)
+    assert words in refusal(*with_posterior(tmp_path, cells))
+
+
+def test_a_map_without_an_estimate_is_a_mass_not_found(tmp_path: Path) -> None:
+    estimates(tmp_path, None)
+    tactile = document(*with_posterior(tmp_path, ",not_detected,estimate.json"))["modalities"]["tactile"]
+    assert (tactile["n"], tactile["detected"]) == (2, 1)
+
+
+def test_a_protocol_fixes_the_analysis_and_its_hash_is_reported(tmp_path: Path) -> None:
+    protocol = tmp_path / "protocol.toml"
+    protocol.write_text('title = "Primary: MAPE, tactile against ultrasound"\n[analysis]\nintervals = "percentile"\n')
+    found = document(TRIAL, "--excision", EXCISION, "--protocol", protocol)
+    assert found["provenance"]["settings"]["intervals"] == "percentile"
+    roles = {one["role"]: one["sha256"] for one in found["provenance"]["inputs"]}
+    assert roles["protocol"] == hashlib.sha256(protocol.read_bytes()).hexdigest()
+    words = refusal(TRIAL, "--excision", EXCISION, "--protocol", protocol, "--intervals", "bca")
+    assert "--intervals bca contradicts" in words
+    protocol.write_text("[analysis]\nlevel = 3\n")
+    assert "protocol.toml" in refusal(TRIAL, "--excision", EXCISION, "--protocol", protocol)
+
+
+def test_other_intervals_change_intervals_and_no_figure() -> None:
+    plain = document(TRIAL, "--excision", EXCISION)["modalities"]["tactile"]
+    for method in ("percentile", "bca"):
+        options = ("--intervals", method, "--resamples", 400)
+        other = document(TRIAL, "--excision", EXCISION, *options)["modalities"]["tactile"]
+        assert other["mape_percent"] == plain["mape_percent"]
+        assert other["mape_percent_interval"] != plain["mape_percent_interval"]
+        assert other["mape_percent_interval"] == pytest.approx(plain["mape_percent_interval"], rel=0.15)
+
+
+def test_the_check_of_intervals_is_reported() -> None:
+    found = document(TRIAL, "--excision", EXCISION, "--check-intervals", 200)["interval_check"]
+    assert found["tactile"]["trials"] == 200
+    assert 0.88 < found["tactile"]["share"] <= 1
+    assert "held the true" in validate(TRIAL, "--excision", EXCISION, "--check-intervals", 50).stdout
+
+
+def test_the_page_needs_nothing_else_and_is_the_same_every_time(tmp_path: Path) -> None:
+    for name in ("a.html", "b.html"):
+        assert validate(TRIAL, "--excision", EXCISION, "--html", tmp_path / name).exit_code == 0
+    page = (tmp_path / "a.html").read_text()
+    assert page == (tmp_path / "b.html").read_text()
+    assert not re.search(r"https?://|<script|<link|src=\"(?!data:)|url\(|@import", page)
+    assert page.count("data:image/png;base64,") == 3
+    assert hashlib.sha256(TRIAL.read_bytes()).hexdigest() in page
+    for words in ("synthetic", "Passing-Bablok", "p Holm", "ICC", "MAPE %", RESEARCH_USE):
+        assert words in page
+    assert "exists" in refusal(TRIAL, "--excision", EXCISION, "--html", tmp_path / "a.html")
+
+
+def test_the_page_stands_what_has_almost_nothing(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(
+        "patient,mass,modality,replicate,size_mm,status\nP1,1,cbe,1,,not_detected\nP1,1,<b>,1,9,detected\n".replace(
+            "<b>", "mri"
+        )
+    )
+    (tmp_path / "e.csv").write_text("patient,mass,ex_vivo_mm\nP1,1,10\n")
+    result = validate(tmp_path / "t.csv", "--excision", tmp_path / "e.csv", "--html", tmp_path / "r.html")
+    assert result.exit_code == 0, result.exception
+    assert "nan" not in (tmp_path / "r.html").read_text().replace("nance", "").lower().split("base64")[0]
+
+
+def paper_trial(folder: Path) -> tuple[object, ...]:
+    """Sizes whose percent errors average 17, 34 and 47 and whose lines through zero have slopes 1.04, 0.90 and 1.26.
+
+    Of the 25 masses every second errs up by p, the others down by q (one missed by each of two modalities): the mean
+    error and the slope are two linear equations for p and q.
+    """
+    e = 8.0 + np.arange(1, 26)
+    rows, up = ["patient,mass,modality,replicate,size_mm,status"], np.arange(25) % 2 == 0
+    for name, mape, slope, missed in (
+        ("tactile", 0.17, 1.04, None),
+        ("ultrasound", 0.34, 0.90, 9),
+        ("cbe", 0.47, 1.26, 3),
+    ):
+        found = np.arange(25) != missed
+        plus, minus = e[up & found], e[~up & found]
+        target = [25 * mape - (missed is not None), slope * e @ e - e[found] @ e[found]]
+        p, q = np.linalg.solve([[len(plus), len(minus)], [plus @ plus, -(minus @ minus)]], target)
+        assert p > 0
+        assert 0 < q < 1
+        for i, size in enumerate(e * np.where(up, 1 + p, 1 - q)):
+            cells = f"{size:.12g},detected" if found[i] else ",not_detected"
+            rows.append(f"P{min(i, 23):02d},{1 + (i == 24)},{name},1,{cells}")
+    (folder / "t.csv").write_text("\n".join(rows) + "\n")
+    keys = [f"P{min(i, 23):02d},{1 + (i == 24)},{size:g}" for i, size in enumerate(e)]
+    (folder / "e.csv").write_text("patient,mass,ex_vivo_mm\n" + "\n".join(keys) + "\n")
+    return folder / "t.csv", "--excision", folder / "e.csv"
+
+
+def test_the_papers_figures_give_a_ratio_of_two_and_not_more(tmp_path: Path) -> None:
+    found = document(*paper_trial(tmp_path))
+    modalities = found["modalities"]
+    for name, mape, slope in (("tactile", 17, 1.04), ("ultrasound", 34, 0.90), ("cbe", 47, 1.26)):
+        assert modalities[name]["mape_percent"] == pytest.approx(mape)
+        assert modalities[name]["slope_through_origin"] == pytest.approx(slope)
+    ratio = found["mape_ratio_to_tactile"]["ultrasound"]
+    assert ratio["ratio"] == pytest.approx(2.0)
+    assert ratio["ratio_detected"] == pytest.approx(1.84, abs=0.005)
+    text = validate(*paper_trial(tmp_path)).stdout
+    assert re.search(r"ultrasound: MAPE 2\.00 \[.*\] times the tactile one's; over masses found, 1\.84 \[", text)
+    assert "more than twice" not in text
+
+
+@pytest.mark.slow
+def test_the_model_of_the_next_mass_is_reported() -> None:
+    found = document(TRIAL, "--excision", EXCISION, "--bayes")["next_mass"]
+    assert found["probability_less_error"]["tactile errs less than ultrasound"] > 0.9
+    assert all(one["rhat"] <= 1.01 for one in found["diagnostics"].values())
+    low, high = (found["modalities"]["tactile"]["mape_percent"][key] for key in ("low", "high"))
+    assert 5 < low < high < 40
