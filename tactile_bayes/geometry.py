@@ -138,7 +138,7 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         zero or along the normal.
     """
     variances, axes = np.linalg.eigh(covariance_mm2)
-    spread = np.sqrt(np.clip(variances, 0.0, None))[::-1]
+    spread = np.sqrt(np.maximum(variances, 0.0))[::-1]
     if not spread[1] > 0.05 * spread[0] or not spread[1] > 1e-9:
         raise BadDataError(
             f"the taxel centres lie on a line (spread {spread[0]:.3g} by {spread[1]:.3g} mm)",

@@ -174,6 +174,8 @@ class MapAccumulator:
             )
         if self._kept is not None:
             self._kept.append((counts, poses))
+        if len(counts) <= _PORTION:
+            return self._add(counts, poses) if len(counts) else 0
         return sum(self._add(counts[part], poses.part(part)) for part in chunks(len(counts), _PORTION))
 
     def _add(self, counts: CountArray, poses: FramePoses) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,19 +40,26 @@ class Projection:
         Where the taxels' middle lies on the lattice, in cells; half a cell is added, so that cell k is centred on k.
     cell_mm
         Side of a cell.
+    extent_mm : (3,) array
+        How far the taxels reach from their middle along each axis; found from them when it is not given.
     """
 
     taxels_mm: FloatArray
     turn: FloatArray
     shift: FloatArray
     cell_mm: float
+    extent_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        if not self.extent_mm.any():
+            object.__setattr__(self, "extent_mm", np.abs(self.taxels_mm).max(axis=1, initial=0.0))
 
     def __len__(self) -> int:
         return len(self.turn)
 
     def part(self, frames: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Projection:
         """Some of the frames."""
-        return Projection(self.taxels_mm, self.turn[frames], self.shift[frames], self.cell_mm)
+        return Projection(self.taxels_mm, self.turn[frames], self.shift[frames], self.cell_mm, self.extent_mm)
 
     def block(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """First row and column, and shape, of a block of the lattice that holds every reading.
@@ -62,12 +69,13 @@ class Projection:
         BadDataError
             When the block would be so wide that cells could not be told exactly.
         """
-        reach = np.abs(self.turn) @ np.abs(self.taxels_mm).max(axis=1, initial=0.0)
-        low = np.floor((self.shift - reach).min(axis=0))
-        wide = np.floor((self.shift + reach).max(axis=0)) - low + 1
-        if max(float(np.abs(low).max()), float(wide.max())) > _MOST_CELLS:
-            refuse_vast(int(wide[1] + abs(low[1])), int(wide[0] + abs(low[0])), self.cell_mm, most=_MOST_CELLS)
-        return (int(low[1]), int(low[0])), (int(wide[1]), int(wide[0]))
+        reach = np.abs(self.turn) @ self.extent_mm
+        left, top = np.floor((self.shift - reach).min(axis=0)).tolist()
+        right, bottom = np.floor((self.shift + reach).max(axis=0)).tolist()
+        columns, rows = right - left + 1, bottom - top + 1
+        if max(abs(left), abs(top), columns, rows) > _MOST_CELLS:
+            refuse_vast(int(rows + abs(top)), int(columns + abs(left)), self.cell_mm, most=_MOST_CELLS)
+        return (int(top), int(left)), (int(rows), int(columns))
 
     def flat(self, first: tuple[int, int], shape: tuple[int, int]) -> IntArray:
         """(n, k) indices of the readings' cells in a block given by its first row and column and its shape."""
@@ -101,6 +109,7 @@ class Projector:
         self._middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
         centres = apply(tracker_from_head, head.surface_mm[taxels]) - self._middle
         self._taxels = np.ascontiguousarray(_rounded(centres, _TAXEL_STEP_MM).T)
+        self._extent = np.abs(self._taxels).max(axis=1, initial=0.0)
 
     def at(self, poses: FramePoses) -> Projection:
         """Projection of the frames at `poses` onto the cells of the plane."""
@@ -117,6 +126,7 @@ class Projector:
             _rounded(turn / self._cell_mm, _TURN_STEP),
             _rounded(shift / self._cell_mm + 0.5, _SHIFT_STEP),
             self._cell_mm,
+            self._extent,
         )
 
 
