@@ -194,7 +194,7 @@ class Landmarks:
     ----------
     sternal_notch_mm, xiphoid_mm : (3,) arrays
     spread_mm
-        Largest distance between touches of one landmark, where they were touched again; None where they were not.
+        Largest distance of an earlier touch from the last one, where a landmark was touched again; else None.
     """
 
     sternal_notch_mm: FloatArray

@@ -299,3 +299,21 @@ def test_a_session_that_may_name_a_person_is_refused(
     with pytest.raises(BadDataError, match=words):
         write_scan(tmp_path / "s.mcap", named, provenance=MADE)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_landmark_touched_again_counts_last_and_tells_its_spread(scan: Scan, tmp_path: Path) -> None:
+    path = tmp_path / "again.mcap"
+    with path.open("wb") as stream:
+        writer = ScanWriter(
+            stream,
+            head=scan.head,
+            element_calibration=scan.element_calibration,
+            session=scan.session,
+            provenance=Provenance("test", {}),
+        )
+        for name, x_mm in (("xiphoid", 0.0), ("sternal_notch", 1.0), ("sternal_notch", 5.0)):
+            writer.add_landmark(name, np.array([x_mm, 0.0, 3.0]), device_ns=0, host_ns=0)
+        writer.finish()
+    marks = read_scan(path).landmarks
+    assert marks is not None
+    assert (marks.sternal_notch_mm[0], marks.spread_mm) == (5.0, 4.0)

@@ -372,14 +372,16 @@ def _pose_values(body: bytes) -> tuple[float, ...]:
 
 
 def _landmarks(records: McapRecords) -> Landmarks | None:
-    """The last touch of each landmark; None unless all were touched."""
-    points = {}
+    """The last touch of each landmark, and how far the others lie from it; None unless all were touched."""
+    points, apart = {}, []
     for name in LANDMARK_NAMES:
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
         if not touches:
             return None
-        points[f"{name}_mm"] = np.array(_pose_values(touches[-1][1])[:3])
-    return Landmarks(**points)
+        places = np.array([_pose_values(touch[1])[:3] for touch in touches])
+        points[f"{name}_mm"] = places[-1]
+        apart += np.linalg.norm(places[:-1] - places[-1], axis=1).tolist()
+    return Landmarks(**points, spread_mm=max(apart) if apart else None)
 
 
 def _decode(kind: Any, body: bytes) -> Any:
