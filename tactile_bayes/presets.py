@@ -26,5 +26,6 @@ CELL_PER_SIGMA: Final = 0.75
 FIT_RADIUS_MM: Final = 20.0
 
 NORMALISE: Final = ("mean", "gain", "none")
-METHODS: Final = ("optimise", "laplace", "ensemble")
+METHODS: Final = ("optimise", "laplace", "importance", "ensemble")
+NOISE: Final = ("independent", "field")
 INTERVAL: Final = 0.95

@@ -13,6 +13,9 @@ from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# As the program does, and before a test module imports numpy: its threads would fight with the tests' own processes.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # The same examples at every run; `HYPOTHESIS_PROFILE=ci` looks at more of them.
 settings.register_profile("default", max_examples=20, derandomize=True, deadline=None)
 settings.register_profile(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.presets import FIT_RADIUS_MM, NORMALISE
+from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -47,15 +47,22 @@ def command() -> None:
     show_default=True,
     help="Radius about the lump within which they were fitted (declared).",
 )
+@click.option(
+    "--noise",
+    type=click.Choice(NOISE),
+    default="independent",
+    show_default=True,
+    help="The errors they were fitted under (declared); least squares is independent.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
 def size(
-    table: Path, output: Path, normalise: str, background: str, fit_radius_mm: float, seed: int, force: bool
+    table: Path, output: Path, normalise: str, background: str, fit_radius_mm: float, noise: str, seed: int, force: bool
 ) -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms.
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
-    stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The three
+    stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The
     declared options say how the table's maps were made; `estimate` refuses a map made otherwise.
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
@@ -74,14 +81,14 @@ def size(
 
     refuse_existing(output, force=force)
     rows = read_table(table, "size_table.table.json")
-    recipe = Recipe(normalise, background, fit_radius_mm, declared=True)
+    recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise)
     rng = np.random.default_rng(seed)
     try:
         with progress_bar("effective draws") as progress:
             calibration = learn_size_calibration(size_table(rows), recipe=recipe, rng=rng, progress=progress)
     except BadDataError as error:
         raise error.at(table) from None
-    settings = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm}
+    settings = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, calibration, provenance=provenance, force=force)
     click.echo(calibration_text(calibration), nl=False)

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.presets import METHODS, RESEARCH_USE
 
 EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.toml", "empty.toml")
 
@@ -26,7 +26,7 @@ EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.tom
 )
 @click.option(
     "--method",
-    type=click.Choice(["optimise", "laplace", "ensemble"]),
+    type=click.Choice(METHODS),
     default="ensemble",
     show_default=True,
     help="Of the estimate.",

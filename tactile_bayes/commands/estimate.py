@@ -17,7 +17,7 @@ from tactile_bayes.errors import (
     TactileBayesError,
     UsageError,
 )
-from tactile_bayes.presets import FIT_RADIUS_MM, INTERVAL, METHODS
+from tactile_bayes.presets import FIT_RADIUS_MM, INTERVAL, METHODS, NOISE
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
@@ -42,6 +42,8 @@ class Settings:
     rotation: str
     centre_mm: tuple[float, float] | None
     max_steps: int | None
+    noise: str | None
+    accuracy_sd: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +63,7 @@ class Answer:
     type=click.Choice(METHODS),
     default="ensemble",
     show_default=True,
-    help="ensemble: MCMC; laplace: mode and curvature, fast; optimise: the paper's least squares.",
+    help="ensemble: MCMC; importance: weighted draws; laplace: mode, curvature; optimise: the paper's least squares.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
 @click.option(
@@ -89,6 +91,17 @@ class Answer:
 )
 @click.option("--max-steps", type=click.IntRange(min=150), help="Of the ensemble, before it gives up.")
 @click.option(
+    "--noise",
+    type=click.Choice(NOISE),
+    help="independent: least squares, correlation judged after; field: correlated errors in the model. "
+    "As the calibration's, if not given.",
+)
+@click.option(
+    "--accuracy-sd",
+    type=click.FloatRange(min=0.001, max=0.5),
+    help="Of importance: error of interval ends, in posterior SDs; 0.02 if not given.",
+)
+@click.option(
     "--workers", type=click.IntRange(min=1), default=1, show_default=True, help="Processes, for several maps."
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Send several maps to a dask scheduler (extra [cluster]).")
@@ -112,6 +125,8 @@ def command(
     rotation: str,
     centre_mm: tuple[float, float] | None,
     max_steps: int | None,
+    noise: str | None,
+    accuracy_sd: float | None,
     workers: int,
     scheduler: str | None,
     force: bool,
@@ -126,7 +141,17 @@ def command(
     Example: tactile-bayes estimate map.nc --size-calibration size.json --figure size.png
     """
     settings = Settings(
-        size_calibration, method, seed, interval, background, fit_radius_mm, rotation, centre_mm, max_steps
+        size_calibration,
+        method,
+        seed,
+        interval,
+        background,
+        fit_radius_mm,
+        rotation,
+        centre_mm,
+        max_steps,
+        noise,
+        accuracy_sd,
     )
     outputs = {"output": output, "figure": figure, "map figure": map_figure}
     _check_outputs([path for path in outputs.values() if path], maps, size_calibration, force=force)
@@ -234,6 +259,8 @@ def _run(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMap, 
         "fit_radius_mm": options.fit.radius_mm,
         "rotation": settings.rotation,
         "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
+        "noise": options.fit.noise,
+        "accuracy_sd": settings.accuracy_sd,
     }
     return tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed)
 
@@ -243,10 +270,14 @@ def _options(settings: Settings, calibration: SizeCalibration | None) -> Estimat
     from tactile_bayes.posterior.estimate import EstimateOptions
     from tactile_bayes.posterior.fit import FitOptions
 
-    background = settings.background or (calibration.recipe.background if calibration else "fixed")
+    noise = settings.noise or (calibration.recipe.noise if calibration else "independent")
+    printed = "free" if noise == "field" else "fixed"
+    background = settings.background or (calibration.recipe.background if calibration else printed)
     radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
-    fit = FitOptions(background, radius, settings.rotation, settings.centre_mm)
-    return EstimateOptions(method=settings.method, fit=fit, max_steps=settings.max_steps)
+    fit = FitOptions(background, radius, settings.rotation, settings.centre_mm, noise)
+    return EstimateOptions(
+        method=settings.method, fit=fit, max_steps=settings.max_steps, accuracy_sd=settings.accuracy_sd
+    )
 
 
 def _answer(tactile_map: TactileMap, estimate: Estimate, provenance: Provenance, settings: Settings) -> Answer:

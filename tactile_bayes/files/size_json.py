@@ -31,6 +31,7 @@ def write_size_calibration(
             "background": calibration.recipe.background,
             "radius_mm": calibration.recipe.radius_mm,
             "declared": calibration.recipe.declared,
+            "noise": calibration.recipe.noise,
         },
         "axes": list(calibration.axes),
         "residual_correlation": _number(calibration.residual_correlation),

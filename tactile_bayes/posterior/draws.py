@@ -21,7 +21,7 @@ class ParameterDraws:
     ----------
     theta : (chain, draw, p) array
     method
-        ``"optimise"``, ``"laplace"`` or ``"ensemble"``.
+        One of `presets.METHODS`.
     diagnostics
         Figures of the method (R-hat, effective draws, evaluations...), for the report.
     """
@@ -38,7 +38,7 @@ class ParameterDraws:
     @property
     def effective_draws(self) -> float:
         """Draws this set is worth for an end point: the smallest tail ESS, or all when they are independent."""
-        return float(self.diagnostics.get("ess_tail", len(self.flat)))
+        return float(min(self.diagnostics.get("ess_tail", np.inf), len(self.flat)))
 
 
 def student_draws(

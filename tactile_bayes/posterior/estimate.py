@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
@@ -36,15 +36,17 @@ class EstimateOptions:
     Parameters
     ----------
     method
-        ``"optimise"``, ``"laplace"`` or ``"ensemble"``.
+        One of `presets.METHODS`.
     fit
-        Background, window, rotation, centre.
+        Background, window, rotation, centre, noise.
     prior
         On the bump.
     least_probability
         Below this probability of a lump there is no estimate.
     max_steps
         Of the ensemble; None for its default.
+    accuracy_sd
+        Of interval ends, in posterior SDs, for importance sampling; None for its default.
     """
 
     method: str = "ensemble"
@@ -52,6 +54,7 @@ class EstimateOptions:
     prior: BumpPrior = field(default_factory=BumpPrior)
     least_probability: float = DETECTED
     max_steps: int | None = None
+    accuracy_sd: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,11 +126,12 @@ def estimate_map(
     NotConvergedError
         When the method does not converge.
     """
+    _check_options(options)
     if calibration is not None:
         check_recipe(tactile_map, calibration, options.fit)
     if not tactile_map.covered.any():
         return Estimate("no_estimate", "the map has no covered cell")
-    candidates = tuple(find_bump(tactile_map, options.fit))
+    candidates = tuple(find_bump(tactile_map, _search_options(tactile_map, options.fit)))
     if not candidates:
         return Estimate("no_estimate", "nothing rises above the background")
     chosen = candidates[-1]
@@ -138,11 +142,16 @@ def estimate_map(
     if detection.probability < options.least_probability:
         reason = f"no lump detected (probability {detection.probability:.2g}, needed {options.least_probability:g})"
         return Estimate("no_estimate", reason, detection=detection, candidates=candidates)
-    fit, odds = _choose_rotation(tactile_map, fit, options)
-    draws = _draw(fit, options, rng=rng, progress=progress)
-    posterior = _map_posterior(fit, draws, options, rng=rng)
+    if options.fit.noise == "field":
+        draws, posterior, noise = _under_field(fit, options, rng=rng, progress=progress)
+    else:
+        fit, odds = _choose_rotation(tactile_map, fit, options)
+        draws = _draw(fit, options, rng=rng, progress=progress)
+        posterior = _map_posterior(fit, draws, options, rng=rng)
+        noise = _judged_noise(fit, odds)
     size = _size(posterior, calibration, rng=rng)
-    diagnostics = _diagnostics(tactile_map, fit, draws, calibration, odds=odds)
+    diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | noise
+    diagnostics["method"] = draws.method
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"Eq 6 gives no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         return Estimate("no_estimate", reason, detection=detection, candidates=candidates, diagnostics=diagnostics)
@@ -157,20 +166,42 @@ def estimate_map(
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
-        left_out=_left_out(fit, options, calibration, odds),
+        left_out=_left_out(options, calibration, diagnostics),
     )
 
 
 def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration, fit: FitOptions) -> None:
     """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
     differs = calibration.recipe.differences(
-        normalise=tactile_map.recipe.normalise, background=fit.background, radius_mm=fit.radius_mm
+        normalise=tactile_map.recipe.normalise,
+        background=fit.background,
+        radius_mm=fit.radius_mm,
+        noise=fit.noise,
     )
     if differs:
         raise BadDataError(
             f"the size calibration was learned by another recipe: {'; '.join(differs)}",
             way_out="build and fit the map as the calibration's maps were, or learn a calibration for this recipe",
         )
+
+
+def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:
+    """Options of the least squares that looks for a lump.
+
+    Under a noise field it only has to find the place: there the known level holds it better than a free one, which a
+    rib at the window's rim can lift.
+    """
+    known = fit.noise == "field" and tactile_map.background is not None
+    return replace(fit, background="fixed") if known else fit
+
+
+def _check_options(options: EstimateOptions) -> None:
+    if options.fit.noise != "field":
+        return
+    if options.method == "optimise":
+        raise UsageError("optimise is the paper's least squares and has no noise field; choose another --method")
+    if options.fit.background != "free":
+        raise UsageError("a noise field takes level and tilt with it; give --background free")
 
 
 def _fault_reason(candidates: tuple[Candidate, ...]) -> str:
@@ -195,10 +226,14 @@ def _draw(
     scale = np.sqrt(np.diag(fit.covariance))
     if options.method == "laplace":
         return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
+    mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=scale)
+    if options.method == "importance":
+        from tactile_bayes.posterior.importance import importance, importance_options
+
+        return importance(target, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
     if options.method == "ensemble":
         from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
 
-        mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=scale)
         settings = EnsembleOptions()
         if options.max_steps is not None:
             settings = replace(settings, max_steps=options.max_steps)
@@ -212,8 +247,9 @@ def _map_posterior(
     theta = draws.theta
     sigma_x, sigma_y, angle = fit.bump.widths(theta)
     target = fit.target(options.prior)
-    # two of three methods are linear about the mode: for them the exact figure would cost more than all the rest
-    excess = target.excess(draws.flat) if options.method == "ensemble" else fit.linear_excess(draws.flat)
+    # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
+    exact = options.method in ("ensemble", "importance")
+    excess = target.excess(draws.flat) if exact else fit.linear_excess(draws.flat)
     noise = target.draw_noise_sd(excess, rng).reshape(theta.shape[:2])
     return MapPosterior(
         amplitude=theta[..., 0],
@@ -242,40 +278,71 @@ def _size(
     )
 
 
-def _diagnostics(
-    tactile_map: TactileMap,
-    fit: BumpFit,
-    draws: ParameterDraws,
-    calibration: SizeCalibration | None,
-    *,
-    odds: float | None,
-) -> dict[str, object]:
-    sigma_x, sigma_y, _ = fit.widths()
-    outside: list[str] = []
-    if calibration is not None:
-        amplitude = float(fit.theta[0])
-        outside += [f"x: {text}" for text in calibration.x.outside(sigma_x, amplitude)]
-        outside += [f"y: {text}" for text in calibration.y.outside(sigma_y, amplitude)]
+def _under_field(
+    fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Callable[[int, int], None] | None
+) -> tuple[ParameterDraws, MapPosterior, dict[str, object]]:
+    """The posterior under correlated errors, started from the least-squares bump."""
+    from tactile_bayes.posterior.field_posterior import choose_field_fit, draw_field, shape_draws
+
+    chosen, odds = choose_field_fit(fit, options.prior, options.fit, least_odds=ROTATION_ODDS)
+    draws = draw_field(
+        chosen,
+        options.method,
+        rng=rng,
+        accuracy_sd=options.accuracy_sd,
+        max_steps=options.max_steps,
+        progress=progress,
+    )
+    sigma_x, sigma_y, angle = shape_draws(chosen, draws.theta)
+    amplitude, level, noise_sd = (v.reshape(sigma_x.shape) for v in chosen.target.draw_linear(draws.flat, rng))
+    posterior = MapPosterior(
+        amplitude=amplitude,
+        sigma_x_mm=sigma_x,
+        sigma_y_mm=sigma_y,
+        x_mm=draws.theta[..., 2],
+        y_mm=draws.theta[..., 3],
+        angle_rad=angle,
+        background=level,
+        noise_sd=noise_sd,
+    )
+    figures: dict[str, object] = {"rotation_odds": odds, "rotated": chosen.rotated, "noise": "field"}
+    return draws, posterior, figures | chosen.target.field_summary(chosen.mode)
+
+
+def _judged_noise(fit: BumpFit, odds: float | None) -> dict[str, object]:
     return {
-        "method": draws.method,
-        **draws.diagnostics,
-        "cells": len(fit.cells),
+        "noise": "independent",
         "noise_inflation": fit.errors.inflation,
         "noise_dof": fit.errors.dof,
-        "covered_share": fit.covered_share,
         "level_offset": level_offset(fit.fit.residual, weight=fit.weight),
         "rotation_odds": odds,
         "rotated": fit.bump.rotated,
+    }
+
+
+def _diagnostics(
+    tactile_map: TactileMap, fit: BumpFit, posterior: MapPosterior, calibration: SizeCalibration | None
+) -> dict[str, object]:
+    medians = (np.median(v) for v in (posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.amplitude))
+    sigma_x, sigma_y, amplitude = (float(value) for value in medians)
+    outside: list[str] = []
+    if calibration is not None:
+        outside += [f"x: {text}" for text in calibration.x.outside(sigma_x, amplitude)]
+        outside += [f"y: {text}" for text in calibration.y.outside(sigma_y, amplitude)]
+    return {
+        "cells": len(fit.cells),
+        "covered_share": fit.covered_share,
         "coarse_cells": tactile_map.recipe.cell_mm > COARSE_CELL * min(sigma_x, sigma_y),
         "outside_calibration": outside,
     }
 
 
 def _left_out(
-    fit: BumpFit, options: EstimateOptions, calibration: SizeCalibration | None, odds: float | None
+    options: EstimateOptions, calibration: SizeCalibration | None, diagnostics: Mapping[str, object]
 ) -> tuple[str, ...]:
     notes = []
-    if odds is not None and not fit.bump.rotated:
+    odds = diagnostics["rotation_odds"]
+    if odds is not None and not diagnostics["rotated"]:
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
     if options.fit.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")

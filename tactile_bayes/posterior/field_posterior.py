@@ -14,7 +14,8 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import FitCells
 from tactile_bayes.posterior.collapsed import CollapsedTarget
 from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.importance import ImportanceOptions, importance
+from tactile_bayes.posterior.fit import WIDEST_IN_RADII, BumpFit, FitOptions
+from tactile_bayes.posterior.importance import importance, importance_options
 from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
 
 START_SCALE = np.array([0.06, 0.06, 0.3, 0.3, 0.06])
@@ -82,6 +83,37 @@ def fit_field(
     return FieldFit(target, mode, covariance)
 
 
+def choose_field_fit(
+    least_squares: BumpFit, prior: BumpPrior, options: FitOptions, *, least_odds: float
+) -> tuple[FieldFit, float | None]:
+    """Fit from the least-squares bump, turned only where the map favours it by `least_odds` (or as the options say).
+
+    Returns
+    -------
+    fit
+    odds
+        Of a turned ellipse against one along the head's axes; None when the options decided.
+    """
+    p, q, r = (float(v) for v in least_squares.bump.shape_parameters(least_squares.theta))
+    start = np.array([p + q, p - q, least_squares.theta[1], least_squares.theta[2], r])
+
+    def fit(rotated: bool) -> FieldFit:
+        return fit_field(
+            least_squares.cells,
+            start,
+            prior=prior,
+            rotated=rotated,
+            widest_mm=WIDEST_IN_RADII * options.radius_mm,
+            radius_mm=options.radius_mm,
+        )
+
+    if options.rotation != "auto":
+        return fit(options.rotation == "on"), None
+    turned = fit(True)
+    odds = rotation_odds(turned, prior)
+    return (turned, odds) if odds > least_odds else (fit(False), odds)
+
+
 def rotation_odds(turned: FieldFit, prior: BumpPrior) -> float:
     """Bayes factor of a turned ellipse against one along the head's axes: the Savage-Dickey ratio at r = 0."""
     r, sd = float(turned.mode[4]), float(np.sqrt(turned.covariance[4, 4]))
@@ -101,8 +133,7 @@ def draw_field(
     if method == "laplace":
         return laplace(fit.target, fit.mode, scale=np.sqrt(np.diag(fit.covariance)), dof=fit.dof, rng=rng)
     if method == "importance":
-        options = ImportanceOptions() if accuracy_sd is None else ImportanceOptions(accuracy_sd=accuracy_sd)
-        return importance(fit.target, fit.mode, fit.covariance, rng=rng, options=options)
+        return importance(fit.target, fit.mode, fit.covariance, rng=rng, options=importance_options(accuracy_sd))
     from dataclasses import replace
 
     from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble

@@ -42,12 +42,16 @@ class FitOptions:
         ``"auto"`` spends a rotation only where the map asks for it; ``"off"`` and ``"on"`` decide beforehand.
     centre_mm
         Where to look, in `plane`; None takes the highest bump that can be a lump.
+    noise
+        ``"independent"``: least squares, the likelihood divided by the inflation of correlated errors.
+        ``"field"``: correlated errors in the model; level and tilt are integrated out with them.
     """
 
     background: str = "fixed"
     radius_mm: float = 20.0
     rotation: str = "auto"
     centre_mm: tuple[float, float] | None = None
+    noise: str = "independent"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,6 +41,11 @@ class ImportanceOptions:
     keep: int = INDEPENDENT_DRAWS
 
 
+def importance_options(accuracy_sd: float | None) -> ImportanceOptions:
+    """The default options, with another accuracy if one is given."""
+    return ImportanceOptions() if accuracy_sd is None else ImportanceOptions(accuracy_sd=accuracy_sd)
+
+
 def importance(
     log_density: LogDensity,
     mode: FloatArray,

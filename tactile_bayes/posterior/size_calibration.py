@@ -25,6 +25,8 @@ class Recipe:
         ``"fixed"`` or ``"free"``, as in `FitOptions`.
     radius_mm
         Radius of the fitted window.
+    noise
+        ``"independent"`` (least squares) or ``"field"``, as in `FitOptions`.
     declared
         True when somebody said so for a table made elsewhere, False when the program made the maps itself.
     """
@@ -33,13 +35,15 @@ class Recipe:
     background: str = "fixed"
     radius_mm: float = 20.0
     declared: bool = True
+    noise: str = "independent"
 
-    def differences(self, *, normalise: str, background: str, radius_mm: float) -> list[str]:
+    def differences(self, *, normalise: str, background: str, radius_mm: float, noise: str) -> list[str]:
         """What differs from another recipe, in words; empty when nothing does."""
         pairs = [
             ("normalise", self.normalise, normalise),
             ("background", self.background, background),
             ("fit radius", f"{self.radius_mm:g} mm", f"{radius_mm:g} mm"),
+            ("noise", self.noise, noise),
         ]
         return [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
 

@@ -34,7 +34,7 @@ def calibration_text(calibration: SizeCalibration) -> str:
     how = "declared" if recipe.declared else "as the maps were made here"
     lines.append(
         f"recipe ({how}): normalise {recipe.normalise}, background {recipe.background}, "
-        f"fit radius {recipe.radius_mm:g} mm"
+        f"fit radius {recipe.radius_mm:g} mm, noise {recipe.noise}"
     )
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 

@@ -31,7 +31,7 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
         on_plane = np.stack([posterior.x_mm, posterior.y_mm, np.zeros_like(posterior.x_mm)], axis=-1)
         in_patient = apply(tactile_map.patient_from_plane, on_plane)
         draws |= {"centre_patient_mm.x": in_patient[..., 0], "centre_patient_mm.y": in_patient[..., 1]}
-    if estimate.fit is not None and estimate.fit.bump.rotated:
+    if estimate.diagnostics.get("rotated"):
         draws["angle_deg"] = np.degrees(posterior.angle_rad)
     if estimate.size is not None:
         draws |= {name: getattr(estimate.size, name) for name in SIZES}

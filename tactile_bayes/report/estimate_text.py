@@ -74,6 +74,11 @@ def _findings(estimate: Estimate) -> list[str]:
         found = estimate.draws.diagnostics
         ess = min(found["ess_bulk"], found["ess_tail"])
         lines.append(f"Method ensemble: R-hat {found['rhat']:.3f}, {ess:.0f} effective draws.")
+    elif estimate.draws is not None and "pareto_k" in estimate.draws.diagnostics:
+        found = estimate.draws.diagnostics
+        lines.append(
+            f"Method importance: interval ends to {found['end_error_sd']:.3f} SD, Pareto shape {found['pareto_k']:.2f}."
+        )
     elif estimate.draws is not None:
         lines.append(f"Method {estimate.draws.method}: {len(estimate.draws.flat)} independent draws.")
     return lines
