@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -85,16 +86,20 @@ class Frames:
         )
 
 
-def cpu_s(action: Callable[[], object], *, runs: int) -> float:
-    """Least CPU time of several runs after one to warm up."""
-    action()
-    times = []
-    for _ in range(runs):
-        gc.collect()
-        start = time.thread_time()
-        action()
-        times.append(time.thread_time() - start)
-    return min(times)
+def cpu_s(actions: dict[str, Callable[[], object]], *, runs: int) -> dict[str, float]:
+    """Least CPU time of each action over several rounds after one to warm up; each round runs all, one after another.
+
+    What else the machine does then slows all of them alike.
+    """
+    times: dict[str, list[float]] = {name: [] for name in actions}
+    for turn in range(runs + 1):
+        for name, action in actions.items():
+            gc.collect()
+            start = time.thread_time()
+            action()
+            if turn:
+                times[name].append(time.thread_time() - start)
+    return {name: min(values) for name, values in times.items()}
 
 
 def same_work(source: Frames, job: Job, engine: Engine) -> CellSums:
@@ -116,20 +121,24 @@ def against_peers(frames: int, *, runs: int) -> dict[str, float]:
     poses = source.poses(0, frames)
     counts = job.counts.reshape(frames, *source.head.shape)
 
+    actions: dict[str, Callable[[], object]] = {}
     engines = {"numpy": NumpyEngine(), **({"fast": compiled_engine()} if fast_is_installed() else {})}
-    times = {}
     for name, engine in engines.items():
-        times[f"{name} path"] = cpu_s(lambda e=engine: same_work(source, job, e), runs=runs)
-        whole = cpu_s(lambda e=engine: source.accumulator(e).add(counts, poses), runs=runs)
-        times[f"{name} accumulator, all it does"] = whole
-    times["bincount"] = min(cpu_s(lambda n=n: bincount(job, frames=n), runs=runs) for n in BINCOUNT_FRAMES)
-    try:
+        actions[f"{name} path"] = lambda e=engine: same_work(source, job, e)
+        actions[f"{name} accumulator, all it does"] = lambda e=engine: source.accumulator(e).add(counts, poses)
+    for size in BINCOUNT_FRAMES:
+        actions[f"bincount/{size}"] = lambda n=size: bincount(job, frames=n)
+    if find_spec("boost_histogram"):
         for name, fill in BOOST.items():
-            best = min(cpu_s(lambda n=n, fill=fill: fill(job, frames=n), runs=runs) for n in BOOST_FRAMES)
-            times[f"boost-histogram {name}"] = best
-    except ImportError:
+            for size in BOOST_FRAMES:
+                actions[f"boost-histogram {name}/{size}"] = lambda n=size, f=fill: f(job, frames=n)
+    else:
         print("boost-histogram is not installed: no ratio against it")
-    return times
+    best: dict[str, float] = {}
+    for name, value in cpu_s(actions, runs=runs).items():  # each peer at its best chunk
+        title = name.split("/")[0]
+        best[title] = min(value, best.get(title, value))
+    return best
 
 
 def streamed(minutes: float, engine: Engine) -> tuple[float, float]:
