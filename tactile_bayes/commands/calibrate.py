@@ -137,14 +137,18 @@ def size_table(table: Table) -> SizeTable:
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.posterior.learn_size import SizeTable, width_changes
 
-    columns = table.columns
+    # a study says which of its lumps show; the others' fits are fits to a trough
+    shown = [flag is not False for flag in table.columns.get("detectable", [None] * len(table))]
+    columns = {
+        name: [v for v, keep in zip(values, shown, strict=True) if keep] for name, values in table.columns.items()
+    }
 
     def array(name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
         values = columns[name]
         if all(value is None for value in values):
             return None
         if any(value is None for value in values):
-            row = values.index(None)
+            row = table.columns[name].index(None)
             raise table.error(row, name, "is blank in some rows only", way_out="fill the column or leave it out")
         return np.asarray(values, dtype=np.float64)
 
