@@ -59,42 +59,43 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
     """Compare the detected sizes of one modality with excision."""
     found = sizes.only_detected()
     x, y = found.ex_vivo_mm, found.size_mm
-    figures = _figures(found, confidence=confidence, error_ratio=error_ratio)
+    robust = _Fit(partial(passing_bablok, confidence=float(confidence)))
+    figures = _figures(found, confidence=confidence, error_ratio=error_ratio, robust=robust)
     if len(x) < 2 or not _squarable(x, y):
         return MethodComparison(len(x), error_ratio, figures)
     return MethodComparison(
         n=len(x),
         error_ratio=error_ratio,
         figures=figures,
-        analytic=_analytic(x, y, confidence=float(confidence), error_ratio=error_ratio),
+        analytic=_analytic(found, robust, confidence=float(confidence), error_ratio=error_ratio),
         limits=_limits(found, confidence=float(confidence)),
         trends=_trends(x, y, confidence=float(confidence)),
         concordance=_or_none(lambda: concordance(x, y, confidence=float(confidence))),
     )
 
 
-def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float) -> dict[str, Figure]:
+def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float, robust: _Fit) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
-    for name, statistic, scale in _statistics(error_ratio):
+    for name, statistic, scale in _statistics(error_ratio, robust):
         wanted = scale if isinstance(statistic, SumStatistic) or len(found.size_mm) <= MOST_REFITTED else None
         figures[name] = figure(_guarded(statistic), found, scale=wanted, confidence=confidence)
     return figures
 
 
-def _statistics(error_ratio: float) -> list[tuple[str, Statistic, Scale]]:
+def _statistics(error_ratio: float, robust: _Fit) -> list[tuple[str, Statistic, Scale]]:
     """Every figure with its name and the scale of its interval."""
     demings = partial(_deming_slope, error_ratio=error_ratio)
-    fits: tuple[tuple[str, Callable[[FloatArray, FloatArray], Line | PassingBablok]], ...] = (
-        ("weighted_deming", partial(weighted_deming, error_ratio=error_ratio)),
-        ("passing_bablok", passing_bablok),
+    fits = (
+        ("weighted_deming", _Fit(partial(weighted_deming, error_ratio=error_ratio))),
+        ("passing_bablok", robust),
     )
     return [
         ("ols_intercept_mm", SumStatistic(_terms, _intercept_with(_ols_slope), _NO_LINE), "linear"),
         ("ols_slope", SumStatistic(_terms, _ols_slope, _NO_LINE), "linear"),
         ("deming_intercept_mm", SumStatistic(_terms, _intercept_with(demings), _NO_LINE), "linear"),
         ("deming_slope", SumStatistic(_terms, demings, _NO_LINE), "linear"),
-        *((f"{name}_intercept_mm", _part_of(fit, "intercept"), "linear") for name, fit in fits),
-        *((f"{name}_slope", _part_of(fit, "slope"), "linear") for name, fit in fits),
+        *((f"{name}_intercept_mm", fit.part("intercept"), "linear") for name, fit in fits),
+        *((f"{name}_slope", fit.part("slope"), "linear") for name, fit in fits),
         ("concordance", SumStatistic(_terms, _concordance, "concordance needs sizes that vary"), "fisher"),
         ("difference_mean_mm", SumStatistic(_terms, _bias), "linear"),
         ("difference_sd_mm", SumStatistic(_terms, _sd, "one mass has no spread"), "log"),
@@ -160,11 +161,21 @@ def _sd(sums: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 0] - 1), 0.0))
 
 
-def _part_of(fit: Callable[[FloatArray, FloatArray], Line | PassingBablok], part: str) -> Statistic:
-    def statistic(sizes: ModalitySizes) -> float:
-        return float(getattr(fit(sizes.ex_vivo_mm, sizes.size_mm), part))
+class _Fit:
+    """A line that several figures are parts of: not fitted twice in a row to the same masses."""
 
-    return statistic
+    def __init__(self, fit: Callable[[FloatArray, FloatArray], Line | PassingBablok]) -> None:
+        self._fit = fit
+        self._last: tuple[ModalitySizes, Line | PassingBablok] | None = None
+
+    def __call__(self, sizes: ModalitySizes) -> Line | PassingBablok:
+        if self._last is None or self._last[0] is not sizes:
+            self._last = sizes, self._fit(sizes.ex_vivo_mm, sizes.size_mm)
+        return self._last[1]
+
+    def part(self, name: str) -> Statistic:
+        """One number of the line as a statistic."""
+        return lambda sizes: float(getattr(self(sizes), name))
 
 
 def _guarded(statistic: Statistic) -> Statistic:
@@ -185,16 +196,17 @@ def _squarable(x: FloatArray, y: FloatArray) -> bool:
     return bool(both.min() > _SMALLEST and both.max() < _LARGEST)
 
 
-def _analytic(x: FloatArray, y: FloatArray, *, confidence: float, error_ratio: float) -> dict[str, Ends | None]:
+def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ratio: float) -> dict[str, Ends | None]:
+    x, y = found.ex_vivo_mm, found.size_mm
     ends: dict[str, Ends | None] = {}
     for name, fit in (("ols", least_squares), ("deming", partial(deming, error_ratio=error_ratio))):
-        line = _or_none(partial(fit, x, y))
-        both = None if line is None else line.intervals(confidence=confidence)
-        ends[f"{name}_intercept_mm"], ends[f"{name}_slope"] = both or (None, None)
-    robust = _or_none(lambda: passing_bablok(x, y, confidence=confidence))
-    finite = robust is not None and bool(np.all(np.isfinite([*robust.slope_interval, *robust.intercept_interval])))
-    ends["passing_bablok_intercept_mm"] = robust.intercept_interval if robust and finite else None
-    ends["passing_bablok_slope"] = robust.slope_interval if robust and finite else None
+        plain = _or_none(partial(fit, x, y))
+        two = None if plain is None else plain.intervals(confidence=confidence)
+        ends[f"{name}_intercept_mm"], ends[f"{name}_slope"] = two or (None, None)
+    line = _or_none(lambda: robust(found))
+    if isinstance(line, PassingBablok):
+        for name, both in (("intercept_mm", line.intercept_interval), ("slope", line.slope_interval)):
+            ends[f"passing_bablok_{name}"] = both if np.all(np.isfinite(both)) else None
     agreement = _or_none(lambda: concordance(x, y, confidence=confidence))
     ends["concordance"] = None if agreement is None else agreement.interval
     return ends

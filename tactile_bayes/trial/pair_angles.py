@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -57,15 +58,16 @@ class PairAngles:
             return float(self._angles[rank - 1])
         low, high = -math.pi / 2, math.pi / 2
         count_low, count_high = 0, self.number
-        share = 0.5
+        widths = [high - low]
         while high - low > RESOLUTION:
+            share = _next_share(rank, count_low, count_high, widths)
             middle = low + share * (high - low)
             count = self.below(middle, inclusive=True)
             if count >= rank:
                 high, count_high = middle, count
             else:
                 low, count_low = middle, count
-            share = _next_share(rank, count_low, count_high, share)
+            widths.append(high - low)
         return high
 
     def shift(self, *, rising: bool) -> int:
@@ -108,11 +110,17 @@ def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.where(np.abs(difference) < _EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
 
 
-def _next_share(rank: int, count_low: int, count_high: int, before: float) -> float:
-    """Where in the bracket to count next: by proportion, drawn to the middle so that neither end stays for ever."""
-    if count_high == count_low or before != 0.5:
+def _next_share(rank: int, count_low: int, count_high: int, widths: Sequence[float]) -> float:
+    """Where in the bracket to count next: by proportion, a hair to either side in turn so that both ends close in.
+
+    Where that does not shrink the bracket eightfold in three steps, its middle.
+    """
+    step = len(widths)
+    if count_high == count_low or (step > 3 and widths[-1] > widths[-4] / 8):
         return 0.5
-    return min(0.98, max(0.02, (rank - count_low) / (count_high - count_low)))
+    share = (rank - 0.5 - count_low) / (count_high - count_low)
+    beside = 0.98 * share if step % 2 else 1 - 0.98 * (1 - share)
+    return min(0.999, max(0.001, beside))
 
 
 def _pairs_of_equals(rows: FloatArray) -> int:
