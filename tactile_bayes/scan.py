@@ -199,7 +199,7 @@ class Landmarks:
 
     sternal_notch_mm: FloatArray
     xiphoid_mm: FloatArray
-    spread_mm: float | None = None
+    spread_mm: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.spread_mm is not None and not 0 <= self.spread_mm < np.inf:
