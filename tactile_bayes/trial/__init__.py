@@ -1,9 +1,9 @@
 """Method comparison of size estimates against excision.
 
-One family of estimators a module, each with a ``figures`` function from `ModalitySizes` to named `Figure`s:
-`accuracy` (percent and mm errors, bias), `origin_line` (slope through zero and its r squared), `spread` (within one
-mass). `proportion`, `jackknife` and `coverage` serve them; `summary` runs them all. A new family is a new module and a
-line in ``summary.FAMILIES``.
+`readings` gathers sizes a mass at a time; `summary` runs everything. Families of figures: `accuracy`, `origin_line`,
+`spread`, `replicates`, `method_comparison` (with `lines`, `passing_bablok`, `bland_altman`, `concordance` below it),
+`comparison` and `paired`. Intervals over patients: `sums`, `figures`, `jackknife`, `bootstrap`, and `check_intervals`,
+which counts how often they hold. Stated uncertainty: `coverage`, `calibration`. Beyond the trial: `next_mass`, `planning`.
 """
 
 from __future__ import annotations
