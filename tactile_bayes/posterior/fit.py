@@ -26,6 +26,8 @@ LEAST_COVERED_SHARE = 0.6
 LEAST_WIDTH_IN_CELLS = 0.5
 WIDEST_IN_RADII = 0.75
 MOST_AXIS_RATIO = 4.0
+FIT_TOLERANCE = 1e-8
+"""Of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +170,12 @@ def fit_bump(
         if len(cells) < len(bump.names) + 2:
             return None, f"{len(cells)} covered cells for {len(bump.names)} parameters"
         weight = np.ones(len(cells)) if weight_variance is None else count_weights(cells, weight_variance)
-        fit = _best_fit(tactile_map, bump, cells, weight=weight, centre=centre, start=start)
+        starts = (
+            [start]
+            if start is not None
+            else [_start(tactile_map, bump, cells, centre, width) for width in START_WIDTHS_MM]
+        )
+        fit = _best_fit(bump, cells, starts, weight=weight, centre=centre, radius_mm=options.radius_mm)
         moved = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
         if not fit.converged or moved > options.radius_mm / 2:
             return None, "no bump that the window holds: the fit ran away"
@@ -194,16 +201,20 @@ def _bump(tactile_map: TactileMap, options: FitOptions, *, rotated: bool) -> Bum
 
 
 def _best_fit(
-    tactile_map: TactileMap,
     bump: Bump,
     cells: FitCells,
+    starts: list[FloatArray],
     *,
     weight: FloatArray,
     centre: tuple[float, float],
-    start: FloatArray | None,
+    radius_mm: float,
 ) -> LeastSquaresFit:
-    """The lowest minimum from several starting widths, or from one start when it is known."""
-    starts = [start] if start is not None else [_start(tactile_map, bump, cells, centre, w) for w in START_WIDTHS_MM]
+    """The lowest minimum from several starts; one that leaves the window or outgrows it is not followed further."""
+
+    def lost(theta: FloatArray) -> bool:
+        away = np.hypot(theta[1] - centre[0], theta[2] - centre[1]) > radius_mm
+        return bool(away or max(bump.widths(theta)[:2]) > 4.0 * radius_mm)
+
     fits = [
         fit_least_squares(
             lambda theta: bump.predict(theta, cells),
@@ -211,6 +222,8 @@ def _best_fit(
             data=cells.value,
             weight=weight,
             scale=bump.step_scale,
+            tolerance=FIT_TOLERANCE,
+            abandon=lost,
         )
         for begin in starts
     ]

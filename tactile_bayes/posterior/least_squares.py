@@ -76,6 +76,7 @@ def fit_least_squares(
     scale: FloatArray,
     tolerance: float = 1e-10,
     max_iterations: int = 200,
+    abandon: Callable[[FloatArray], bool] | None = None,
 ) -> LeastSquaresFit:
     """Minimise ``sum(weight * (data - model(theta))**2)`` by Levenberg-Marquardt.
 
@@ -89,6 +90,8 @@ def fit_least_squares(
         Weights are inverse variances up to one common factor.
     tolerance
         Stop when the Gauss-Newton step is this small in units of `scale`.
+    abandon
+        Stop, not converged, at parameters from which no useful minimum can follow.
 
     Notes
     -----
@@ -113,6 +116,8 @@ def fit_least_squares(
             damping, grow = max(damping / 5.0, 1e-14), 2.0
             if small:
                 return LeastSquaresFit(theta, jacobian, residual, sse, True, iteration)
+            if abandon is not None and abandon(theta):
+                return LeastSquaresFit(theta, jacobian, residual, sse, False, iteration)
         else:
             if float(np.abs(step).max()) < tolerance:
                 return LeastSquaresFit(theta, jacobian, residual, sse, True, iteration)
