@@ -1,0 +1,48 @@
+"""The exit codes that no other test brings about: interrupted, and the table of all of them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from tactile_bayes import errors
+from tests.conftest import ROOT
+
+INTERRUPTED = """
+import os, signal, sys, threading
+from tactile_bayes.cli import main
+sys.argv = ["tactile-bayes", "calibrate", "size", {table!r}, "-o", {output!r}]
+threading.Timer({after}, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+main()
+"""
+
+
+def interrupt(output: Path, *, after: float) -> subprocess.CompletedProcess[str]:
+    table = str(ROOT / "tactile_bayes" / "demo" / "phantoms.csv")
+    code = INTERRUPTED.format(table=table, output=str(output), after=after)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+def test_ctrl_c_ends_with_130_one_line_and_nothing_left(tmp_path: Path) -> None:
+    """A calibration takes seconds; Ctrl-C comes while it imports and while it samples."""
+    for after in (0.3, 2.5):
+        done = interrupt(tmp_path / "size.json", after=after)
+        if done.returncode == errors.EXIT_DONE:  # a machine that was faster than the signal
+            (tmp_path / "size.json").unlink()
+            continue
+        assert done.returncode == errors.EXIT_INTERRUPTED
+        assert done.stderr.splitlines()[-1] == "interrupted"
+        assert "Traceback" not in done.stderr
+        assert done.stdout == ""
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_every_error_has_a_documented_code() -> None:
+    page = (ROOT / "docs" / "exit-codes.md").read_text(encoding="utf-8")
+    codes = {value for name, value in vars(errors).items() if name.startswith("EXIT_")}
+    kinds = {error.exit_code for error in errors.TactileBayesError.__subclasses__()}
+    assert codes == {0, 2, 3, 4, 5, 6, 130}
+    assert kinds <= codes
+    for code in codes:
+        assert f"| {code} |" in page
