@@ -7,11 +7,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.report.trial_html import trial_html
 from tactile_bayes.report.trial_text import trial_text
 from tactile_bayes.trial.document import as_document
+from tactile_bayes.trial.lines import weighted_deming
 from tactile_bayes.trial.readings import Reading
 from tactile_bayes.trial.summary import TrialReport, summarise
 
@@ -146,3 +148,14 @@ def test_ties_have_one_answer_whatever_their_order() -> None:
     assert forward["ols_slope"] == pytest.approx(0.04)
     assert backward["ols_slope"].value == pytest.approx(0.04)
     assert forward["passing_bablok_slope"] == backward["passing_bablok_slope"].value
+
+
+def test_customary_intervals_of_weighted_deming_leave_out_one_mass_at_a_time() -> None:
+    """Pseudo-values about the whole fit, their SD over root n, Student's t with n - 2 (Linnet 1990)."""
+    made = report(E, *([x * f] for x, f in zip(E, (1.1, 0.9, 1.2, 1.0, 0.8, 1.05, 1.15, 0.95, 1.3, 1.0), strict=True)))
+    methods = made.modalities["tactile"].methods
+    x, y = np.array(E), made.sizes["tactile"].size_mm
+    whole = weighted_deming(x, y).slope
+    pseudo = [10 * whole - 9 * weighted_deming(np.delete(x, i), np.delete(y, i)).slope for i in range(10)]
+    reach = stats.t.ppf(0.975, 8) * np.std(pseudo, ddof=1) / math.sqrt(10)
+    assert methods.analytic["weighted_deming_slope"] == pytest.approx((whole - reach, whole + reach))

@@ -14,7 +14,7 @@ from tactile_bayes.trial.bland_altman import Limits, Trend
 from tactile_bayes.trial.concordance import Concordance, concordance
 from tactile_bayes.trial.figures import Figure, Statistic, figure
 from tactile_bayes.trial.jackknife import Scale, UndefinedError
-from tactile_bayes.trial.lines import Line, deming, least_squares, weighted_deming
+from tactile_bayes.trial.lines import Line, deming, jackknife_errors, least_squares, weighted_deming
 from tactile_bayes.trial.passing_bablok import PassingBablok, passing_bablok
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic, columns, ratio
@@ -203,6 +203,9 @@ def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ra
         plain = _or_none(partial(fit, x, y))
         two = None if plain is None else plain.intervals(confidence=confidence)
         ends[f"{name}_intercept_mm"], ends[f"{name}_slope"] = two or (None, None)
+    weighted = partial(weighted_deming, error_ratio=error_ratio)
+    for name, both in _jackknifed(weighted, x, y, confidence=confidence).items():
+        ends[f"weighted_deming_{name}"] = both
     line = _or_none(lambda: robust(found))
     if isinstance(line, PassingBablok):
         for name, both in (("intercept_mm", line.intercept_interval), ("slope", line.slope_interval)):
@@ -210,6 +213,18 @@ def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ra
     agreement = _or_none(lambda: concordance(x, y, confidence=confidence))
     ends["concordance"] = None if agreement is None else agreement.interval
     return ends
+
+
+def _jackknifed(
+    fit: Callable[[FloatArray, FloatArray], Line], x: FloatArray, y: FloatArray, *, confidence: float
+) -> dict[str, Ends | None]:
+    """Intervals by leaving out one mass at a time, n - 2 degrees of freedom: customary where there is no formula."""
+    line = _or_none(partial(fit, x, y)) if 3 < len(x) <= MOST_REFITTED else None
+    errors = None if line is None else _or_none(partial(jackknife_errors, fit, x, y))
+    if line is None or errors is None:
+        return {"intercept_mm": None, "slope": None}
+    two = Line(line.intercept, line.slope, line.n, *errors).intervals(confidence=confidence) or (None, None)
+    return {"intercept_mm": two[0], "slope": two[1]}
 
 
 def _limits(found: ModalitySizes, *, confidence: float) -> dict[str, Limits]:
