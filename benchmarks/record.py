@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -41,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("what", nargs="?", choices=["throughput", "load", "kills"], default="throughput")
     parser.add_argument("--duration", type=float, default=60.0, help="of the scan in s (60)")
     parser.add_argument("--repeats", type=int, default=10, help="kills (10)")
+    parser.add_argument("--busy", type=int, nargs="+", default=[0, 2, 4], help="load: busy processes (0 2 4)")
+    parser.add_argument("--live", action="store_true", help="load: with the live view")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures as JSON")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as name:
@@ -65,7 +68,8 @@ def program(words: Sequence[str], folder: Path, **options: Any) -> subprocess.Po
     """The program in a process of its own."""
     command = [sys.executable, "-m", "tactile_bayes", *words]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
-    return subprocess.Popen(command, cwd=folder, env=dict(environment()), text=True, **quiet)
+    variables = dict(environment()) | {"TERM": "dumb", "OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.Popen(command, cwd=folder, env=variables, text=True, **quiet)
 
 
 def throughput(folder: Path, scan: Path, options: argparse.Namespace) -> dict[str, Any]:
@@ -137,7 +141,6 @@ def record_pieces(data: Any, pieces: list[bytes], path: Path) -> None:
             element_calibration=data.element_calibration,
             session={"source": "benchmark"},
             provenance=Provenance("benchmark", {}),
-            path=path,
         )
         line = Line("head", None, None, HeadParser(), b"", b"")  # type: ignore[arg-type]
         recorder = Recorder(line, None, writer)
@@ -168,17 +171,22 @@ def devices(folder: Path, scan: Path) -> Iterator[tuple[list[str], dict[str, int
 
 def load(folder: Path, scan: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
     """Record the whole scan while others are busy."""
+    live = ["--live"] if options.live else []
     rows = []
-    for busy in (0, 2, 4):
+    for busy in options.busy:
         others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
         try:
             with devices(folder, scan) as (words, pids):
                 output = folder / f"busy{busy}.mcap"
-                process = program(["record", "-o", output.name, *words], folder)
+                shown = (folder / f"busy{busy}.txt").open("w+")
+                process = program(["record", "-o", output.name, *words, *live], folder, stderr=shown)
                 time.sleep(options.duration * 0.9)
                 used = processes_cpu({"record": process.pid, **pids})
                 process.wait()
             row = {"busy": busy, "exit": process.returncode, **account_of(output), "cpu_s": used}
+            with shown:
+                shown.seek(0)
+                row |= view_of(shown.read())
         finally:
             for other in others:
                 other.kill()
@@ -186,6 +194,20 @@ def load(folder: Path, scan: Path, options: argparse.Namespace) -> list[dict[str
         rows.append(row)
         print(json.dumps(row), flush=True)
     return rows
+
+
+def view_of(text: str) -> dict[str, Any]:
+    """How far the live view was behind the recorder, and how much it did."""
+    behind = sorted(int(found) for found in re.findall(r"view (\d+) ms behind", text))
+    last = re.search(r"(\d+) drawings and (\d+) estimates in ([\d.]+) s", text)
+    if not behind or not last:
+        return {}
+    seconds = float(last[3])
+    return {
+        "view_behind_ms": {"median": behind[len(behind) // 2], "max": behind[-1]},
+        "drawings_per_s": round(int(last[1]) / seconds, 1),
+        "estimates_per_s": round(int(last[2]) / seconds, 1),
+    }
 
 
 def account_of(path: Path) -> dict[str, Any]:

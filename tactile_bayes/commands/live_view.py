@@ -113,8 +113,6 @@ class Estimator:
 
 def _prepare() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with contextlib.suppress(OSError):
-        os.nice(5)  # of all that runs during a recording this can wait best
     import tactile_bayes.files.size_json
     import tactile_bayes.posterior.estimate  # noqa: F401
 
@@ -131,7 +129,10 @@ def estimate_text(tactile_map: TactileMap, calibration_path: str | None) -> str:
 
     try:
         calibration = read_size_calibration(Path(calibration_path)) if calibration_path else None
-        fit = FitOptions(calibration.recipe.background, calibration.recipe.radius_mm) if calibration else FitOptions()
+        # whether an ellipse is turned is a question for afterwards, and takes a third of the time
+        fit = FitOptions(rotation="off")
+        if calibration is not None:
+            fit = FitOptions(calibration.recipe.background, calibration.recipe.radius_mm, "off")
         options = EstimateOptions(method="laplace", fit=fit)
         found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
     except TactileBayesError as error:
@@ -174,21 +175,28 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
             showing.append(server.show)
         if setup["terminal"]:
             showing.append(stack.enter_context(terminal_view()))
-        _look(reader, live, estimator, showing)
+        began = time.monotonic()
+        drawings = _look(reader, live, estimator, showing)
+        if not sys.stderr.isatty():
+            seconds = time.monotonic() - began
+            print(f"live view: {drawings} drawings and {estimator.done} estimates in {seconds:.1f} s", file=sys.stderr)
 
 
-def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callable[[LiveState], None]]) -> None:
-    drawn = 0.0
+def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callable[[LiveState], None]]) -> int:
+    """Draw until the recording ends; how often that was."""
+    drawn, drawings, newest = 0.0, 0, None
     while not reader.ended:
         live.take(reader.read(1 / DRAWINGS_PER_S / 2))
+        estimator.look(newest)
         now = time.monotonic()
         if now - drawn < 1 / DRAWINGS_PER_S:
             continue
-        drawn = now
+        drawn, drawings = now, drawings + 1
         state = live.state(size=estimator.text)
-        estimator.look(state.tactile_map)
+        newest = state.tactile_map
         for show in showing:
             show(state)
+    return drawings
 
 
 @contextlib.contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,12 +142,14 @@ def _record(request: Request) -> tuple[Report, bool]:
 
     from tactile_bayes.commands.record_parts import Stopper, instrument_of, provenance_of, refuse_calibration
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
+    from tactile_bayes.files.schema import check_document
     from tactile_bayes.hardware.recorder import Recorder
 
     head, calibration, landmarks = instrument_of(request)
     with ExitStack() as stack:
         hello, lines = _connect(request, stack)
         _check_fit(hello, head, request)
+        check_document(request.session(hello), "scan_session.schema.json", path=request.output)
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
         observer = _look_on(request, head, calibration, stack)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
@@ -157,7 +159,6 @@ def _record(request: Request) -> tuple[Report, bool]:
             element_calibration=calibration,
             session=request.session(hello),
             provenance=provenance_of(request, request.settings(hello)),
-            path=request.output,
         )
         recorder = Recorder(
             *lines,
@@ -173,6 +174,8 @@ def _record(request: Request) -> tuple[Report, bool]:
             report = _run(recorder, stopper, head, request)
             writer.close(asdict(report))
         except OSError as error:
+            with suppress(OSError):  # what is still in its buffer cannot be written either
+                stream.close()
             raise full_disk(request.output, error) from None
     return report, stopper.interrupted
 

@@ -19,7 +19,6 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter
-from tactile_bayes.files.schema import check_document
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 LOG_TOPIC: Final = "/log"
@@ -50,9 +49,7 @@ class RecordingWriter(ScanWriter):
     stream
         A new file.
     head, element_calibration, session, provenance
-        As for `ScanWriter`.
-    path
-        For messages.
+        As for `ScanWriter`; the session was checked, before the file was made.
     """
 
     def __init__(
@@ -63,13 +60,11 @@ class RecordingWriter(ScanWriter):
         element_calibration: ElementCalibration,
         session: Mapping[str, str],
         provenance: Provenance,
-        path: Path,
     ) -> None:
-        check_document(dict(session), "scan_session.schema.json", path=path)
         super().__init__(
             stream, head=head, element_calibration=element_calibration, session=session, provenance=provenance
         )
-        self._stream, self._path = stream, path
+        self._stream = stream
         schema = build_file_descriptor_set(Log).SerializeToString(deterministic=True)
         number = self._writer.register_schema(name=Log.DESCRIPTOR.full_name, encoding="protobuf", data=schema)
         self._log_channel: int = self._writer.register_channel(

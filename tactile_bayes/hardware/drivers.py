@@ -17,6 +17,7 @@ from tactile_bayes.hardware.ports import ANSWER_S, Port, shown
 from tactile_bayes.hardware.readings import HelloReading, Parser, PoseReading
 
 _BETWEEN_COMMANDS_S: Final = 0.02
+_ASK_AGAIN_S: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,11 +147,10 @@ def check_head(port: Port, *, every: int = 1) -> HelloReading:
     """
     port.write(encode_command(head.STOP))
     port.drain()
-    port.write(encode_command(head.ASK))
-    parser, came = HeadParser(), b""
-    end = time.monotonic() + ANSWER_S
+    parser, came, end = HeadParser(), b"", time.monotonic() + ANSWER_S
     while time.monotonic() < end and parser.hello is None:
-        data = port.read_some(0.1)
+        port.write(encode_command(head.ASK))  # again and again: one may get lost
+        data = port.read_some(_ASK_AGAIN_S)
         came += data
         parser.feed(data)
     if parser.hello is None:

@@ -204,7 +204,7 @@ class Emulator:
         return self._begun is None and self._next > 0
 
     def _pass_on(self) -> None:
-        if self._waiting:
+        if self._waiting and not self.unplugged:
             del self._waiting[: self._link.write(bytes(self._waiting))]
 
     def _patience_s(self) -> float:
@@ -257,5 +257,5 @@ class Emulator:
     def _unplug(self) -> None:
         with contextlib.suppress(OSError):
             self._link.write(bytes(self._waiting))
-        self._link.close()
         self._begun, self.unplugged = None, True
+        self._link.close()

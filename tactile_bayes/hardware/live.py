@@ -19,7 +19,7 @@ from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, TrackerPoses
 
 # Frames used after which the plane is fitted anew: the first ones lie on a line.
-REFIT_AT: Final = (100, 200, 400, 800, 1600, 3200, 6400)
+REFIT_AT: Final = (100, 200, 400, 800, 1600)
 _KEPT_POSES: Final = 400
 _PATIENCE_NS: Final = 150_000_000
 

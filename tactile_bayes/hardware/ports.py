@@ -18,7 +18,7 @@ import serial
 from tactile_bayes.errors import DeviceError
 
 # How long a device may take to answer.
-ANSWER_S: Final = 1.5
+ANSWER_S = 2.5
 _SHOWN_BYTES: Final = 12
 
 
@@ -106,6 +106,8 @@ class Port:
 def _open(url: str, baud: int, role: str) -> Any:
     try:
         port = serial.serial_for_url(url, baudrate=baud, timeout=0, do_not_open=True)
+        if "://" not in url:
+            port.exclusive = True  # two programs that read one port get half of it each
         if not url.startswith(("socket://", "loop://")):
             port.rts = False  # high holds a Flock of Birds in reset
         port.open()

@@ -1,0 +1,247 @@
+"""The parts of a recording: reading processes, clocks, landmarks, emulated faults, ports."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated_devices import short_scan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile_bayes.errors import DeviceError
+from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid
+from tactile_bayes.hardware import reading
+from tactile_bayes.hardware.clocks import ArrivalClock, PoseClock
+from tactile_bayes.hardware.drivers import TRACKERS
+from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedTracker, Faults
+from tactile_bayes.hardware.landmarks import LandmarkTouch
+from tactile_bayes.hardware.ports import Port, shown
+from tactile_bayes.hardware.readings import PoseReading
+from tactile_bayes.hardware.streams import Stream, read_in_process
+
+
+def read_all(stream: Stream, size: int) -> bytes:
+    """What comes, up to `size` bytes."""
+    found = b""
+    while len(found) < size:
+        assert select.select([stream], [], [], 10.0)[0], f"{len(found)} of {size} bytes came"
+        found += b"".join(piece.data for piece in stream.read())
+        if stream.ended:
+            break
+    return found
+
+
+@pytest.fixture
+def line():
+    """A reading process on a pipe of the test: what to write to, and the stream."""
+    device, ours = os.pipe()
+    near, far = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-I", "-S", reading.__file__, str(device), str(far)], pass_fds=(device, far)
+    )
+    os.close(device)
+    os.close(far)
+    os.set_blocking(near, False)
+    stream = Stream(process, near)
+    yield ours, stream
+    stream.close()
+
+
+def test_a_reader_hands_over_what_it_reads_in_order_with_rising_times(line):
+    ours, stream = line
+    sent = [os.urandom(700) for _ in range(50)]
+    stamps, found = [], b""
+    for data in sent:
+        os.write(ours, data)
+    while len(found) < 35_000:
+        assert select.select([stream], [], [], 10.0)[0]
+        for piece in stream.read():
+            stamps.append(piece.host_ns)
+            found += piece.data
+    assert found == b"".join(sent)
+    assert stamps == sorted(stamps)
+    os.close(ours)
+
+
+def test_a_reader_tells_when_the_device_has_gone(line):
+    ours, stream = line
+    os.write(ours, b"last words")
+    os.close(ours)
+    assert read_all(stream, 1000) == b"last words"
+    for _ in range(100):
+        if stream.ended:
+            break
+        select.select([stream], [], [], 0.1)
+        stream.read()
+    assert stream.ended
+
+
+def test_a_full_pipe_loses_whole_records_and_counts_them(line):
+    ours, stream = line
+    sent = 0
+    for _ in range(100):  # nobody reads: the pipe takes 64 KiB, the rest has nowhere to go
+        sent += os.write(ours, b"x" * 4000)
+        time.sleep(0.001)
+    time.sleep(0.2)
+    kept = 0
+    while select.select([stream], [], [], 0.3)[0]:
+        kept += sum(len(piece.data) for piece in stream.read())
+    os.write(ours, b"y")
+    kept += len(read_all(stream, 1))
+    assert stream.overrun_bytes > 0
+    assert kept + stream.overrun_bytes == sent + 1
+    os.close(ours)
+
+
+def test_a_reader_leaves_when_nobody_listens(line):
+    ours, stream = line
+    os.close(stream.pipe)
+    os.write(ours, b"x")
+    assert stream.process.wait(10.0) == 0
+    stream.pipe = os.open("/dev/null", os.O_RDONLY)
+    os.close(ours)
+
+
+def test_the_reader_imports_nothing_of_ours():
+    text = Path(reading.__file__).read_text(encoding="utf-8")
+    assert "tactile_bayes" not in text
+    assert "numpy" not in text
+
+
+def test_a_port_without_descriptor_is_read_all_the_same():
+    port = Port("loop://", baud=9600, role="tracker")
+    stream = read_in_process(port)
+    port.write(b"round and round")
+    assert read_all(stream, 15) == b"round and round"
+    stream.close()
+    port.close()
+
+
+@pytest.mark.parametrize(
+    ("data", "words"), [(b"", "nothing"), (b"hello\r\n", repr("hello\r\n")), (bytes(20), "00 00 00"), (b"\xff", "ff")]
+)
+def test_what_came_is_shown(data, words):
+    assert words in shown(data)
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_every_driver_says_in_one_line_that_nobody_answers(name, monkeypatch):
+    monkeypatch.setattr("tactile_bayes.hardware.drivers.ANSWER_S", 0.05)
+    near, far = os.openpty()
+    port = Port(os.ttyname(far), baud=9600, role="tracker")
+    with pytest.raises(DeviceError) as error:
+        TRACKERS[name].check(port)
+    assert "\n" not in str(error.value)
+    for words in (os.ttyname(far), TRACKERS[name].title, "nothing came"):
+        assert words in str(error.value)
+    port.close()
+    os.close(near)
+    os.close(far)
+
+
+def test_every_emulated_protocol_has_a_driver_and_the_other_way_round():
+    assert set(PROTOCOLS) == set(TRACKERS)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_driver_reads_what_the_emulated_tracker_says(name):
+    poses = short_scan(0.2).poses
+    tracker, parser = EmulatedTracker(poses, protocol=name), TRACKERS[name].parser()
+    found = [one for i in range(len(poses)) for one in parser.feed(tracker.record(i))]
+    assert len(found) == len(poses)
+    assert parser.garbage_bytes == 0
+    step = {"bird": 0.12, "fastrak-ascii": 0.13, "liberty-ascii": 2e-4, "open": 1e-12}.get(name, 2e-5)
+    np.testing.assert_allclose([one.position_mm for one in found], poses.position_mm, rtol=0, atol=step)
+    assert TRACKERS[name].has_clock == (found[0].device_ns is not None)
+
+
+def test_settings_and_letters_may_come_in_one_piece():
+    tracker = EmulatedTracker(short_scan(0.2).poses, protocol="fastrak")
+    assert tracker.hear(b"cUO1,2,11,0\rf") == b""
+    assert len(tracker.hear(b"P")) == 32
+    tracker.hear(b"C")
+    assert tracker.streaming
+
+
+@given(
+    offset=st.integers(-(10**12), 10**12),
+    delays=st.lists(st.integers(0, 20_000_000), min_size=2, max_size=100),
+)
+def test_the_offset_of_a_clock_is_the_least_delay(offset, delays):
+    clock = ArrivalClock()
+    for i, delay in enumerate(delays):
+        device_ns = i * 5_000_000
+        clock.observe(device_ns, device_ns + offset + delay)
+    assert clock.offset_ns == offset + min(delays)
+
+
+def test_a_drifting_clock_is_followed():
+    clock, drift = ArrivalClock(), 100e-6
+    rng = np.random.default_rng(4)
+    for i in range(12_000):
+        device_ns = i * 5_000_000
+        clock.observe(device_ns, round(device_ns * (1 + drift)) + int(rng.integers(0, 3_000_000)))
+    true = 12_000 * 5_000_000 * drift
+    assert abs(clock.offset_ns - true) < 1e6  # 6 ms of drift in a minute; the last seconds' share is left
+
+
+def test_poses_are_placed_by_arrival_or_by_a_shared_clock():
+    shared, arrival = PoseClock(shared=True), PoseClock(shared=False)
+    assert arrival.place(None, 10**9) is None  # no frame yet
+    for clock in (shared, arrival):
+        clock.head.observe(2 * 10**9, 5 * 10**9)  # the head's zero is 3 s into the host's time
+    assert shared.place(2_004_000_000, 5_010_000_000) == 2_004_000_000
+    assert arrival.place(None, 5_010_000_000) == 2_010_000_000
+    # with a clock of its own, a pose that was held up on its way keeps its place
+    clocked = PoseClock(shared=False)
+    clocked.head.observe(2 * 10**9, 5 * 10**9)
+    first = clocked.place(100_000_000, 5_010_000_000)
+    late = clocked.place(110_000_000, 5_090_000_000)
+    assert (first, late) == (2_010_000_000, 2_020_000_000)
+    assert shared.place(2_003_000_000, 0) is None  # backwards
+
+
+def test_a_landmark_is_where_the_apex_touches_however_the_handle_is_held():
+    rng, point = np.random.default_rng(3), np.array([10.0, -20.0, 30.0])
+    lever = rigid(np.eye(3), np.array([5.0, 6.0, -70.0]))
+    apex = inverse(lever)[:3, 3]
+    touch = LandmarkTouch("xiphoid", scanhead_from_tracker=lever, samples=50)
+    result = None
+    for _ in range(50):
+        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        turn *= np.linalg.det(turn)
+        position = point - turn @ apex + 0.2 * rng.standard_normal(3)
+        q = quaternion_from_rotation(turn)
+        result = touch.add(PoseReading(tuple(position), tuple(q), flags=()))
+    assert result is not None
+    assert np.abs(result.position_mm - point).max() < 0.15
+    assert 0.2 < result.spread_mm < 0.5
+    assert result.steady
+    assert "spread 0." in str(result)
+
+
+def test_a_landmark_that_slipped_says_so_and_doubtful_poses_do_not_count():
+    touch = LandmarkTouch("xiphoid", scanhead_from_tracker=np.eye(4), samples=2)
+    assert touch.add(PoseReading((0, 0, 0), (1, 0, 0, 0))) is None
+    assert touch.add(PoseReading((9, 9, 9), (1, 0, 0, 0), flags=("error W",))) is None
+    found = touch.add(PoseReading((9, 0, 0), (1, 0, 0, 0)))
+    assert not found.steady
+    assert "touch it again" in str(found)
+
+
+def test_faults_come_as_often_as_asked():
+    rng = np.random.default_rng(1)
+    faults = Faults(drop=0.1, corrupt=0.2)
+    sent = [faults.disturb(b"record", rng) for _ in range(4000)]
+    assert 0.08 < sum(one == b"" for one in sent) / 4000 < 0.12
+    assert 0.16 < sum(one not in (b"", b"record") for one in sent) / 4000 < 0.20
+    assert all(len(one) in (0, 6) for one in sent)
+    assert Faults().disturb(b"record", rng) == b"record"
+    assert [Faults(stall=(1.0, 0.5)).stalls(t) for t in (0.9, 1.0, 1.49, 1.5)] == [False, True, True, False]
