@@ -113,6 +113,8 @@ class _Ensemble:
         self._sampler = emcee.EnsembleSampler(
             self.walkers, p, self._standardised(log_density), vectorize=True, moves=[(emcee.moves.DEMove(), 1.0)]
         )
+        # emcee's wrapper prints parameters and a traceback at any exception, Ctrl-C among them
+        self._sampler.log_prob_fn = self._standardised(log_density)
         start = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
         # emcee takes neither an integer nor a Generator: it must be handed the state of a RandomState
         random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
