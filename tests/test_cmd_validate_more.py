@@ -190,11 +190,13 @@ def test_other_intervals_change_intervals_and_no_figure() -> None:
         assert other["mape_percent_interval"] == pytest.approx(plain["mape_percent_interval"], rel=0.15)
 
 
-def test_the_check_of_intervals_is_reported() -> None:
+def test_the_check_of_intervals_is_reported(tmp_path: Path) -> None:
     found = document(TRIAL, "--excision", EXCISION, "--check-intervals", 200)["interval_check"]
     assert found["tactile"]["trials"] == 200
     assert 0.88 < found["tactile"]["share"] <= 1
-    assert "held the true" in validate(TRIAL, "--excision", EXCISION, "--check-intervals", 50).stdout
+    page = tmp_path / "r.html"
+    assert "held the true" in validate(TRIAL, "--excision", EXCISION, "--check-intervals", 50, "--html", page).stdout
+    assert "Do the intervals hold?" in page.read_text()
 
 
 def test_the_page_needs_nothing_else_and_is_the_same_every_time(tmp_path: Path) -> None:
@@ -265,8 +267,10 @@ def test_the_papers_figures_give_a_ratio_of_two_and_not_more(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_the_model_of_the_next_mass_is_reported() -> None:
-    found = document(TRIAL, "--excision", EXCISION, "--bayes")["next_mass"]
+def test_the_model_of_the_next_mass_is_reported(tmp_path: Path) -> None:
+    page = tmp_path / "r.html"
+    found = document(TRIAL, "--excision", EXCISION, "--bayes", "--html", page)["next_mass"]
+    assert "Probability that tactile errs less than ultrasound" in page.read_text()
     assert found["probability_less_error"]["tactile errs less than ultrasound"] > 0.9
     assert all(one["rhat"] <= 1.01 for one in found["diagnostics"].values())
     low, high = (found["modalities"]["tactile"]["mape_percent"][key] for key in ("low", "high"))

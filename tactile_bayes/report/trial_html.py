@@ -75,6 +75,8 @@ def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -
         *_replicates(report),
         *_calibrations(report),
         *_comparisons(report),
+        *_next_mass(document),
+        *_interval_check(document),
         *_origin(document),
         f"<h2>As text</h2><pre>{html.escape(text)}</pre>",
         f'<p class="mark">{html.escape(RESEARCH_USE)}</p></body></html>',
@@ -201,6 +203,48 @@ def _comparisons(report: TrialReport) -> Iterator[str]:
             for one in report.paired
         ],
     )
+
+
+def _next_mass(document: Mapping[str, Any]) -> Iterator[str]:
+    found = document.get("next_mass")
+    if not found:
+        return
+    yield "<h2>The next mass</h2>"
+    columns = {"mape_percent": "expected error %", "bias_percent": "bias %", "log_slope": "slope of ln size"}
+    columns |= {"patient_sd": "SD patients", "mass_sd": "SD masses", "replicate_sd": "SD maps"}
+    rows = [
+        [name, *(_with(one[key]["median"], (one[key]["low"], one[key]["high"])) for key in columns)]
+        for name, one in found["modalities"].items()
+    ]
+    yield _table(["", *columns.values()], rows)
+    for pair, probability in found["probability_less_error"].items():
+        yield f"<p>Probability that {html.escape(pair)}: {probability:.3f}</p>"
+    percent = 100 * found["interval"]["probability"]
+    yield (
+        '<p class="note">Bayesian errors-in-variables model of ln size, for a single reading of a mass of a new patient; '
+        f"medians and equal-tailed {percent:g} % intervals. It stands beside the tables above and replaces none.</p>"
+    )
+
+
+def _interval_check(document: Mapping[str, Any]) -> Iterator[str]:
+    found = document.get("interval_check")
+    if not found:
+        return
+    yield "<h2>Do the intervals hold?</h2>"
+    heads = ["", "simulated trials", "true MAPE %", "held it", "lay above", "lay below"]
+    rows = [
+        [
+            name,
+            str(one["trials"]),
+            f"{one['true_mape_percent']:.1f}",
+            _with(one["share"], (one["share_interval"][0], one["share_interval"][1])),
+            str(one["above"]),
+            str(one["below"]),
+        ]
+        for name, one in found.items()
+    ]
+    yield _table(heads, rows)
+    yield '<p class="note">Trials of this size with errors like those found; intervals of the percent error.</p>'
 
 
 def _origin(document: Mapping[str, Any]) -> Iterator[str]:
