@@ -221,7 +221,7 @@ def _next_mass(document: Mapping[str, Any]) -> Iterator[str]:
         yield f"<p>Probability that {html.escape(pair)}: {probability:.3f}</p>"
     percent = 100 * found["interval"]["probability"]
     yield (
-        '<p class="note">Bayesian errors-in-variables model of ln size, for a single reading of a mass of a new patient; '
+        '<p class="note">Bayesian errors-in-variables model of ln size, for a single reading of a new patient\'s mass; '
         f"medians and equal-tailed {percent:g} % intervals. It stands beside the tables above and replaces none.</p>"
     )
 
