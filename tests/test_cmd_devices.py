@@ -90,7 +90,7 @@ def test_a_tracker_is_found_by_asking(run_cli, protocol):
 
 def test_a_pivot_is_measured_on_the_tracker_itself(run_cli):
     with serving(EmulatedTracker(pivoting(), protocol="bird"), PtyLink()) as emulator:
-        words = ["--pivot", emulator._link.url, "--tracker-protocol", "bird", "--duration", 1]
+        words = ["--pivot", emulator._link.url, "--tracker-protocol", "bird", "--duration", 0.5]
         done = run_cli("devices", *words)
     assert done.returncode == 0, done.stderr
     assert "record as it is" in done.stdout

@@ -116,7 +116,7 @@ def notes(path: Path) -> list[tuple[str, str]]:
         return [(m.name, m.message) for _, _, _, m in reader.iter_decoded_messages(topics=["/log"])]
 
 
-@pytest.mark.parametrize("tcp", [False, True], ids=["pty", "tcp"])
+@pytest.mark.parametrize("tcp", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["pty", "tcp"])
 def test_a_recorded_scan_gives_the_bit_identical_map(record, tmp_path, source, scan, tcp):
     with head_and_tracker(scan, tcp=tcp, speed=FAST) as devices:
         words = ["--clock", "shared", "--landmarks", source, "--side", "phantom", "--examiner", "E7"]
@@ -206,13 +206,13 @@ def test_faults_are_counted_and_noted(record, tmp_path, scan):
 def test_a_kill_costs_the_last_fraction_of_a_second(tmp_path, start, run_cli, long_scan):
     with head_and_tracker(long_scan) as devices:
         process = start(devices)
-        wait_for_bytes(tmp_path / "a.mcap", 250_000)
+        wait_for_bytes(tmp_path / "a.mcap", 120_000)
         process.send_signal(signal.SIGKILL)
         process.wait()
     file = read_scan_report(tmp_path / "a.mcap")
     assert not file.complete
     assert "everything after" in file.lost[0]
-    assert len(file.scan.frames) >= 100
+    assert len(file.scan.frames) >= 50
     done = run_cli("repair", "a.mcap", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "everything after" in done.stdout
@@ -221,11 +221,17 @@ def test_a_kill_costs_the_last_fraction_of_a_second(tmp_path, start, run_cli, lo
     np.testing.assert_array_equal(mended.scan.frames.counts, file.scan.frames.counts)
 
 
-@pytest.mark.parametrize(("number", "words"), [(signal.SIGTERM, "SIGTERM"), (signal.SIGINT, "Ctrl-C")])
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (signal.SIGTERM, "SIGTERM"),
+        pytest.param(signal.SIGINT, "Ctrl-C", marks=pytest.mark.slow),
+    ],
+)
 def test_a_signal_ends_the_recording_in_order(tmp_path, start, long_scan, number, words):
     with head_and_tracker(long_scan) as devices:
         process = start(devices)
-        wait_for_bytes(tmp_path / "a.mcap", 150_000)
+        wait_for_bytes(tmp_path / "a.mcap", 60_000)
         process.send_signal(number)
         out, err = process.communicate(timeout=20)
     assert process.returncode == 0, err
@@ -252,7 +258,7 @@ def test_a_pulled_cable_ends_it_with_one_line(record, tmp_path, scan, role):
 def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, start, long_scan):
     def little_room() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, 120_000))
 
     with head_and_tracker(long_scan) as devices:
         process = start(devices, preexec_fn=little_room)
@@ -354,7 +360,7 @@ def test_keys_touch_landmarks_start_and_stop(child_environment, tmp_path, source
         for key, answer in ((b"n", b"sternal notch at"), (b"x", b"xiphoid at"), (b" ", b"recording")):
             os.write(near, key)
             assert answer in process.stderr.readline()
-        wait_for_bytes(tmp_path / "a.mcap", 150_000)
+        wait_for_bytes(tmp_path / "a.mcap", 60_000)
         os.write(near, b"q")
         out, err = process.communicate(timeout=20)
     os.close(near)

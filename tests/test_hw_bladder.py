@@ -146,7 +146,10 @@ def test_the_command_writes_what_record_attaches(run_cli, tmp_path, steps):
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"head_id": "another"}, "was measured on head 'another'"), ({"date": "2020-02-29"}, "is of 2020-02-29")],
+    [
+        ({"head_id": "another"}, "was measured on head 'another'"),
+        pytest.param({"date": "2020-02-29"}, "is of 2020-02-29", marks=pytest.mark.slow),
+    ],
 )
 def test_record_refuses_a_calibration_that_is_stale_or_another_heads(run_cli, tmp_path, steps, change, words):
     made = run_cli("calibrate", "array", *words_of(steps), "-o", "array.json", cwd=tmp_path)

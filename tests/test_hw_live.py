@@ -155,7 +155,7 @@ def test_record_shows_a_line_a_second_where_it_cannot_draw(run_cli, tmp_path, sc
     from tactile_bayes.files.scan_mcap import write_scan
 
     write_scan(tmp_path / "like.mcap", scan, provenance=Provenance("test", {}))
-    with head_and_tracker(short_scan(2.0)) as devices:
+    with head_and_tracker(short_scan(1.0)) as devices:
         words = [*devices, "--like", "like.mcap", "--live", "--serve", "127.0.0.1:0"]
         done = run_cli("record", "-o", "a.mcap", *words, cwd=tmp_path, env={"TERM": "dumb"})
     assert done.returncode == 0, done.stderr
