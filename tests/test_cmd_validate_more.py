@@ -192,6 +192,15 @@ def test_other_intervals_change_intervals_and_no_figure() -> None:
         assert other["mape_percent_interval"] == pytest.approx(plain["mape_percent_interval"], rel=0.15)
 
 
+def test_the_second_table_is_printed_when_asked_for() -> None:
+    plain, more = validate(TRIAL, "--excision", EXCISION), validate(TRIAL, "--excision", EXCISION, "--methods")
+    assert set(plain.stdout.splitlines()) < set(more.stdout.splitlines())
+    for words in ("Passing-Bablok: slope", "limits of agreement mm", "p Holm", "ICC", "CRPS"):
+        assert words in more.stdout
+        assert words not in plain.stdout
+    assert max(map(len, more.stdout.splitlines())) < 160
+
+
 def test_the_check_of_intervals_is_reported(tmp_path: Path) -> None:
     found = document(TRIAL, "--excision", EXCISION, "--check-intervals", 200)["interval_check"]
     assert found["tactile"]["trials"] == 200

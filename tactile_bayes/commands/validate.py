@@ -71,6 +71,7 @@ class Outcome:
     help="Simulate so many trials of this size and count how often the intervals hold.",
 )
 @click.option("--bayes", is_flag=True, help="Errors-in-variables model by MCMC: the error of the next mass.")
+@click.option("--methods", is_flag=True, help="Also print lines, limits of agreement, repeatability and pairs.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 @click.option("-o", "--output", metavar="REPORT.json", type=_FILE, help="Write the report as JSON to this file.")
 @click.option("--html", metavar="REPORT.html", type=_FILE, help="Write tables and figures as one self-contained page.")
@@ -80,6 +81,7 @@ def command(
     trial: Path,
     excision: Path,
     columns: Path | None,
+    methods: bool,
     as_json: bool,
     output: Path | None,
     html: Path | None,
@@ -111,7 +113,7 @@ def command(
         write_text(output, dump_json(outcome.document), force=force)
     if html:
         _write_html(html, outcome, force=force)
-    click.echo(dump_json(outcome.document) if as_json else _text(outcome), nl=False)
+    click.echo(dump_json(outcome.document) if as_json else _text(outcome, methods=methods), nl=False)
 
 
 def _settings(given: dict[str, Any], protocol: Path | None) -> Settings:
@@ -197,18 +199,18 @@ def _provenance(inputs: TrialInputs, settings: Settings, protocol: Path | None) 
     ).as_dict()
 
 
-def _text(outcome: Outcome) -> str:
+def _text(outcome: Outcome, *, methods: bool) -> str:
     from tactile_bayes.report.trial_text import trial_text
 
     more = [] if outcome.next_mass is None else outcome.next_mass.lines()
-    return trial_text(outcome.report, checks=outcome.checks, more=more)
+    return trial_text(outcome.report, methods=methods, checks=outcome.checks, more=more)
 
 
 def _write_html(path: Path, outcome: Outcome, *, force: bool) -> None:
     from tactile_bayes.files.atomic import write_text
     from tactile_bayes.report.trial_html import trial_html
 
-    write_text(path, trial_html(outcome.report, outcome.document, text=_text(outcome)), force=force)
+    write_text(path, trial_html(outcome.report, outcome.document, text=_text(outcome, methods=True)), force=force)
 
 
 def _refuse_inputs(output: Path, *inputs: Path) -> None:

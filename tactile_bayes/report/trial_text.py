@@ -14,9 +14,13 @@ _HEADINGS = ("", "found", "MAPE %", "MAPE % found", "MAE mm", "bias % found", "s
 
 
 def trial_text(
-    report: TrialReport, *, checks: Mapping[str, IntervalCheck] | None = None, more: Sequence[str] = ()
+    report: TrialReport,
+    *,
+    methods: bool = False,
+    checks: Mapping[str, IntervalCheck] | None = None,
+    more: Sequence[str] = (),
 ) -> str:
-    """The whole report; `more` lines follow it, and the research-use line comes last."""
+    """The whole report, with the second table when `methods`; the research-use line comes last."""
     lines = [
         f"Sizes against excision: {_plural(report.masses, 'mass')} of {_plural(report.patients, 'patient')}, "
         f"{_plural(report.readings, 'reading')}{_synthetic(report)}",
@@ -24,8 +28,7 @@ def trial_text(
         *_aligned([_HEADINGS, *(_row(one) for one in report.modalities.values())]),
         "",
         *_notes(report),
-        "",
-        *method_lines(report),
+        *(["", *method_lines(report)] if methods else []),
         *(_check_line(name, one) for name, one in (checks or {}).items()),
         *more,
         RESEARCH_USE,
