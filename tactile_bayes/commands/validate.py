@@ -152,6 +152,7 @@ def _analyse(inputs: TrialInputs, settings: Settings, protocol: Path | None) -> 
         confidence=confidence,
         error_ratio=settings.error_ratio,
         ex_vivo_sd_mm=inputs.ex_vivo_sd_mm,
+        seed=settings.seed,
     )
     document = {"schema": SCHEMA, **as_document(report)}
     checks: dict[str, IntervalCheck] = {}

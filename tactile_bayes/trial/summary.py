@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from tactile_bayes.trial import accuracy, origin_line, replicates, spread
+from tactile_bayes.trial.bootstrap import SEED
 from tactile_bayes.trial.calibration import Calibration, Prediction, calibration, log_normal, predictions
 from tactile_bayes.trial.comparison import mape_ratios
 from tactile_bayes.trial.coverage import Coverage, coverage
@@ -70,6 +71,7 @@ def summarise(
     confidence: float = 0.95,
     error_ratio: float = 1.0,
     ex_vivo_sd_mm: Mapping[MassKey, float | None] | None = None,
+    seed: int = SEED,
 ) -> TrialReport:
     """Compare each modality's sizes with excision.
 
@@ -85,6 +87,8 @@ def summarise(
         Variance of the error of ex-vivo sizes over that of a modality's, for the Deming lines.
     ex_vivo_sd_mm
         Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature.
+    seed
+        Of the sign flips, where there are too many to try all.
     """
     readings = list(readings)
     sizes = gather(readings, ex_vivo_mm)
@@ -101,7 +105,7 @@ def summarise(
         synthetic_readings=sum(reading.synthetic for reading in readings),
         readings=len(readings),
         confidence=float(confidence),
-        paired=tuple(paired_comparisons(sizes, confidence=confidence)),
+        paired=tuple(paired_comparisons(sizes, confidence=confidence, seed=seed)),
         sizes=sizes,
         ex_vivo_sd_mm={number: (ex_vivo_sd_mm or {}).get(key) for key, number in mass_numbers(ex_vivo_mm).items()},
     )
