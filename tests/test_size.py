@@ -140,10 +140,11 @@ def test_outside_the_table_is_said_with_its_range() -> None:
         ({"normalise": "gain"}, "normalise gain (the calibration: mean)"),
         ({"background": "free"}, "background free (the calibration: fixed)"),
         ({"radius_mm": 12.0}, "fit radius 12 mm (the calibration: 20 mm)"),
+        ({"noise": "field"}, "noise field (the calibration: independent)"),
     ],
 )
 def test_another_recipe_is_named(changes: dict[str, object], words: str) -> None:
-    same = {"normalise": "mean", "background": "fixed", "radius_mm": 20.0}
+    same = {"normalise": "mean", "background": "fixed", "radius_mm": 20.0, "noise": "independent"}
     assert Recipe().differences(**same) == []
     assert Recipe().differences(**(same | changes)) == [words]
 
