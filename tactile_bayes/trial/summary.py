@@ -90,7 +90,8 @@ def summarise(
     seed
         Of the sign flips, where there are too many to try all.
     """
-    readings = list(readings)
+    # one order for every order of the rows: an iteration's last digits depend on it
+    readings = sorted(readings, key=lambda r: (r.key, r.modality, r.replicate))
     sizes = gather(readings, ex_vivo_mm)
     beside = _Beside(readings, ex_vivo_mm, ex_vivo_sd_mm or {})
     return TrialReport(
