@@ -258,6 +258,14 @@ def test_slope_zero_has_a_defined_answer() -> None:
     assert deming(x, np.array([4.9, 5.1, 5.1, 4.9])).slope == pytest.approx(0)
 
 
+def test_points_that_neither_rise_nor_fall_determine_no_line() -> None:
+    """Half the slopes of these four are below -1, so the median shifted by their number is past the last slope."""
+    x, y = np.array([5.0, 6.0, 7.0, 8.0]), np.array([6.0, 1.0, 7.0, 2.0])
+    for scale in (1.0, 2.0, 1e-6):
+        with pytest.raises(UndefinedError, match="neither rise nor fall"):
+            passing_bablok(scale * x, scale * y)
+
+
 def test_what_determines_no_line_is_refused() -> None:
     same, one = np.full(5, 7.0), np.arange(1.0, 6.0)
     for name, fit in FITS.items():

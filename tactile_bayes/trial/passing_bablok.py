@@ -52,7 +52,8 @@ def passing_bablok(
     Raises
     ------
     UndefinedError
-        With fewer than two different points, or when the middle slope is vertical.
+        With fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond 45
+        degrees against the line that the shifted median lies beyond the last.
     """
     if len(x) < 2:
         raise UndefinedError(f"a line needs at least 2 masses (found {len(x)})")
@@ -61,6 +62,8 @@ def passing_bablok(
     if angles.number == 0:
         raise UndefinedError("all points coincide, so no line is determined")
     shift = angles.shift(rising=rising)
+    if (angles.number + shift) // 2 + 1 > angles.number or angles.number + shift < 1:
+        raise UndefinedError("the shifted median lies beyond the slopes: the points neither rise nor fall")
     slope = _at(angles, angles.number + shift, measure)
     if not abs(slope) < 1e15:
         raise UndefinedError("the middle slope is vertical")
