@@ -24,6 +24,7 @@ def table(*cells: Any) -> Table:
 
 
 ROWS = {
+    "size without status": ((9.5, None, None, None, None), ["status", "is blank beside size_mm 9.5"]),
     "no size": ((None, "detected", None, None, None), ["size_mm", "is blank while status is detected"]),
     "size not found": ((9.5, "not_detected", None, None, None), ["size_mm", "is 9.5 while status is not_detected"]),
     "size not done": ((9.5, "not_done", None, None, None), ["size_mm", "not_done"]),
@@ -32,6 +33,12 @@ ROWS = {
     "upside down": ((9.5, "detected", 12.0, 11.0, 0.9), ["low_mm", "is 12, above high_mm 11"]),
     "interval not found": ((None, "not_detected", 8.0, 11.0, 0.9), ["low_mm", "while status is not_detected"]),
 }
+
+
+def test_a_row_blank_in_size_and_status_was_not_done() -> None:
+    blank = table("P1", "1", "cbe", 1, None, None, None, None, None)
+    (reading,) = readings_from_columns(blank.columns, fault=blank.error)
+    assert (reading.status, reading.size_mm) == ("not_done", None)
 
 
 @pytest.mark.parametrize("name", ROWS)

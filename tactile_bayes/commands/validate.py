@@ -91,8 +91,8 @@ def command(
 ) -> None:
     """Compare sizes with excision: errors, lines, agreement, repeatability and calibration of each modality.
 
-    TRIAL.csv has the columns patient, mass, modality, replicate, size_mm, status (detected, not_detected or not_done)
-    and optionally sd_mm, low_mm, high_mm, probability, reader, posterior, synthetic. EX.csv has patient, mass,
+    TRIAL.csv has the columns patient, mass, modality, replicate, size_mm, status (detected, not_detected, not_done or
+    blank) and optionally sd_mm, low_mm, high_mm, probability, reader, posterior, synthetic. EX.csv has patient, mass,
     ex_vivo_mm and optionally ex_vivo_second_mm, sd_mm, synthetic. Sizes are in mm.
 
     Example: tactile-bayes validate trial.csv --excision excision.csv -o report.json

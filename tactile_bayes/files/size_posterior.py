@@ -85,13 +85,15 @@ def _check_blank(columns: Mapping[str, list[Any]], row: int, *, fault: Callable[
             )
 
 
-def _check_status(status: str, stated: StatedSize, row: int, *, fault: Callable[..., BadDataError]) -> None:
+def _check_status(status: str | None, stated: StatedSize, row: int, *, fault: Callable[..., BadDataError]) -> None:
     if status == "detected" and stated.size_mm is None:
         way_out = "give status not_detected, or not_done"
         raise fault(row, "posterior", "names an estimate without a size while status is detected", way_out=way_out)
     if status != "detected" and stated.size_mm is not None:
         way_out = "give status detected, or leave posterior blank"
-        raise fault(row, "posterior", f"names an estimate with a size while status is {status}", way_out=way_out)
+        raise fault(
+            row, "posterior", f"names an estimate with a size while status is {status or 'blank'}", way_out=way_out
+        )
 
 
 def _from_json(path: Path) -> StatedSize:

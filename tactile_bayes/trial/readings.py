@@ -170,7 +170,7 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     more = [columns.get(name, [None] * len(columns["patient"])) for name in ("sd_mm", "reader", "synthetic")]
     for row, cells in enumerate(zip(*(columns[name] for name in names), *more, strict=True)):
         patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, *others = cells
-        _check_status(row, status, size_mm, fault=fault)
+        status = _status(row, status, size_mm, fault=fault)
         interval = _interval(row, status, (low_mm, high_mm, probability), fault=fault)
         sd_mm, reader, synthetic = others
         key = (patient, mass)
@@ -178,13 +178,19 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     return readings
 
 
-def _check_status(row: int, status: str, size_mm: float | None, *, fault: CellFault) -> None:
+def _status(row: int, status: str | None, size_mm: float | None, *, fault: CellFault) -> str:
+    """The status, checked against the size; a row blank in both was not done."""
+    if status is None and size_mm is None:
+        return "not_done"
+    if status is None:
+        raise fault(row, "status", f"is blank beside size_mm {size_mm:g}", way_out="give status detected")
     if status == "detected" and size_mm is None:
         way_out = "give the size, or status not_detected or not_done"
         raise fault(row, "size_mm", "is blank while status is detected", way_out=way_out)
     if status != "detected" and size_mm is not None:
         way_out = "leave size_mm blank, or give status detected"
         raise fault(row, "size_mm", f"is {size_mm:g} while status is {status}", way_out=way_out)
+    return status
 
 
 def _interval(
