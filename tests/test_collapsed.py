@@ -107,6 +107,12 @@ def test_amplitude_and_noise_come_back() -> None:
     amplitude, level, noise_sd = fit.target.draw_linear(theta, np.random.default_rng(0))
     assert amplitude.mean() == pytest.approx(TRUTH["amplitude"], abs=4 * amplitude.std())
     assert level.mean() == pytest.approx(1.0, abs=0.005)
+    # against dense algebra without a field: the spread of the level, and that it falls as the amplitude rises
+    design = np.column_stack([fit.target.design, fit.target._bumps(fit.mode[None])[0]])
+    joint = np.linalg.inv(design.T @ (design / fit.target.variance[:, None]))
+    white = np.sqrt(joint[0, 0]) * 0.01 / np.sqrt(fit.target.variance.mean())
+    assert 0.9 * white < level.std() < 3.0 * white
+    assert np.corrcoef(level, amplitude)[0, 1] < 0.0
     assert noise_sd.mean() == pytest.approx(0.01, rel=0.05)
 
 

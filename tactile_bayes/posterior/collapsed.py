@@ -34,14 +34,17 @@ class LinearSolution:
     ----------
     amplitude, level : (m,) arrays
         Conditional means.
-    amplitude_variance, level_variance : (m,) arrays
+    amplitude_variance : (m,) array
         Over tau^2.
+    level_slope, level_variance : (m,) arrays
+        By how much the level falls as the amplitude rises, and its variance over tau^2 given the amplitude.
     sum_of_squares : (m,) array
     """
 
     amplitude: FloatArray
     level: FloatArray
     amplitude_variance: FloatArray
+    level_slope: FloatArray
     level_variance: FloatArray
     sum_of_squares: FloatArray
 
@@ -155,10 +158,11 @@ class CollapsedTarget:
             index = _choose(evidence, rng)
             solution = _pick(solutions, index)
             tau = np.sqrt(solution.sum_of_squares / rng.chisquare(dof, size=len(part)))
-            amplitude[i : i + BLOCK] = solution.amplitude + tau * np.sqrt(
-                solution.amplitude_variance
-            ) * rng.standard_normal(len(part))
-            level[i : i + BLOCK] = solution.level
+            z = rng.standard_normal((2, len(part)))
+            off = tau * np.sqrt(solution.amplitude_variance) * z[0]
+            amplitude[i : i + BLOCK] = solution.amplitude + off
+            about = tau * np.sqrt(solution.level_variance) * z[1]
+            level[i : i + BLOCK] = solution.level - solution.level_slope * off + about
             noise[i : i + BLOCK] = tau * np.sqrt(self.variance.mean())
         return amplitude, level, noise
 
@@ -223,8 +227,9 @@ def _marginal(
     # a dent is no lump: only rises have density
     evidence = np.where(amplitude > 0, evidence, -np.inf)
     level = (inverse @ gram[:c, c])[0] - to_level[:, 0] * amplitude if c else np.zeros(len(amplitude))
-    level_variance = inverse[0, 0] + to_level[:, 0] ** 2 / power if c else np.zeros(len(amplitude))
-    return evidence, LinearSolution(amplitude, level, 1.0 / power, level_variance, sum_of_squares)
+    slope = to_level[:, 0] if c else np.zeros(len(amplitude))
+    variance = np.full(len(amplitude), inverse[0, 0] if c else 0.0)
+    return evidence, LinearSolution(amplitude, level, 1.0 / power, slope, variance, sum_of_squares)
 
 
 def _independent_variance(cells: FitCells) -> FloatArray:
@@ -250,5 +255,5 @@ def _choose(evidence: FloatArray, rng: np.random.Generator) -> np.ndarray[tuple[
 
 def _pick(solutions: list[LinearSolution], index: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> LinearSolution:
     rows = np.arange(len(index))
-    names = ("amplitude", "level", "amplitude_variance", "level_variance", "sum_of_squares")
+    names = ("amplitude", "level", "amplitude_variance", "level_slope", "level_variance", "sum_of_squares")
     return LinearSolution(*(np.stack([getattr(s, name) for s in solutions], axis=1)[rows, index] for name in names))
