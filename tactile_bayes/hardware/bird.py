@@ -10,13 +10,13 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading, plausible
+from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, RecordParser, plausible
 
 SCALE_INCH: Final = 36.0
 _WORDS: Final = 7
 
 
-class BirdParser:
+class BirdParser(RecordParser):
     """Flock of Birds records.
 
     Parameters
@@ -28,26 +28,10 @@ class BirdParser:
     """
 
     def __init__(self, *, scale_inch: float = SCALE_INCH, group: bool = False) -> None:
-        self.garbage_bytes = 0
+        super().__init__()
         self.record_bytes = 2 * _WORDS + group
         self._scale = scale_inch
         self._group = group
-        self._rest = b""
-
-    def feed(self, data: bytes) -> list[Reading]:
-        """Poses that are complete with `data`."""
-        buffer, place, size = self._rest + data, 0, self.record_bytes
-        found: list[Reading] = []
-        while len(buffer) - place >= size:
-            pose = self._record(buffer[place : place + size])
-            if pose is None:
-                place += 1
-                self.garbage_bytes += 1
-            else:
-                found.append(pose)
-                place += size
-        self._rest = buffer[place:]
-        return found
 
     def _record(self, record: bytes) -> PoseReading | None:
         if not record[0] & 0x80 or any(byte & 0x80 for byte in record[1:]):

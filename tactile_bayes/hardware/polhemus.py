@@ -16,7 +16,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading, plausible
+from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading, RecordParser, plausible
 
 FASTRAK_BINARY: Final = (2, 11, 0)
 FASTRAK_ASCII: Final = (2, 11, 1)
@@ -42,7 +42,7 @@ _LIBERTY_HEADER: Final = struct.Struct("<2sBBBBH")
 _LONGEST_LINE: Final = 512
 
 
-class FastrakParser:
+class FastrakParser(RecordParser):
     """FASTRAK records, ASCII or binary, found again after garbage by their fixed layout.
 
     Binary records carry no checksum: the station, the error byte, the closing space and the length of the quaternion
@@ -50,28 +50,12 @@ class FastrakParser:
     """
 
     def __init__(self, items: Sequence[int] = FASTRAK_BINARY, *, binary: bool = True) -> None:
-        self.garbage_bytes = 0
+        super().__init__()
         self._items = tuple(items)
         self._binary = binary
-        self._rest = b""
         numbers = sum(_NUMBERS[_FASTRAK_KIND[item]] for item in items if item in _FASTRAK_KIND)
         ends = {0: 1, 1: 2}
         self.record_bytes = 3 + numbers * (4 if binary else 7) + sum(ends.get(item, 0) for item in items)
-
-    def feed(self, data: bytes) -> list[Reading]:
-        """Poses that are complete with `data`."""
-        buffer, place, size = self._rest + data, 0, self.record_bytes
-        found: list[Reading] = []
-        while len(buffer) - place >= size:
-            pose = self._record(buffer[place : place + size])
-            if pose is None:
-                place += 1
-                self.garbage_bytes += 1
-            else:
-                found.append(pose)
-                place += size
-        self._rest = buffer[place:]
-        return found
 
     def _record(self, record: bytes) -> PoseReading | None:
         station, error = record[1] - 48, record[2:3]
@@ -118,35 +102,19 @@ def _columns(text: bytes, *, decimals: int) -> tuple[float, ...] | None:
         return None
 
 
-class LibertyParser:
+class LibertyParser(RecordParser):
     """LIBERTY, PATRIOT and Latus binary records, read by their list of items.
 
     The header's size is a check with a tolerance of the closing space, which firmware may or may not count.
     """
 
     def __init__(self, items: Sequence[int] = LIBERTY_BINARY) -> None:
-        self.garbage_bytes = 0
+        super().__init__()
         self._kinds = [_LIBERTY_KIND[item] for item in items if item in _LIBERTY_KIND]
         letters = {"time_ms": "I", "count": "I", "stylus": "I", "distortion": "i"}
         self._body = struct.Struct("<" + "".join(letters.get(k, f"{_NUMBERS.get(k, 1)}f") for k in self._kinds))
         self._tail = b"".join({0: b" ", 1: b"\r\n"}.get(item, b"") for item in items)
         self.record_bytes = _LIBERTY_HEADER.size + self._body.size + len(self._tail)
-        self._rest = b""
-
-    def feed(self, data: bytes) -> list[Reading]:
-        """Poses that are complete with `data`."""
-        buffer, place, size = self._rest + data, 0, self.record_bytes
-        found: list[Reading] = []
-        while len(buffer) - place >= size:
-            pose = self._record(buffer[place : place + size])
-            if pose is None:
-                place += 1
-                self.garbage_bytes += 1
-            else:
-                found.append(pose)
-                place += size
-        self._rest = buffer[place:]
-        return found
 
     def _record(self, record: bytes) -> PoseReading | None:
         tag, station, command, error, _, size = _LIBERTY_HEADER.unpack_from(record)

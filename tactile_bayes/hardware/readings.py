@@ -85,6 +85,38 @@ class Parser(Protocol):
         """Readings that are complete with `data`."""
 
 
+class RecordParser:
+    """A parser of records of one fixed length, found again after garbage by trying the next byte.
+
+    A subclass sets `record_bytes` and says what `_record` makes of that many bytes.
+    """
+
+    record_bytes: int
+
+    def __init__(self) -> None:
+        self.garbage_bytes = 0
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Poses that are complete with `data`."""
+        buffer, place, size = self._rest + data, 0, self.record_bytes
+        found: list[Reading] = []
+        while len(buffer) - place >= size:
+            pose = self._record(buffer[place : place + size])
+            if pose is None:
+                place += 1
+                self.garbage_bytes += 1
+            else:
+                found.append(pose)
+                place += size
+        self._rest = buffer[place:]
+        return found
+
+    def _record(self, record: bytes) -> PoseReading | None:
+        """The record's pose, or None when the bytes are not a record."""
+        raise NotImplementedError
+
+
 def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) -> bool:
     """Whether numbers can be a pose: finite, within 25 m, a quaternion of unit length within a scan's tolerance."""
     if not all(map(math.isfinite, (*position_mm, *quaternion_wxyz))):

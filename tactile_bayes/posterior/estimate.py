@@ -20,13 +20,13 @@ from tactile_bayes.posterior.noise import level_offset
 from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
 from tactile_bayes.posterior.size_calibration import SizeCalibration
+from tactile_bayes.presets import CELL_PER_SIGMA
 
 Status = Literal["estimate", "no_estimate"]
 ROTATION_ODDS = 3.0
 """A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
 DETECTED = 0.95
 MOST_INVALID = 0.05
-COARSE_CELL = 0.75
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,7 +332,7 @@ def _diagnostics(
     return {
         "cells": len(fit.cells),
         "covered_share": fit.covered_share,
-        "coarse_cells": tactile_map.recipe.cell_mm > COARSE_CELL * min(sigma_x, sigma_y),
+        "coarse_cells": tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(sigma_x, sigma_y),
         "outside_calibration": outside,
     }
 
