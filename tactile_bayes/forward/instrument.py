@@ -123,7 +123,8 @@ def head_positions(scene: Scene, time_s: FloatArray) -> tuple[FloatArray, FloatA
     )
     # Yaw stays at half: turning about the normal smears a lump's widths, rocking hardly does.
     turn = np.stack([np.sin(phase["roll"]), np.sin(phase["pitch"] + 0.5), 0.5 * np.sin(phase["yaw"] + 1.5)], axis=-1)
-    return rotation_from_vector(tilt * turn), origin
+    yaw = rotation_from_vector(np.array([0.0, 0.0, np.radians(scene.strokes.yaw_deg)]))
+    return yaw @ rotation_from_vector(tilt * turn), origin
 
 
 def _stroke(strokes: Strokes, share: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -81,6 +81,8 @@ class Strokes:
         Parallel lines, their distance, and how far each reaches either side of the middle.
     wander_mm, tilt_deg
         Amplitudes of the slow departure from the line and of the head's rocking.
+    yaw_deg
+        By how much the head is turned about the normal, away from square to the strokes.
     """
 
     lines: int = 5
@@ -88,6 +90,7 @@ class Strokes:
     half_length_mm: float = 34.0
     wander_mm: float = 0.5
     tilt_deg: float = 2.0
+    yaw_deg: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
