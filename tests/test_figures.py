@@ -116,6 +116,52 @@ def test_the_fit_is_drawn_as_ellipses_of_one_and_two_sigma(tmp_path, axes):
     assert {one.center for one in ellipses} == {(3.0, -2.0)}
 
 
+def few_map() -> TactileMap:
+    """Two columns of cells, at x of 19 and 20 mm, with nine readings."""
+    whole = bump_map()
+    count = whole.count.copy()
+    count[:, -2:] = 9
+    return replace(whole, count=count)
+
+
+def hatching(axes) -> list:
+    return [one for one in axes.collections if one.get_clip_path() is not None]
+
+
+def test_cells_with_few_readings_are_hatched_and_no_others(tmp_path, axes):
+    map_figure(few_map(), tmp_path / "few.png")
+    left, right, *_ = axes[0].figure.axes
+    for panel in (left, right):
+        (lines,) = hatching(panel)
+        cells, _ = lines.get_clip_path().get_transformed_path_and_affine()
+        span = lines.get_clip_path()._path.get_extents()
+        assert (span.x0, span.x1, span.y0, span.y1) == (18.5, 20.5, -15.5, 15.5)
+        assert len(cells.vertices) == 5 * 2 * 31
+    assert [text.get_text() for text in right.get_legend().get_texts()] == ["fewer than 10 readings: noisy"]
+
+
+def test_a_map_read_well_everywhere_has_no_hatching(tmp_path, axes):
+    map_figure(bump_map(), tmp_path / "well.png")
+    left, right, *_ = axes[0].figure.axes
+    assert not hatching(left) + hatching(right)
+    assert right.get_legend() is None
+
+
+def test_hatching_shows_without_colour(tmp_path, axes):
+    """In grey the hatched cells hold both nearly black and nearly white; cells beside them do not."""
+    from PIL import Image
+
+    map_figure(few_map(), tmp_path / "few.png")
+    grey = np.asarray(Image.open(tmp_path / "few.png").convert("L"), dtype=float)[::-1]
+    for panel in axes[0].figure.axes[:2]:
+        for x_mm, hatched in ((19.5, True), (15.5, False)):
+            corners = panel.transData.transform([(x_mm - 0.8, -10.0), (x_mm + 0.8, 10.0)])
+            (left, right), (bottom, top) = (sorted(corners[:, axis].astype(int)) for axis in (0, 1))
+            part = grey[bottom:top, left:right]
+            both = min((part < 60).mean(), (part > 200).mean())
+            assert (both > 0.05) == hatched, (x_mm, both)
+
+
 def test_noise_alone_does_not_fill_the_colours(tmp_path, axes):
     flat = bump_map()
     noise = np.random.default_rng(0).normal(1, 0.01, flat.mean.shape)

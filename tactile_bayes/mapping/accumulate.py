@@ -39,9 +39,12 @@ class Accumulated:
         Passes over the scan.
     last_change
         Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for.
+    levels
+        What the frames were divided by, one array a scan.
     """
 
     sums: CellSums
+    levels: list[FloatArray]
     scale: float = 1.0
     passes: int = 1
     last_change: float = 0.0
@@ -120,12 +123,12 @@ def accumulate(
     if normalise == "none":
         levels = [np.ones(len(level)) for level in levels]
     if normalise != "gain":
-        return Accumulated(add_all(sources, levels, cell_mm=cell_mm, engine=engine, progress=progress))
+        return Accumulated(add_all(sources, levels, cell_mm=cell_mm, engine=engine, progress=progress), levels)
     from tactile_bayes.mapping.gains import solve_gains
 
     solved = solve_gains(sources, levels, tolerance=GAIN_TOLERANCE, progress=progress)
     sums = add_all(sources, solved.gains, cell_mm=cell_mm, engine=engine, progress=progress)
-    return Accumulated(sums, float(np.nanmedian(sums.mean())), solved.passes, solved.last_change)
+    return Accumulated(sums, solved.gains, float(np.nanmedian(sums.mean())), solved.passes, solved.last_change)
 
 
 def add_all(

@@ -19,6 +19,7 @@ from tactile_bayes.mapping.neighbourhood import local_plane
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.quality import cell_figures, frame_figures, plane_figures, stroke_figures
+from tactile_bayes.mapping.shared_frames import shared_frame_figures
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.mapping.timing import timing_figures
@@ -113,6 +114,7 @@ def build_map(
         sources, strokes = find_shifts(sources, levels, cell_mm=cell_mm, engine=loops)
         figures.update(stroke_figures(strokes))
     done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
+    figures.update(shared_frame_figures(sources, done.levels, done.sums))
     recipe = MapRecipe("scan", normalise, float(cell_mm), rules.window_kpa, late_ms, flat_field, register_strokes)
     return _as_map(done, selections, plane, recipe, figures)
 

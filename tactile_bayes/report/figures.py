@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import atomic_path
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 _DPI = 150
 _SCALE_BAR_MM = 10.0
-# Cells with fewer readings do not set the range of the colours: one noisy edge cell would wash out the lump.
-_COLOUR_READINGS = 10
+# Lines of hatching across the longer side of the map.
+_HATCHES = 60
 # The colours span at least this share of the level below and above it, so that noise alone does not look like a lump.
 _LEAST_COLOURS = (0.9, 1.3)
 _VALUE_LABELS = {
@@ -72,6 +72,8 @@ def map_figure(
     A map on a plane is drawn as the examiner sees the breast, z into the page: x runs to the left when y runs up. With
     landmarks the sternal notch is in the upper half, and an arrow points to it.
 
+    Cells with fewer than `FEW_READINGS` readings are hatched in both panels.
+
     Parameters
     ----------
     fit
@@ -93,7 +95,9 @@ def map_figure(
         _draw_values(left, tactile_map)
         _draw_coverage(right, tactile_map)
         for axes in (left, right):
+            _hatch_few(axes, tactile_map)
             _orient(axes, tactile_map)
+        _explain_hatching(right, tactile_map)
         if fit:
             _draw_fit(left, fit)
         _draw_scale_bar(left)
@@ -180,7 +184,8 @@ def _draw_values(axes: Axes, tactile_map: TactileMap) -> None:
 
 
 def _colour_range(tactile_map: TactileMap) -> tuple[float, float]:
-    well = tactile_map.covered & (tactile_map.count >= _COLOUR_READINGS)
+    """Cells with few readings do not set the range: one noisy edge cell would wash out the lump."""
+    well = tactile_map.covered & (~tactile_map.few)
     values = tactile_map.mean[well if well.any() else tactile_map.covered]
     level = float(np.median(values))
     return min(float(values.min()), _LEAST_COLOURS[0] * level), max(float(values.max()), _LEAST_COLOURS[1] * level)
@@ -195,6 +200,44 @@ def _draw_coverage(axes: Axes, tactile_map: TactileMap) -> None:
     )
     _colour_bar(axes, image, "readings a cell")
     axes.set_title("Coverage", loc="left", fontsize=11)
+
+
+def _hatch_few(axes: Axes, tactile_map: TactileMap) -> None:
+    """White lines with black edges over the cells with few readings: to be seen on every colour, and without any."""
+    if not tactile_map.few.any():
+        return
+    from matplotlib import patheffects
+    from matplotlib.collections import LineCollection
+    from matplotlib.path import Path as Outline
+
+    half = tactile_map.recipe.cell_mm / 2
+    rows, columns = np.nonzero(tactile_map.few)
+    middle = np.stack([tactile_map.x_mm[columns], tactile_map.y_mm[rows]], axis=1)
+    corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    codes = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
+    cells = Outline((middle[:, None] + corners).reshape(-1, 2), np.tile(codes, len(middle)))
+    left, right, bottom, top = _extent(tactile_map)
+    height = top - bottom
+    starts = np.arange(left - height, right, max(right - left, height) / _HATCHES)
+    lines = LineCollection(
+        [[(start, bottom), (start + height, top)] for start in starts],
+        colors="white",
+        linewidths=0.7,
+        path_effects=[patheffects.withStroke(linewidth=1.6, foreground="black")],
+    )
+    axes.add_collection(lines, autolim=False)
+    lines.set_clip_path(cells, axes.transData)
+
+
+def _explain_hatching(axes: Axes, tactile_map: TactileMap) -> None:
+    """Below the panel, where it hides no cell."""
+    if not tactile_map.few.any():
+        return
+    from matplotlib.patches import Patch
+
+    sample = Patch(facecolor="0.35", edgecolor="white", hatch="////", linewidth=0)
+    label = f"fewer than {FEW_READINGS} readings: noisy"
+    axes.legend([sample], [label], loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=8, frameon=False)
 
 
 def _colour_bar(axes: Axes, image: Any, label: str) -> None:

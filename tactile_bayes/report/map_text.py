@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from tactile_bayes.mapping.advice import advise_cell
+from tactile_bayes.mapping.shared_frames import LEAST_SHARE
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE
 
@@ -132,12 +133,31 @@ def _cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
             "coverage",
             f"{100 * quality['coverage']:.0f} % of the cells, {quality['median_count']:.0f} readings a cell",
         )
+    yield from _shared(tactile_map)
     yield "resolves", f"lumps of map width sigma {tactile_map.recipe.cell_mm / CELL_PER_SIGMA:.2g} mm or more"
     advice = advise_cell(tactile_map)
     if advice is not None:
         yield "cell", advice.text()
     if tactile_map.recipe.normalise == "gain":
         yield "gain solve", f"{quality['gain_passes']:.0f} passes, last change {quality['gain_last_change']:.1e}"
+
+
+def _shared(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """What a frame's readings have in common, and what a cell's readings are worth."""
+    quality = tactile_map.quality
+    if "median_count" not in quality:
+        return
+    if "effective_readings" not in quality:
+        yield "shared errors", "not known: too few frames that cross each other's cells, or readings without scatter"
+        return
+    share = f"under {100 * LEAST_SHARE:.0f} %"
+    if quality["shared_share"] >= LEAST_SHARE:
+        share = f"{100 * quality['shared_share']:.0f} %"
+    length = f", over {quality['shared_length_mm']:.1f} mm" if "shared_length_mm" in quality else ""
+    worth = (
+        f"{quality['median_count']:.0f} readings a cell are worth {quality['effective_readings']:.0f} independent ones"
+    )
+    yield "shared errors", f"{share} of a reading's variance is its neighbours' in the frame too{length}; {worth}"
 
 
 def _notes(tactile_map: TactileMap) -> Iterator[str]:
