@@ -10,7 +10,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray, Plane, inverse, patient_from_base
 from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress, sources_of
-from tactile_bayes.mapping.convention import hint
+from tactile_bayes.mapping.convention import check_convention, hint
 from tactile_bayes.mapping.engine import Engine, choose_engine
 from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
@@ -103,6 +103,7 @@ def build_map(
     if isinstance(latency_ms, str):
         late_ms = _latency(selections, rules, cell_mm, figures)
         selections = rules.select([part.scan for part in selections], late_ms)
+    figures |= check_convention(selections)
     plane = _plane(selections)
     if plane_radius_mm is not None:
         radius = None if isinstance(plane_radius_mm, str) else plane_radius_mm

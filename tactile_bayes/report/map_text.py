@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from tactile_bayes.mapping.advice import advise_cell
+from tactile_bayes.mapping.convention import CONVENTIONS
 from tactile_bayes.mapping.shared_frames import LEAST_SHARE
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE
@@ -118,6 +119,11 @@ def _plane(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         of = f"{quality['plane_frames']:.0f} frames" if "plane_frames" in quality else "all frames used"
         near = f" within {quality['plane_radius_mm']:.0f} mm of the mass" if "plane_radius_mm" in quality else ""
         yield "  fitted to", f"{of}{near}; longest over second spread {quality['plane_condition']:.1f}"
+    if "normal_agreement" in quality:
+        yield (
+            "rotations",
+            f"face and motion agree to {quality['normal_agreement']:.3f} of 1, as the quaternions are told",
+        )
     moved = f"{quality['span_x_mm']:.0f} x {quality['span_y_mm']:.0f} mm"
     yield "head", f"turned by {quality['yaw_sd_deg']:.1f} deg (SD), moved {moved}"
     repeats = quality.get("landmark_spread_mm")
@@ -185,5 +191,10 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
         yield "coverage is low: add strokes side by side, or use larger cells"
     if quality.get("tilt_deg", 0.0) > _HIGH_TILT_DEG:
         yield "the head's face was tilted against its motion: check the tracker's lever arm and quaternion order"
+    if "other_convention" in quality:
+        other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
+        yield f"check the quaternions: {other}, face and motion would agree to {agreement:.3f}; widths may be wrong"
+    elif "normal_agreement" not in quality and "plane_rms_mm" in quality:
+        yield "the motion does not tell whether the quaternions are scalar first and from sensor to base: check them"
     if quality.get("yaw_sd_deg", 0.0) > _HIGH_YAW_DEG:
         yield "the head was turned while scanning: widths across and along it are mixed"
