@@ -120,7 +120,7 @@ def test_a_store_of_other_settings_is_refused(run_cli: Run, tmp_path: Path) -> N
 
 
 FAULTS: dict[str, tuple[tuple[object, ...], int, list[str]]] = {
-    "seat": (("--seat", "sitting"), EXIT_BAD_DATA, ["seat is 'sitting'", "centred, resting or a number from 0 to 1"]),
+    "seat": (("--seat", "sitting"), EXIT_BAD_DATA, ["seat is 'sitting'", "centred, resting or a number from 0 to 2"]),
     "no grid": (("--grid", "none.csv"), EXIT_BAD_DATA, ["none.csv"]),
     "sharp": (("--shoulder-mm", 13), EXIT_BAD_DATA, ["shoulder_mm of the head is 13", "between 0 and 12 mm"]),
     "flat": (("--head-radius-mm", 5), EXIT_BAD_DATA, ["radius_mm of the head is 5", "above 12 mm"]),

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from concurrent.futures import Executor
 
     from tactile_bayes.batch import BatchStore
+    from tactile_bayes.forward.solid_study import SolidSettings
     from tactile_bayes.forward.study import Geometry, LineFit, StudyRow, StudySettings
     from tactile_bayes.forward.tactile_line import TactileLine
     from tactile_bayes.geometry import FloatArray
@@ -20,29 +22,37 @@ _ABOVE_0 = click.FloatRange(min=0.0, min_open=True)
 # The line is a map that does not change in y: a bump of this width there.
 _NO_CHANGE_MM = 1e6
 _GRID_SCHEMA = "study_grid.table.json"
+MODELS = ("plane-strain", "solid")
 
 
 @click.command("study")
 @click.option(
     "--model",
-    type=click.Choice(["plane-strain"]),
+    type=click.Choice(MODELS),
     default="plane-strain",
     show_default=True,
-    help="Forward model: the paper's two-dimensional body.",
+    help="The paper's two-dimensional body, or balls under the whole head in three dimensions.",
 )
 @click.option("--grid", default="paper", show_default=True, metavar="paper|FILE", help="150 cases, or a table of them.")
 @click.option(
     "--seat",
     default="centred",
     show_default=True,
-    metavar="centred|resting|0..1",
+    metavar="centred|resting|0..2",
     help="How far the lump stands out of the gland, where the grid does not say.",
 )
 @click.option("-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write the table; else it is printed.")
 @click.option("--figures", metavar="DIR", type=_FILE, help="Draw figures 5 to 8 of the paper into this directory.")
 @click.option("--head-radius-mm", type=_ABOVE_0, default=35.0, show_default=True, help="Radius of the head's arc.")
-@click.option("--shoulder-mm", type=float, default=3.0, show_default=True, help="Radius of the head's shoulders.")
-@click.option("--mean-kpa", type=_ABOVE_0, default=9.5, show_default=True, help="Force over the head's area.")
+@click.option(
+    "--shoulder-mm",
+    type=float,
+    default=3.0,
+    show_default=True,
+    help="Radius of the head's shoulders; solid: of the rim around its taxels.",
+)
+@click.option("--mean-kpa", type=_ABOVE_0, default=9.5, show_default=True, help="Mean pressure on the head.")
+@click.option("--fat-kpa", type=_ABOVE_0, default=5.0, show_default=True, help="Young's modulus of fat.")
 @click.option("--poisson", type=float, default=0.495, show_default=True, help="Poisson's ratio of the tissues.")
 @click.option("--gland-ratio", type=_ABOVE_0, default=10.0, show_default=True, help="Modulus of gland over fat.")
 @click.option("--thickness-mm", type=_ABOVE_0, help="Depth of the chest wall; 70, or deeper where the lump needs it.")
@@ -64,14 +74,16 @@ def command(
 ) -> None:
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses.
 
-    A head slides over each lump in a layered, two-dimensional body; its frames become a map, and Eq 5 is fitted to it
-    with the background at 1. Cases with an amplitude below 0.02 or a width that is not resolved are marked as not
-    detectable. With -o an interrupted study goes on where it stopped.
+    A head slides over each lump in a layered body; its frames become a map, and a Gaussian is fitted to it with the
+    background at 1: Eq 5 across a cylinder in two dimensions, Eq 7 over a ball in three. Cases with an amplitude below
+    0.02 or a width that is not resolved are marked as not detectable. With -o an interrupted study goes on where it
+    stopped. `calibrate size` learns from the table of the solid model as it is, from the other with
+    --fit-radius-mm 48.
 
     A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
-    lump's centre on the fat-gland boundary, 1 (resting) its lowest point.
+    lump's centre on the fat-gland boundary, 1 (resting) its lowest point; above 1 the lump stands clear of the gland.
 
-    Example: tactile-bayes study --seat resting -o study.csv
+    Example: tactile-bayes study --model solid --seat resting -o study.csv
     """
     from tactile_bayes.batch import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
@@ -79,9 +91,8 @@ def command(
     from tactile_bayes.forward.study import paper_grid
     from tactile_bayes.presets import RESEARCH_USE
 
-    del model  # there is one so far
     chosen = parse_seat(seat)
-    settings = study_settings(**options)
+    settings = study_settings(model=model, **options)
     geometries = paper_grid(chosen) if grid == "paper" else read_grid(Path(grid), seat=chosen)
     if output is not None:
         refuse_existing(output, force=force)
@@ -110,19 +121,22 @@ def study_settings(
     gland_ratio: float,
     thickness_mm: float | None,
     fineness: int,
-) -> StudySettings:
+    fat_kpa: float = 5.0,
+    model: str = "plane-strain",
+) -> StudySettings | SolidSettings:
     """The study's settings from the options of the command line."""
     from tactile_bayes.forward.contact import Head
     from tactile_bayes.forward.study import StudySettings
 
-    return StudySettings(
-        head=Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm),
-        mean_kpa=mean_kpa,
-        poisson=poisson,
-        gland_ratio=gland_ratio,
-        thickness_mm=thickness_mm,
-        fineness=fineness,
-    )
+    # both models are asked for the same section: the solid one rounds it off outside the taxels
+    section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
+    if model == "plane-strain":
+        return StudySettings(section, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
+    from tactile_bayes.forward.scene import Head as Array
+    from tactile_bayes.forward.solid_study import SolidSettings
+
+    array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm)
+    return SolidSettings(array, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
 
 
 def read_grid(path: Path, *, seat: float) -> list[Geometry]:
@@ -142,7 +156,11 @@ def read_grid(path: Path, *, seat: float) -> list[Geometry]:
 
 
 def run_study(
-    geometries: list[Geometry], *, settings: StudySettings, executor: Executor, output: Path | None = None
+    geometries: list[Geometry],
+    *,
+    settings: StudySettings | SolidSettings,
+    executor: Executor,
+    output: Path | None = None,
 ) -> list[StudyRow]:
     """All rows, in the order of the geometries; kept beside `output` as they come.
 
@@ -166,19 +184,34 @@ def run_study(
         return _run_all(geometries, settings=settings, executor=executor, store=store)
 
 
-def _run_all(
-    geometries: list[Geometry], *, settings: StudySettings, executor: Executor, store: BatchStore | None
-) -> list[StudyRow]:
+def _rows_of(settings: StudySettings | SolidSettings) -> Callable[[Geometry], list[StudyRow]]:
+    """What makes the rows of a geometry, importable by name in another process."""
     from functools import partial
 
+    from tactile_bayes.forward.study import StudySettings, run_geometry
+
+    if isinstance(settings, StudySettings):
+        return partial(run_geometry, settings=settings, fit=fit_line)
+    from tactile_bayes.commands.study_raster import fit_raster
+    from tactile_bayes.forward.solid_study import run_solid_geometry
+
+    return partial(run_solid_geometry, settings=settings, fit=fit_raster)
+
+
+def _run_all(
+    geometries: list[Geometry],
+    *,
+    settings: StudySettings | SolidSettings,
+    executor: Executor,
+    store: BatchStore | None,
+) -> list[StudyRow]:
     from tactile_bayes.batch import run_batch
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.forward.study import run_geometry
 
     with progress_bar("geometries") as progress:
         outcomes = run_batch(
-            partial(run_geometry, settings=settings, fit=fit_line),
+            _rows_of(settings),
             geometries,
             key=lambda geometry: geometry.key,
             executor=executor,
@@ -239,12 +272,11 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
 
 
 def table_text(rows: list[StudyRow]) -> str:
-    """The study as a size table that `calibrate size` reads."""
-    from dataclasses import fields
-
-    from tactile_bayes.forward.study import StudyRow
-
-    names = [field.name for field in fields(StudyRow)]
+    """The study as a size table that `calibrate size` reads; sigma_y_mm only where a row has one."""
+    names = ["seat", "d_mm", "depth_ratio", "stiffness_ratio", "amplitude", "sigma_x_mm"]
+    if any(row.sigma_y_mm is not None for row in rows):
+        names.append("sigma_y_mm")
+    names += ["fit_rms", "detectable"]
     lines = [",".join(names)]
     lines += [",".join(_cell(getattr(row, name)) for name in names) for row in rows]
     return "\n".join(lines) + "\n"
@@ -257,18 +289,23 @@ def _cell(value: Any) -> str:
 
 
 def summary(rows: list[StudyRow]) -> str:
-    """How many cases show, and Eq 6 in two stages for each seat."""
+    """How many cases show, and Eq 6 in two stages for each seat and each axis of the head."""
     from tactile_bayes.forward.study import DETECTABLE, learn_as_printed
 
     shown = sum(row.detectable for row in rows)
-    lines = [f"{len(rows)} cases, {len(rows) - shown} not detectable (amplitude below {DETECTABLE:g})"]
+    lines = [f"{len(rows)} cases, {len(rows) - shown} not detectable (amplitude below {DETECTABLE:g}, or not resolved)"]
+    axes = (
+        {"x": ", across the head", "y": ", along it"} if any(row.sigma_y_mm is not None for row in rows) else {"x": ""}
+    )
     for seat in dict.fromkeys(row.seat for row in rows):
-        learned = learn_as_printed([row for row in rows if row.seat == seat])
-        if learned is not None:
-            lines.append(
-                f"{seat}, E2/E1 = 100: d = {learned.m:.2f} (sigma / delta) {learned.b_mm:+.2f} mm, "
-                f"delta = {learned.e:.3f} a^{learned.f:.3f} from {learned.cases} cases (Eq 6 in two stages, as printed)"
-            )
+        for axis, words in axes.items():
+            learned = learn_as_printed([row for row in rows if row.seat == seat], axis=axis)
+            if learned is not None:
+                lines.append(
+                    f"{seat}, E2/E1 = 100{words}: d = {learned.m:.2f} (sigma / delta) {learned.b_mm:+.2f} mm, "
+                    f"delta = {learned.e:.3f} a^{learned.f:.3f} from {learned.cases} cases "
+                    "(Eq 6 in two stages, as printed)"
+                )
     return "\n".join(lines)
 
 
@@ -290,8 +327,18 @@ def prepare_figures(folder: Path, *, force: bool) -> None:
         refuse_existing(path, force=force)
 
 
-def draw_figures(rows: list[StudyRow], settings: StudySettings, folder: Path, *, seat: float, force: bool) -> None:
+def draw_figures(
+    rows: list[StudyRow], settings: StudySettings | SolidSettings, folder: Path, *, seat: float, force: bool
+) -> None:
     """Figures 5 to 8 of the paper."""
-    from tactile_bayes.report.study_figures import study_figures
+    from tactile_bayes.forward.study import StudySettings
 
-    study_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_line, force=force)
+    if isinstance(settings, StudySettings):
+        from tactile_bayes.report.study_figures import study_figures
+
+        study_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_line, force=force)
+        return
+    from tactile_bayes.commands.study_raster import fit_raster, raster_map
+    from tactile_bayes.report.solid_figures import solid_figures
+
+    solid_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_raster, build=raster_map, force=force)

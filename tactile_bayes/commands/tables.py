@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     "--seat",
     default="centred",
     show_default=True,
-    metavar="centred|resting|0..1",
+    metavar="centred|resting|0..2",
     help="How far the lump stands out of the gland.",
 )
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")

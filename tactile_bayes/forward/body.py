@@ -11,8 +11,11 @@ GLAND_RATIO = 10.0
 POISSON = 0.495
 THICKNESS_MM = 70.0
 LEAST_DEPTH_RATIO = 0.52
+MOST_SEAT = 2.0
 # A lump that reaches less than this far into the gland, in radii, rests on it: the mesh could not tell its nodes apart.
 _RESTS = 1e-4
+# A film of fat under the lump that is thinner than this, in radii, is none: no element could be as thin.
+_THINNEST_FILM = 0.01
 SEATS = {"centred": 0.0, "resting": 1.0}
 """Named seats. Where the lump's centre lies on the fat-gland boundary, and where the lump only touches it."""
 
@@ -59,11 +62,11 @@ class Body:
     depth_ratio
         h/d: depth of the lump's centre below the skin over its diameter, at least 0.52 (at 0.5 it touches the skin).
     seat
-        How far the lump stands out of the gland, 0 to 1. The fat-gland boundary lies at depth ``h + seat d/2``: through
-        the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat). Within 1e-4
-        of 1 it is 1.
+        How far the lump stands out of the gland, 0 to 2. The fat-gland boundary lies at depth ``h + seat d/2``: through
+        the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat), below it
+        from there on. From 1e-4 below 1 to 0.01 above it, it is 1.
     thickness_mm
-        Depth of the chest wall; None takes 70 mm, or ``h + 0.6 d + 2 mm`` where that is deeper.
+        Depth of the chest wall; None takes 70 mm, or 2 mm below ``h + 0.6 d`` and below the fat where that is deeper.
     fat_kpa, gland_ratio, poisson
         As in `Layers`; the lump has the tissues' Poisson's ratio.
 
@@ -84,11 +87,11 @@ class Body:
         _require(0 < self.d_mm < 1e4, "d_mm", self.d_mm, "above 0, in mm")
         limit = f"at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
         _require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
-        _require(0 <= self.seat <= 1, "seat", self.seat, "between 0 (centred) and 1 (resting)")
-        if self.seat > 1.0 - _RESTS:
+        _require(0 <= self.seat <= MOST_SEAT, "seat", self.seat, f"between 0 (centred) and {MOST_SEAT:g}; 1 is resting")
+        if 1.0 - _RESTS < self.seat < 1.0 + _THINNEST_FILM:
             object.__setattr__(self, "seat", 1.0)
         if self.thickness_mm is None:
-            deep = self.centre_mm + 0.6 * self.d_mm + 2.0
+            deep = self.centre_mm + max(0.6, 0.5 * self.seat) * self.d_mm + 2.0
             object.__setattr__(self, "thickness_mm", max(THICKNESS_MM, deep))
         bottom = self.centre_mm + self.radius_mm
         _require(
@@ -117,7 +120,7 @@ class Body:
 
 
 def parse_seat(text: str) -> float:
-    """The seat that ``centred``, ``resting`` or a number from 0 to 1 names.
+    """The seat that ``centred``, ``resting`` or a number from 0 to 2 names.
 
     Raises
     ------
@@ -128,8 +131,8 @@ def parse_seat(text: str) -> float:
         seat = SEATS[text] if text in SEATS else float(text)
     except ValueError:
         seat = -1.0
-    if not 0 <= seat <= 1:
-        raise BadDataError(f"seat is {text!r}", way_out="give centred, resting or a number from 0 to 1")
+    if not 0 <= seat <= MOST_SEAT:
+        raise BadDataError(f"seat is {text!r}", way_out=f"give centred, resting or a number from 0 to {MOST_SEAT:g}")
     return seat
 
 

@@ -2,7 +2,8 @@
 
 All meshes are of nine-node quadrilaterals on x >= 0 (the body is symmetric about the lump's axis); z is depth. Around
 the lump runs a ring of rays from its circle to a box; beyond the box, rows and columns. Where rays meet in a point
-(the centre of the disc, the point where a resting lump touches the gland) quadrilaterals collapse to triangles.
+(the centre of the disc, the point where a resting lump touches the gland) quadrilaterals collapse to triangles. Under a
+lump that stands clear of the gland the box ends on the boundary of the two.
 """
 
 from __future__ import annotations
@@ -114,24 +115,37 @@ class _Box:
     def around(cls, body: Body, fineness: int) -> _Box:
         h, d, layers = body.centre_mm, body.d_mm, body.layers
         top = h - _BOX * d if h > (_BOX + _LEAST_ABOVE) * d else 0.0
+        if body.seat > 1.0:
+            return cls._above_gland(body, top, fineness)
         bottom = h + 0.5 * d + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - h - 0.5 * d))
-        corner = np.arctan2(_BOX * d, h - top)
-        # Central projection of equal angles: rays leave the circle at right angles where the skin is near.
-        top_x = (h - top) * np.tan(np.linspace(0.0, corner, 2 * _TOP * fineness + 1))
         side_up = np.linspace(top, layers.fat_mm, 2 * _UP * fineness + 1)
         row = 2 * float(side_up[1] - side_up[0])
-        above = np.zeros(1)
-        if top > 0:
-            above = np.linspace(0.0, top, 2 * fineness * int(np.ceil(min(2 * top / d, 6.0))) + 1)
         return cls(
             body,
             _BOX * d,
-            above,
+            _rows_above(top, d, fineness),
             side_up,
             np.linspace(layers.fat_mm, bottom, 2 * _DOWN * fineness + 1),
             _graded(bottom, layers.thickness_mm, row, fineness),
-            top_x,
+            _projected(_BOX * d, h - top, _TOP * fineness),
             np.linspace(0.0, _BOX * d, 2 * _DOWN * fineness + 1),
+        )
+
+    @classmethod
+    def _above_gland(cls, body: Body, top: float, fineness: int) -> _Box:
+        """The box of a lump clear of the gland: its floor is the boundary, its side is fat all along."""
+        h, d, layers = body.centre_mm, body.d_mm, body.layers
+        half = 0.5 * (top + layers.fat_mm)
+        side_up = np.linspace(top, half, 2 * _UP * fineness + 1)
+        return cls(
+            body,
+            _BOX * d,
+            _rows_above(top, d, fineness),
+            side_up,
+            np.linspace(half, layers.fat_mm, 2 * _UP * fineness + 1),
+            _graded(layers.fat_mm, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
+            _projected(_BOX * d, h - top, _TOP * fineness),
+            _projected(_BOX * d, layers.fat_mm - h, _UP * fineness),
         )
 
     @property
@@ -154,6 +168,9 @@ class _Box:
 
     def angles_rad(self) -> FloatArray:
         """(k,) angles from the lump's highest point, one for each point of the outline."""
+        if self.body.seat > 1.0:
+            outline = self.outline()
+            return np.asarray(np.arctan2(outline[:, 0], self.body.centre_mm - outline[:, 1]))
         corner = np.arctan2(self.half_width_mm, self.body.centre_mm - self.above_mm[-1])
         boundary = 0.5 * np.pi + np.arcsin(self.body.seat)
         n_top, n_up = len(self.top_x_mm), len(self.side_up_mm)
@@ -164,6 +181,22 @@ class _Box:
             np.linspace(boundary, np.pi, n_down),
         ]
         return np.concatenate(parts)
+
+
+def _rows_above(top_mm: float, d_mm: float, fineness: int) -> FloatArray:
+    """Rows between the skin and the box; the skin alone where the box reaches it."""
+    if top_mm <= 0:
+        return np.zeros(1)
+    return np.linspace(0.0, top_mm, 2 * fineness * int(np.ceil(min(2 * top_mm / d_mm, 6.0))) + 1)
+
+
+def _projected(half_width_mm: float, distance_mm: float, count: int) -> FloatArray:
+    """Points of the box's lid or floor by central projection of equal angles.
+
+    Rays so leave the circle at right angles where the line is near, and stand close together where it is nearest.
+    """
+    corner = np.arctan2(half_width_mm, distance_mm)
+    return np.asarray(distance_mm * np.tan(np.linspace(0.0, corner, 2 * count + 1)))
 
 
 def _circle(body: Body, angles_rad: FloatArray) -> FloatArray:

@@ -122,7 +122,10 @@ Fit = Callable[[TactileLine, float], LineFit]
 
 @dataclass(frozen=True, slots=True)
 class StudyRow:
-    """One case and the Gaussian its map shows; the fields are the columns of a size table."""
+    """One case and the Gaussian its map shows; the fields are the columns of a size table.
+
+    A map in two dimensions has no `sigma_y_mm`.
+    """
 
     seat: str
     d_mm: float
@@ -132,6 +135,7 @@ class StudyRow:
     sigma_x_mm: float
     fit_rms: float
     detectable: bool
+    sigma_y_mm: float | None = None
 
 
 def seat_name(seat: float) -> str:
@@ -217,29 +221,41 @@ def hard_cases(rows: Sequence[StudyRow]) -> list[StudyRow]:
     return [row for row in rows if row.stiffness_ratio == HARD_RATIO and row.detectable]
 
 
-def width_changes(rows: Sequence[StudyRow]) -> FloatArray:
+def widths(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
+    """(n,) widths across (``"x"``) or along the head (``"y"``; NaN where a row has none)."""
+    if axis == "x":
+        return np.array([row.sigma_x_mm for row in rows])
+    return np.array([np.nan if row.sigma_y_mm is None else row.sigma_y_mm for row in rows])
+
+
+def width_changes(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
     """Delta sigma of each row: its width over that of the same lump at one diameter depth; NaN without such a row."""
-    reference = {
-        (row.seat, row.d_mm, row.stiffness_ratio): row.sigma_x_mm for row in rows if abs(row.depth_ratio - 1.0) < 1e-9
-    }
-    widths = [row.sigma_x_mm / reference.get((row.seat, row.d_mm, row.stiffness_ratio), np.nan) for row in rows]
-    return np.array(widths)
+    sigma = widths(rows, axis=axis)
+    lump = [(row.seat, row.d_mm, row.stiffness_ratio) for row in rows]
+    level = [abs(row.depth_ratio - 1.0) < 1e-9 for row in rows]
+    reference = {key: width for key, width, at in zip(lump, sigma, level, strict=True) if at}
+    return np.array([width / reference.get(key, np.nan) for key, width in zip(lump, sigma, strict=True)])
 
 
-def learn_as_printed(rows: Sequence[StudyRow]) -> PrintedEq6 | None:
+def learn_as_printed(rows: Sequence[StudyRow], *, axis: str = "x") -> PrintedEq6 | None:
     """Eq 6 in two stages from the hard, detectable cases of one seat; None where they are too few.
+
+    Parameters
+    ----------
+    axis
+        Of the head: ``"x"`` across it, ``"y"`` along it.
 
     Notes
     -----
     Figure 8: least squares of d on sigma at h/d = 1, and of ln Delta sigma on ln a over all depths.
     """
     hard = hard_cases(rows)
-    change = width_changes(hard)
+    change = width_changes(hard, axis=axis)
     amplitude = np.array([row.amplitude for row in hard])
     level = [row for row in hard if abs(row.depth_ratio - 1.0) < 1e-9]
     known = np.isfinite(change)
     if len({row.d_mm for row in level}) < 2 or known.sum() < 2 or np.ptp(amplitude[known]) <= 0:
         return None
-    m, b = np.polyfit([row.sigma_x_mm for row in level], [row.d_mm for row in level], 1)
+    m, b = np.polyfit(widths(level, axis=axis), [row.d_mm for row in level], 1)
     f, log_e = np.polyfit(np.log(amplitude[known]), np.log(change[known]), 1)
     return PrintedEq6(float(m), float(b), float(np.exp(log_e)), float(f), int(known.sum()))
