@@ -55,13 +55,12 @@ def _list() -> None:
 def _pivot(url: str, protocol: str, duration_s: float) -> None:
     import numpy as np
 
-    from tactile_bayes.hardware.drivers import TRACKERS
-    from tactile_bayes.hardware.ports import Port
+    from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
     from tactile_bayes.hardware.readings import PoseReading
     from tactile_bayes.hardware.rotation_sense import rotation_sense
 
     driver = TRACKERS[protocol]
-    port = Port(url, baud=driver.baud or 9600, role="tracker")
+    port = open_tracker(protocol, url)
     try:
         driver.check(port)
         click.echo("turn it", err=True)

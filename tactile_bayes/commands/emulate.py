@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tactile_bayes.hardware.emulator import Link
     from tactile_bayes.scan import Scan
 
-PROTOCOLS = ("open", "fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "igtlink")
+PROTOCOLS = ("open", "fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "igtlink", "ndi")
 _SHARE = click.FloatRange(0.0, 1.0)
 
 
@@ -96,6 +96,10 @@ def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path)
 
     if kind == "head" and len(scan.frames):
         return EmulatedHead(scan)
+    if kind == "tracker" and len(scan.poses) and protocol == "ndi":
+        from tactile_bayes.hardware.emulated_ndi import EmulatedNdi
+
+        return EmulatedNdi(scan.poses, hold=faults.hold)
     if kind == "tracker" and len(scan.poses):
         return EmulatedTracker(scan.poses, protocol=protocol, hold=faults.hold)
     what = "frames" if kind == "head" else "poses"

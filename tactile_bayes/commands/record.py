@@ -34,6 +34,7 @@ _CODE = "A code, not a name."
 )
 @click.option("--head-baud", type=click.IntRange(min=300), default=2_000_000, show_default=True, help="Line rate.")
 @click.option("--tracker-baud", type=click.IntRange(min=300), help="Line rate; by default the protocol's.")
+@click.option("--tracker-rom", type=_FILE, metavar="TOOL.rom", help="ndi: description of a wireless tool.")
 @click.option("--every", type=click.IntRange(1, 255), default=1, show_default=True, help="Ask for every n-th frame.")
 @click.option("--duration", "duration_s", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Stop then.")
 @click.option(
@@ -94,6 +95,7 @@ class Request:
     tracker_protocol: str
     head_baud: int
     tracker_baud: int | None
+    tracker_rom: Path | None
     every: int
     duration_s: float | None
     clock: str
@@ -198,7 +200,7 @@ def _look_on(
 def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:
     """Open the ports, check who is there, start the reading processes."""
     from tactile_bayes.hardware import head
-    from tactile_bayes.hardware.drivers import TRACKERS, check_head
+    from tactile_bayes.hardware.drivers import TRACKERS, check_head, open_tracker
     from tactile_bayes.hardware.head import HeadParser
     from tactile_bayes.hardware.ports import Port
     from tactile_bayes.hardware.recorder import Line
@@ -214,7 +216,9 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
     tracker_port = None
     if request.tracker_url:
         driver = TRACKERS[request.tracker_protocol]
-        tracker_port = Port(request.tracker_url, baud=request.tracker_baud or driver.baud or 9600, role="tracker")
+        tracker_port = open_tracker(
+            request.tracker_protocol, request.tracker_url, baud=request.tracker_baud, rom=request.tracker_rom
+        )
         stack.callback(tracker_port.close)
         driver.check(tracker_port)
     head_stream = read_in_process(port)

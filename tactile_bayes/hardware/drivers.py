@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from tactile_bayes.errors import DeviceError
@@ -134,7 +135,39 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         has_clock=True,
         hint="give socket://HOST:18944 and start its stream",
     ),
+    "ndi": TrackerDriver(
+        "NDI Polaris, Vega or Aurora",
+        0,
+        HeadParser,
+        (),
+        encode_command(head.ASK),
+        encode_command(head.START),
+        encode_command(head.STOP),
+        has_clock=True,
+    ),
 }
+
+
+def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path | None = None) -> Port:
+    """The port of a tracker.
+
+    Parameters
+    ----------
+    baud
+        None for the protocol's own.
+    rom
+        Description of a wireless NDI tool.
+
+    Raises
+    ------
+    DeviceError
+        When it cannot be opened.
+    """
+    if protocol == "ndi":
+        from tactile_bayes.hardware.ndi import NdiPort
+
+        return NdiPort(url, rom=rom)
+    return Port(url, baud=baud or TRACKERS[protocol].baud or 9600, role="tracker")
 
 
 def check_head(port: Port, *, every: int = 1) -> HelloReading:

@@ -1,0 +1,216 @@
+"""NDI trackers: what the driver asks and takes, with a stand-in for the library and, where it is installed, itself."""
+
+# ruff: noqa: N802, ARG002 (the stand-in has the library's names)
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from emulated_devices import serving, short_scan
+
+from tactile_bayes.errors import DeviceError
+from tactile_bayes.hardware import ndi
+from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
+from tactile_bayes.hardware.emulated import EmulatedHead
+from tactile_bayes.hardware.emulated_ndi import EmulatedNdi, crc16
+from tactile_bayes.hardware.emulator import PtyLink, TcpLink
+from tactile_bayes.hardware.ndi import NdiTracker
+from tactile_bayes.hardware.readings import HelloReading, PoseReading
+
+TURN = (0.5, 0.5, -0.5, 0.5)
+
+
+class FakeLibrary:
+    """Stands in for ``ndicapy``: answers from lists, keeps what it was told.
+
+    Parameters
+    ----------
+    frames
+        What each BX shows: (frame number, transform or ``"MISSING"``), or an error number.
+    """
+
+    NDI_OKAY, NDI_115200, NDI_8N1, NDI_NOHANDSHAKE = 0, 5, 0, 0
+
+    def __init__(
+        self, frames=(), *, refuse: dict[str, int] | None = None, enabled=(10,), device: object = "it"
+    ) -> None:
+        self.told: list[str] = []
+        self.opened: tuple = ()
+        self._frames, self._refuse = list(frames), dict(refuse or {})
+        self._handles, self._enabled, self._device = [], list(enabled), device
+        self._error, self._now = 0, (0, "MISSING")
+
+    def ndiOpen(self, name):
+        self.opened = (name,)
+        return self._device
+
+    def ndiOpenNetwork(self, host, port):
+        self.opened = (host, port)
+        return self._device
+
+    def ndiRESET(self, device):
+        self.told.append("a break")
+        self._refuse.pop("INIT", None)
+
+    def ndiCommand(self, device, text, *values):
+        line = text % values
+        name = line.partition(":")[0]
+        self.told.append(line)
+        self._error = self._refuse.get(name, 0)
+        if name == "PHSR":
+            self._handles = self._enabled if line.endswith("04") else []
+        if name == "BX" and self._frames:
+            found = self._frames.pop(0)
+            self._error, self._now = (found, self._now) if isinstance(found, int) else (0, found)
+        return "Polaris\nNDI S/N:P6-00057" if name == "VER" else "OKAY"
+
+    def ndiGetError(self, device):
+        return self._error
+
+    def ndiErrorString(self, number):
+        return f"error {number}"
+
+    def ndiGetPHSRNumberOfHandles(self, device):
+        return len(self._handles)
+
+    def ndiGetPHSRHandle(self, device, index):
+        return self._handles[index]
+
+    def ndiGetPHRQHandle(self, device):
+        return 10
+
+    def ndiPVWRFromFile(self, device, handle, path):
+        self.told.append(f"description of {handle}")
+        return 0 if path.endswith(".rom") else -1
+
+    def ndiGetBXFrame(self, device, port):
+        assert port == b"\n"
+        return self._now[0]
+
+    def ndiGetBXTransform(self, device, port):
+        return self._now[1]
+
+
+def test_a_tracker_is_set_up_in_the_order_of_the_guide(tmp_path):
+    library = FakeLibrary()
+    tracker = NdiTracker(library, "/dev/ttyUSB0", rom=tmp_path / "tool.rom")
+    assert library.opened == ("/dev/ttyUSB0",)
+    words = [line.partition(":")[0] for line in library.told]
+    assert words == ["INIT", "COMM", "VER", "PHSR", "PHRQ", "description of 10", *["PHSR"] * 3, "TSTART"]
+    assert library.told[1] == "COMM:50000"  # 115200, 8N1, no handshake
+    assert (tracker.name, tracker.handle) == ("Polaris", 10)
+    over_network = FakeLibrary()
+    NdiTracker(over_network, "socket://169.254.60.146:8765")
+    assert over_network.opened == ("169.254.60.146", 8765)
+    assert not any(line.startswith("COMM") for line in over_network.told)
+
+
+def test_a_tracker_left_at_another_rate_is_reset():
+    library = FakeLibrary(refuse={"INIT": 0xF6})
+    NdiTracker(library, "/dev/ttyUSB0")
+    assert library.told[:3] == ["INIT:", "a break", "INIT:"]
+
+
+def test_new_frames_with_a_tool_in_sight_are_poses():
+    seen = (*TURN, 254.0, -127.0, 25.4, 0.2)
+    frames = [(1, seen), (1, seen), (2, "MISSING"), (3, seen), 4, (4, (9.0,) * 8), (5, seen)]
+    tracker = NdiTracker(FakeLibrary(frames), "/dev/ttyUSB0")
+    found = [tracker.pose() for _ in frames]
+    pose = PoseReading((254.0, -127.0, 25.4), TURN)
+    assert found == [pose, None, None, pose, None, None, pose]  # again, unseen, spoilt and impossible ones are none
+
+
+def test_a_tracker_that_stops_answering_is_told():
+    tracker = NdiTracker(FakeLibrary([7] * 10), "/dev/ttyUSB0")
+    for _ in range(4):
+        assert tracker.pose() is None
+    with pytest.raises(DeviceError, match=r"BX was not done \(error 7\)"):
+        tracker.pose()
+
+
+@pytest.mark.parametrize(
+    ("library", "rom", "words"),
+    [
+        (FakeLibrary(device=None), None, "cannot be opened; check its cable"),
+        (FakeLibrary(enabled=()), None, "it has no tool; plug one in, or give --tracker-rom"),
+        (FakeLibrary(refuse={"TSTART": 0x2A}), None, r"TSTART was not done \(error 42\)"),
+        (FakeLibrary(), "tool.txt", "description .*tool.txt was not taken"),
+    ],
+    ids=["closed", "no tool", "refused", "no description"],
+)
+def test_what_cannot_be_set_up_is_told_in_one_line(tmp_path, library, rom, words):
+    with pytest.raises(DeviceError, match=words) as error:
+        NdiTracker(library, "/dev/ttyUSB0", rom=rom and tmp_path / rom)
+    assert "\n" not in str(error.value)
+
+
+def test_the_missing_extra_is_one_line(monkeypatch):
+    monkeypatch.setattr(ndi, "find_spec", lambda _: None)
+    with pytest.raises(
+        DeviceError, match=r"tracker /dev/x: needs the package ndicapi; pip install 'tactile-bayes\[ndi\]'"
+    ):
+        open_tracker("ndi", "/dev/x")
+
+
+def test_the_emulated_tracker_speaks_as_the_guide_prints_it():
+    assert crc16(b"123456789") == 0xBB3D
+    device = EmulatedNdi(short_scan(0.2).poses)
+    assert device.hear(b"INIT:E3A5\r") == b"OKAYA896\r"
+    assert device.hear(b"INIT:0000\r") == b"ERROR04%04X\r" % crc16(b"ERROR04")
+    assert device.hear(b"TSTART \r").startswith(b"OKAY")
+    assert device.hear(b"BX 0001\r").startswith(b"ERROR")  # no tool was enabled yet
+
+
+def expected(poses) -> set[tuple]:
+    return {tuple(one) for one in poses.position_mm.astype(np.float32).tolist()}
+
+
+@pytest.mark.parametrize("link", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
+def test_the_library_reads_the_emulated_tracker(link, tmp_path):
+    pytest.importorskip(ndi.MODULE)
+    poses, wireless = short_scan(3.0).poses, link is PtyLink
+    device, line = EmulatedNdi(poses, wireless=wireless), link()
+    rom = tmp_path / "tool.rom"
+    rom.write_bytes(bytes(range(256)) * 4)
+    with serving(device, line):
+        port = open_tracker("ndi", line.url, rom=rom if wireless else None)
+        hello = TRACKERS["ndi"].check(port)
+        assert hello == HelloReading("Emulated NDI tracker", 0, 0, 0, 0.0)
+        port.write(TRACKERS["ndi"].start)
+        parser, found, end = TRACKERS["ndi"].parser(), [], time.monotonic() + 20.0
+        while len(found) < 40 and time.monotonic() < end:
+            found += parser.feed(port.read_some(0.1))
+        port.close()
+    assert device.described == (rom.read_bytes() if wireless else b"")
+    assert len(found) >= 40
+    places = [one.position_mm for one in found]
+    assert set(places) <= expected(poses)
+    assert len(set(places)) == len(places)  # each frame once
+    times = [one.device_ns for one in found]
+    assert times == sorted(times)
+
+
+def test_a_port_where_nobody_answers_is_told():
+    pytest.importorskip(ndi.MODULE)
+    with pytest.raises(DeviceError, match=r"tracker /dev/nothing-here: cannot be opened; check its cable") as error:
+        open_tracker("ndi", "/dev/nothing-here")
+    assert "\n" not in str(error.value)
+
+
+def test_a_recording_with_an_ndi_tracker(run_cli, tmp_path):
+    pytest.importorskip(ndi.MODULE)
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.scan_mcap import read_scan, write_scan
+
+    scan = short_scan(1.0)
+    write_scan(tmp_path / "source.mcap", scan, provenance=Provenance("test", {}))
+    lines = [PtyLink(), PtyLink()]
+    with serving(EmulatedHead(scan), lines[0]), serving(EmulatedNdi(short_scan(8.0).poses), lines[1]):
+        words = ["--head", lines[0].url, "--tracker", lines[1].url, "--tracker-protocol", "ndi"]
+        done = run_cli("record", "-o", "a.mcap", *words, "--like", "source.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    poses = read_scan(tmp_path / "a.mcap").poses
+    assert len(poses) > 30
+    assert {tuple(one) for one in poses.position_mm.tolist()} <= expected(short_scan(8.0).poses)
