@@ -17,6 +17,8 @@ from tactile_bayes.hardware.readings import PoseReading, Reading
 PORT: Final = 18944
 _HEADER: Final = struct.Struct(">H12s20sIIQQ")  # version, type, device, s, fraction, body size, CRC
 _BODY: Final = struct.Struct(">12f")
+_KIND_AT: Final = 2
+_TRANSFORM: Final = b"TRANSFORM\0\0\0"
 _POLYNOMIAL: Final = 0x42F0E1EBA9EA3693
 _LONGEST: Final = 1 << 20
 _RIGID_SLACK: Final = 0.02
@@ -44,7 +46,11 @@ def crc64(data: bytes) -> int:
 
 
 class IgtlinkParser:
-    """TRANSFORM messages of one device name (any, when empty); other messages are passed over."""
+    """TRANSFORM messages of one device name (any, when empty); other messages are passed over.
+
+    The header has no checksum: a spoilt size may claim a megabyte of what follows. While a message waits for its end, a
+    whole transform inside it shows that the size was wrong.
+    """
 
     def __init__(self, *, device: str = "") -> None:
         self.garbage_bytes = 0
@@ -63,7 +69,12 @@ class IgtlinkParser:
                 continue
             end = place + _HEADER.size + size
             if end > len(buffer):
-                break
+                inside = _whole_transform(buffer, place + 1)
+                if inside < 0:
+                    break
+                self.garbage_bytes += inside - place
+                place = inside
+                continue
             body = buffer[place + _HEADER.size : end]
             if crc64(body) != crc:
                 place += 1
@@ -71,10 +82,25 @@ class IgtlinkParser:
                 continue
             place = end
             wanted = not self._device or device.rstrip(b"\0") == self._device
-            if kind.rstrip(b"\0") == b"TRANSFORM" and size == _BODY.size and wanted:
+            if kind == _TRANSFORM and size == _BODY.size and wanted:
                 found += _pose(body, seconds, fraction)
         self._rest = buffer[place:]
         return found
+
+
+def _whole_transform(buffer: bytes, start: int) -> int:
+    """Where the first transform whose checksum holds begins at `start` or later; -1 without one."""
+    place = buffer.find(_TRANSFORM, start + _KIND_AT)
+    while place >= 0:
+        begin = place - _KIND_AT
+        end = begin + _HEADER.size + _BODY.size
+        if end > len(buffer):
+            return -1
+        version, _, _, _, _, size, crc = _HEADER.unpack_from(buffer, begin)
+        if 1 <= version <= 3 and size == _BODY.size and crc64(buffer[end - size : end]) == crc:
+            return begin
+        place = buffer.find(_TRANSFORM, place + 1)
+    return -1
 
 
 def _pose(body: bytes, seconds: int, fraction: int) -> list[Reading]:
