@@ -29,6 +29,7 @@ NETWORK_PORT: Final = 8765
 # From the start of the process: a reset, the change of the line rate and a tool's description take seconds.
 READY_S: Final = 30.0
 _ASK_EVERY_S: Final = 0.002
+_LOOK_S: Final = 0.01
 # A reply may be spoilt on the line; so many in a row are a tracker that has gone.
 _PATIENCE: Final = 5
 _WIRELESS: Final = "PHRQ:*********1****"
@@ -219,7 +220,6 @@ class _SocketLine:
 
     def __init__(self, line: socket.socket) -> None:
         self._line = line
-        self.timeout = 0.0
 
     def fileno(self) -> int:
         return self._line.fileno()
@@ -229,7 +229,7 @@ class _SocketLine:
         return 4096 if select.select([self._line], [], [], 0)[0] else 0
 
     def read(self, size: int) -> bytes:
-        if size <= 0 or not select.select([self._line], [], [], self.timeout)[0]:
+        if size <= 0 or not select.select([self._line], [], [], _LOOK_S)[0]:
             return b""
         return self._line.recv(size)
 

@@ -20,6 +20,8 @@ from tactile_bayes.errors import DeviceError
 # How long a device may take to answer.
 ANSWER_S = 2.5
 _SHOWN_BYTES: Final = 12
+# One read waits so long at most. It is never changed: with rfc2217 that would be negotiated anew each time.
+_READ_S: Final = 0.01
 
 
 class Port:
@@ -62,10 +64,14 @@ class Port:
 
     def read_some(self, timeout_s: float) -> bytes:
         """What comes within the time, as soon as anything does; empty when nothing did."""
-        self._serial.timeout = timeout_s
+        end = time.monotonic() + timeout_s
         try:
-            first: bytes = self._serial.read(1)
-            return first + bytes(self._serial.read(self._serial.in_waiting) if first else b"")
+            while True:
+                data: bytes = self._serial.read(1)
+                if data:
+                    return data + bytes(self._serial.read(self._serial.in_waiting))
+                if time.monotonic() >= end:
+                    return b""
         except (OSError, serial.SerialException) as error:
             raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); check its cable") from None
 
@@ -105,7 +111,7 @@ class Port:
 
 def _open(url: str, baud: int, role: str) -> Any:
     try:
-        port = serial.serial_for_url(url, baudrate=baud, timeout=0, do_not_open=True)
+        port = serial.serial_for_url(url, baudrate=baud, timeout=_READ_S, do_not_open=True)
         if "://" not in url:
             port.exclusive = True  # two programs that read one port get half of it each
         if not url.startswith(("socket://", "loop://")):
@@ -131,7 +137,6 @@ def _descriptor_of(port: Any) -> int | None:
 
 def _relay(port: Any, sink: socket.socket) -> None:
     with contextlib.suppress(OSError, serial.SerialException, TypeError):
-        port.timeout = 0.1
         while True:
             data = port.read(1)
             if data:
