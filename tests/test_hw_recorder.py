@@ -6,6 +6,7 @@ import os
 import select
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from hypothesis import strategies as st
 
 from tactile_bayes.commands.emulate import PROTOCOLS as CHOICES
 from tactile_bayes.errors import DeviceError
+from tactile_bayes.files import scan_recording
+from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid
 from tactile_bayes.hardware import reading
 from tactile_bayes.hardware.clocks import ArrivalClock, PoseClock
@@ -246,3 +249,62 @@ def test_faults_come_as_often_as_asked():
     assert all(len(one) in (0, 6) for one in sent)
     assert Faults().disturb(b"record", rng) == b"record"
     assert [Faults(stall=(1.0, 0.5)).stalls(t) for t in (0.9, 1.0, 1.49, 1.5)] == [False, True, True, False]
+
+
+@pytest.fixture
+def synced(tmp_path, monkeypatch):
+    """A writer whose way to the disk is watched: when it was gone, and what was on the file then."""
+    scan, seen = short_scan(0.2), []
+    path = tmp_path / "a.mcap"
+    monkeypatch.setattr(scan_recording, "SYNC_S", 0.05)
+    monkeypatch.setattr(os, "fdatasync", lambda _: seen.append((threading.get_ident(), path.stat().st_size)))
+    with scan_recording.create_exclusive(path, force=False) as stream:
+        writer = scan_recording.RecordingWriter(
+            stream,
+            head=scan.head,
+            element_calibration=scan.element_calibration,
+            session={"source": "test"},
+            provenance=Provenance("test", {}),
+        )
+        yield writer, scan, seen, path
+        writer.stop_syncing()
+
+
+def wait_until(done) -> None:
+    for _ in range(1000):
+        if done():
+            return
+        time.sleep(0.01)
+    raise AssertionError("it did not come")
+
+
+def test_what_was_flushed_is_seen_onto_the_disk_by_a_thread_of_its_own(synced):
+    writer, scan, seen, path = synced
+    wait_until(lambda: seen)  # the description of the scan
+    before = len(seen)
+    writer.add_frame(scan.frames.counts[0], device_ns=0, host_ns=0)
+    writer.flush()
+    wait_until(lambda: len(seen) > before)
+    assert seen[-1][1] == path.stat().st_size
+    assert threading.get_ident() not in {thread for thread, _ in seen}
+    after = len(seen)
+    time.sleep(0.3)
+    assert len(seen) == after  # nothing new, nothing to do
+
+
+def test_a_disk_that_fails_later_is_told_at_the_next_flush(synced, monkeypatch):
+    writer, _, seen, _ = synced
+    wait_until(lambda: seen)
+
+    def fail(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fdatasync", fail)
+
+    def flush_on() -> None:
+        for _ in range(1000):
+            writer.flush()
+            time.sleep(0.01)
+
+    with pytest.raises(OSError, match="No space left"):
+        flush_on()

@@ -16,6 +16,8 @@ import pytest
 from in_process import run_here
 from posterior_files import write_calibration, write_maps
 
+from tactile_bayes.files.atomic import atomic_path
+
 Run = Callable[..., "CompletedProcess[str]"]
 
 
@@ -105,6 +107,30 @@ def test_a_kill_between_writing_and_renaming_leaves_the_old_file_or_none(
         path.write_text(old)
     killed(WRITE_AND_WAIT, tmp_path, child_environment, after_s=0.0)
     assert (path.read_text() if path.exists() else None) == old
+
+
+def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(
+    tmp_path: Path, child_environment: dict[str, str]
+) -> None:
+    killed(WRITE_AND_WAIT, tmp_path, child_environment, after_s=0.0)
+    (left,) = tmp_path.glob(".out.txt.*.part")
+    host, process = left.name.split(".")[3].split("-")[:2]
+    others = [
+        left.name.replace("out.txt", "other.txt"),  # of another file
+        left.name.replace(f"-{process}-", "-1-"),  # of a process that lives: the system's first
+        left.name.replace(host, "00000000"),  # of another computer
+        ".out.txt.part",
+    ]
+    for name in others:
+        (tmp_path / name).write_text("not ours")
+    with atomic_path(tmp_path / "out.txt") as partial:
+        partial.write_text("whole")
+        assert not left.exists()
+        with atomic_path(tmp_path / "out.txt") as second:
+            assert partial.exists()  # ours lives: another write of the same file leaves it alone
+            second.write_text("sooner")
+        (tmp_path / "out.txt").unlink()
+    assert {one.name for one in tmp_path.iterdir()} == {*others, "out.txt"}
 
 
 def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path: Path, child_environment: dict[str, str]) -> None:

@@ -162,6 +162,7 @@ def _record(request: Request) -> tuple[Report, bool]:
             session=request.session(hello),
             provenance=provenance_of(request, request.settings(hello)),
         )
+        stack.callback(writer.stop_syncing)
         recorder = Recorder(
             *lines,
             writer,
@@ -176,6 +177,7 @@ def _record(request: Request) -> tuple[Report, bool]:
             report = _run(recorder, stopper, head, request)
             writer.close(asdict(report))
         except OSError as error:
+            writer.stop_syncing()
             with suppress(OSError):  # what is still in its buffer cannot be written either
                 stream.close()
             raise full_disk(request.output, error) from None

@@ -5,11 +5,16 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
+import socket
 import tempfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 from tactile_bayes.errors import BadDataError, UsageError
+
+_PART = ".part"
 
 
 def refuse_existing(path: Path, *, force: bool) -> None:
@@ -25,7 +30,8 @@ def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
     """A temporary path beside `path` that becomes `path` when the block ends well.
 
     The file is created with mode 0600, flushed to disk and renamed over the target, so that a kill at any
-    moment leaves the old file or none. If the block raises, the temporary file goes.
+    moment leaves the old file or none. If the block raises, the temporary file goes; what a killed process of this
+    computer left beside the same target goes with the next write.
 
     Raises
     ------
@@ -33,7 +39,8 @@ def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
         When `path` exists and `force` is false, or its directory does not exist.
     """
     refuse_existing(path, force=force)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    _sweep(path)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.{_host()}-{os.getpid()}-", suffix=_PART, dir=path.parent)
     os.close(handle)
     partial = Path(name)
     try:
@@ -44,6 +51,30 @@ def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
         _publish(partial, path, force=force)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _host() -> str:
+    """This computer, in eight letters: directories may be shared with others."""
+    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
+
+
+def _sweep(path: Path) -> None:
+    """Remove what processes that are no more left of an earlier write of `path`."""
+    pattern = re.compile(rf"{re.escape(f'.{path.name}.{_host()}')}-(\d+)-[^.]*{re.escape(_PART)}")
+    for name in os.listdir(path.parent):  # noqa: PTH208 (names only: the directory may be large)
+        found = pattern.fullmatch(name)
+        if found and not _alive(int(found[1])):
+            path.with_name(name).unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def _publish(partial: Path, path: Path, *, force: bool) -> None:

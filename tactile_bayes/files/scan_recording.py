@@ -8,6 +8,7 @@ device time of the frame or pose it belongs to; and, when the recording ended in
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, Final
@@ -23,6 +24,8 @@ from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 LOG_TOPIC: Final = "/log"
 ACCOUNT: Final = "recording"
+# So often what was handed to the system is seen onto the disk: power may fail.
+SYNC_S: Final = 0.5
 
 
 def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
@@ -39,6 +42,47 @@ def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
         return os.fdopen(os.open(path, flags, 0o600), "wb")
     except OSError as error:
         raise UsageError(f"{path} cannot be written ({error.strerror}); choose another place") from None
+
+
+class _Syncer:
+    """Sees a file onto the disk again and again, in a thread of its own: who writes does not wait for the disk.
+
+    A thread, because the system lets go of the interpreter while it waits; readers are processes of their own and know
+    nothing of it.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._dirty, self._ended = threading.Event(), threading.Event()
+        self._error: OSError | None = None
+        self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
+        self._thread.start()
+
+    def ask(self) -> None:
+        """There is something new; raises what the last time failed with."""
+        if self._error is not None:
+            raise self._error
+        self._dirty.set()
+
+    def stop(self) -> None:
+        """Wait for the one that is under way."""
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ended.wait(SYNC_S):
+            if not self._dirty.is_set():
+                continue
+            self._dirty.clear()
+            try:
+                _to_disk(self._descriptor)
+            except OSError as error:
+                self._error = error
+                return
+
+
+def _to_disk(descriptor: int) -> None:
+    getattr(os, "fdatasync", os.fsync)(descriptor)  # not every system has it
 
 
 class RecordingWriter(ScanWriter):
@@ -65,6 +109,7 @@ class RecordingWriter(ScanWriter):
             stream, head=head, element_calibration=element_calibration, session=session, provenance=provenance
         )
         self._stream = stream
+        self._syncer: _Syncer | None = None
         schema = build_file_descriptor_set(Log).SerializeToString(deterministic=True)
         number = self._writer.register_schema(name=Log.DESCRIPTOR.full_name, encoding="protobuf", data=schema)
         self._log_channel: int = self._writer.register_channel(
@@ -78,16 +123,34 @@ class RecordingWriter(ScanWriter):
         self._send(self._log_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def flush(self) -> None:
-        """Close the chunk and hand it to the system: from then on it survives this process."""
+        """Close the chunk and hand it to the system: from then on it survives this process.
+
+        Within `SYNC_S` it is on the disk too, and survives the computer.
+
+        Raises
+        ------
+        OSError
+            When the system, or the disk before this, could not take it.
+        """
         self._writer.flush()
+        if self._syncer is None:
+            self._syncer = _Syncer(self._stream.fileno())
+        self._syncer.ask()
 
     def close(self, account: Mapping[str, Any]) -> None:
         """Write the account, the index and the footer, and see them onto the disk."""
+        self.stop_syncing()
         self._writer.flush()
         self._writer.add_metadata(ACCOUNT, {name: str(value) for name, value in account.items()})
         self.finish()
         self._stream.flush()
         os.fsync(self._stream.fileno())
+
+    def stop_syncing(self) -> None:
+        """Let go of the file, whatever comes; to be called before the stream is closed."""
+        if self._syncer is not None:
+            self._syncer.stop()
+            self._syncer = None
 
 
 def full_disk(path: Path, error: OSError) -> BadDataError:
