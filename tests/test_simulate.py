@@ -21,7 +21,7 @@ from tactile_bayes.forward import scene as scene_types
 from tactile_bayes.forward.instrument import head_positions, level_kpa
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, SceneLandmarks, Strokes, Taxels, Tracker
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
+from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump
 from tactile_bayes.geometry import apply, inverse, rotation_from_quaternion
 from tactile_bayes.scan import Scan
 
@@ -157,6 +157,7 @@ def test_the_schemas_defaults_are_the_types_defaults() -> None:
         "taxels": Taxels,
         "landmarks": SceneLandmarks,
         "body": SceneBody,
+        "rib": Rib,
     }
     assert set(tables) == set(kinds)
     # the keys of a lump of tissue live beside those of a bump, and have no defaults a bump could take
@@ -173,7 +174,9 @@ def test_the_schemas_defaults_are_the_types_defaults() -> None:
         for key, rule in keys.items():
             value = getattr(made, key)
             assert rule.get("default") == (list(value) if isinstance(value, tuple) else value), f"{name}.{key}"
-        assert set(keys) == {f.name for f in dataclasses.fields(kind)} - (set(kinds) | {"lumps", "solid_lumps"}), name
+        assert set(keys) == {f.name for f in dataclasses.fields(kind)} - (
+            set(kinds) | {"lumps", "solid_lumps", "ribs"}
+        ), name
 
 
 def test_an_empty_scene_is_the_default_scene() -> None:

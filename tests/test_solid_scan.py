@@ -20,7 +20,7 @@ from tactile_bayes.forward.scene import Background, Head, Lump, Noise, Scene, St
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.solid import PlacedLump, SolidHead, skin_perturbation, solid_head
 from tactile_bayes.forward.solid_scan import condensed_lump, face_of, layers_of, solid_frames
-from tactile_bayes.forward.solid_scene import SceneBody, SolidLump, fat_thickness
+from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump, fat_thickness
 from tactile_bayes.geometry import (
     apply,
     inverse,
@@ -133,6 +133,17 @@ def test_the_scene_decides_the_model() -> None:
         simulate(SHORT, rng=rng, fidelity="exact")
 
 
+def test_a_rib_is_a_row_of_balls_and_no_lump() -> None:
+    scene = scene_from_toml("[scene]\nduration_s = 0.02\n[body]\nfat_mm = 12\n[[rib]]\nhalf_length_mm = 9\n")
+    assert scene.fidelity == "solid"
+    assert [(ball.x_mm, ball.y_mm, ball.depth_mm) for ball in scene.stiff_balls] == [(x, 26, 12) for x in (-8, 0, 8)]
+    truth = simulate(scene, rng=np.random.default_rng(0)).truth
+    assert truth["lumps"] == []
+    assert truth["ribs"][0]["ball_x_mm"] == [-8.0, 0.0, 8.0]
+    with pytest.raises(BadDataError, match=r"rib\[0\] is of tissue; use --fidelity solid"):
+        simulate(scene, rng=np.random.default_rng(0), fidelity="empirical-gaussian")
+
+
 def test_shoulders_inside_the_array_leave_no_rim() -> None:
     assert face_of(Head()).sensing.shape == (18, 30)
     assert face_of(Head(shoulder_mm=3.0)).sensing.shape == (16, 26)
@@ -163,6 +174,13 @@ IMPOSSIBLE = [
     (LUMP + "depth_ratio = 1\n[[lump]]\namplitude = 0.2", "some lumps are bumps"),
     ("[head]\nrim_mm = 40", "head.rim_mm is 40; it must lie in 0 to below radius_mm, 35"),
     ("[head]\nrim_mm = -1", "head.rim_mm is -1"),
+    ("[[rib]]\ndepth_mm = 5", r"rib\[0\].depth_mm is 5: the rib stands out of the skin; it must lie in 6.12 to 63.88"),
+    ("[[rib]]\ndepth_mm = 68", r"rib\[0\].depth_mm is 68: the rib reaches into the chest wall"),
+    ("[[rib]]\nspacing_mm = 1", r"rib\[0\] is a row of 81 balls; give spacing_mm or half_length_mm for 60 or fewer"),
+    ("[[rib]]\nstiffness_ratio = 0", r"rib\[0\].stiffness_ratio is 0; it must be a number above 0"),
+    ("[[rib]]\ndiameter_mm = 9", r"rib\[0\].diameter_mm is not known"),
+    ("[[rib]]\ny_cm = 2", r"rib\[0\].y_cm is not known; give y_mm, in the unit it names"),
+    ("[[rib]]\n[[lump]]\namplitude = 0.2", r"lump\[0\] is a bump and rib\[0\] is tissue"),
 ]
 
 
@@ -188,6 +206,7 @@ def test_the_command_makes_a_solid_scan_whose_truth_stays_in_the_file(run_cli: R
     done = run_cli("simulate", "s.toml", "-o", "a.mcap", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "lump at 0, 0 mm: d 15 mm, h/d 1, 100 times as stiff as fat" in done.stdout
+    assert "model solid" in done.stdout
     truth = read_truth(tmp_path / "a.mcap")
     assert truth is not None
     assert truth["model"] == "solid"
@@ -240,6 +259,26 @@ def test_another_programs_frames_are_met_one_by_one(
     assert len(residual) > 25
     assert np.sqrt(np.mean(np.square(residual))) <= limit  # s11 has 0.2 kPa of noise, s01 0.02
     assert np.median(ratio) == pytest.approx(1.0, abs=depth_limit)
+
+
+def test_another_programs_rib_is_met_frame_by_frame(shared_data: Path) -> None:
+    """Scan s07: a ball of 12 mm, and 32 mm beside it along the head a row of them 8 mm apart; 0.2 kPa of noise."""
+    with (shared_data / "scans" / "truth.csv").open(newline="") as file:
+        row = next(row for row in csv.DictReader(file) if row["scan"] == "s07_rib_edge")
+    rib = Rib(y_mm=116.0 - float(row["y_mm"]))
+    assert (rib.d_mm, rib.spacing_mm) == (float(row["d_mm"]), 8.0)
+    lump = SolidLump(d_mm=12.0, depth_ratio=1.0)
+    head, placed = one_ball(lump)
+    balls = [placed, *(PlacedLump(placed.perturbation, ball.x_mm, ball.y_mm) for ball in rib.balls())]
+    skin = np.array([float(row[f"base_{axis}_mm"]) for axis in "xyz"])
+    found = poses_and_frames(shared_data / "scans" / "s07_rib_edge.npz", skin, float(row["tracker_latency_ms"]))
+    residual, alone = [], []
+    for pose, pressure in found[::3]:
+        pressed = {"rotation": pose[:3, :3], "x_mm": pose[0, 3], "y_mm": pose[1, 3], "mean_kpa": float(pressure.mean())}
+        residual.append((head.frame(balls, **pressed).pressure_kpa - pressure) / pressure.mean())
+        alone.append((head.frame([placed], **pressed).pressure_kpa - pressure) / pressure.mean())
+    assert np.sqrt(np.mean(np.square(residual))) <= 0.04
+    assert np.sqrt(np.mean(np.square(alone))) >= 0.08  # without the rib
 
 
 def one_ball(lump: SolidLump) -> tuple[SolidHead, PlacedLump]:

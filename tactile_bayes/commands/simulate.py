@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
+
     from tactile_bayes.forward.scene import Lump
-    from tactile_bayes.forward.solid_scene import SolidLump
+    from tactile_bayes.forward.solid_scene import Rib, SolidLump
 
 
 @click.command("simulate")
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the random numbers, in place of the scene's.")
 @click.option(
     "--fidelity",
-    type=click.Choice(["empirical-gaussian", "solid"]),
+    type=click.Choice(["empirical-gaussian", "empirical", "plane-strain", "solid"]),
     help="Model of the tissue; by default the one the scene is written for.",
 )
 @click.option("--force", is_flag=True, help="Overwrite the output.")
@@ -26,7 +29,9 @@ def command(*, scene: Path, output: Path, seed: int | None, fidelity: str | None
     """Make a scan with known truth from SCENE, a TOML file.
 
     Lumps given as bumps (amplitude, sigma) take the empirical-gaussian model; lumps of tissue (d_mm, depth_ratio,
-    stiffness_ratio, seat) in a [body] take the solid one: every frame is a contact problem in three dimensions.
+    stiffness_ratio, seat) and ribs in a [body] take the solid one: every frame is a contact problem in three
+    dimensions. Cheaper for one lump: plane-strain solves the contact in two dimensions, empirical takes Eqs 1 to 4 of
+    the paper. To both a lump is a cylinder along y, and a frame's profile across the head is repeated along it.
 
     The truth goes into the scan file beside the data; no other command reads it. The same scene and seed give the
     same bytes.
@@ -59,7 +64,23 @@ def _run(scene_path: Path, output: Path, *, seed: int | None, fidelity: str | No
     )
     write_scan(output, simulated.scan, provenance=provenance, truth=simulated.truth, force=force)
     lumps = [*map(_bump_line, scene.lumps), *map(_tissue_line, scene.solid_lumps)]
-    return [f"{output}: scan, seed {used}", *describe_scan(simulated.scan), *(lumps or ["no lump"])]
+    found = [*(lumps or ["no lump"]), *map(_rib_line, scene.ribs)]
+    return [
+        f"{output}: scan, seed {used}",
+        *describe_scan(simulated.scan),
+        f"model {_model(simulated.truth)}",
+        *found,
+    ]
+
+
+def _model(truth: Mapping[str, Any]) -> str:
+    shape = truth.get("shape")
+    return str(truth["model"]) + (f": {shape}" if shape else "")
+
+
+def _rib_line(rib: Rib) -> str:
+    where = f"{rib.depth_mm:g} mm deep, {rib.spacing_mm:g} mm apart along x"
+    return f"rib at y {rib.y_mm:g} mm: {len(rib.balls())} balls of {rib.d_mm:g} mm, {where}"
 
 
 def _bump_line(lump: Lump) -> str:

@@ -24,7 +24,7 @@ from tactile_bayes.forward.scene import (
     Taxels,
     Tracker,
 )
-from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
+from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump
 
 _SCHEMA: Final = "scene.schema.json"
 # A lump with one of the first is tissue; only a Gaussian one may have the others.
@@ -168,6 +168,7 @@ def _scene(document: Mapping[str, Any]) -> Scene:
         lumps=bumps,
         body=SceneBody(**document["body"]) if "body" in document else None,
         solid_lumps=tissue,
+        ribs=tuple(Rib(**table) for table in document.get("rib", [])),
         strokes=Strokes(**document.get("strokes", {})),
         head=Head(**document.get("head", {})),
         noise=Noise(**document.get("noise", {})),

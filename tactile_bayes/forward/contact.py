@@ -109,7 +109,7 @@ class Contact:
 
 
 def solve_contact(
-    compliance: FloatArray, profile_mm: FloatArray, *, total_kpa: float, touching: BoolArray | None = None
+    compliance: FloatArray, profile_mm: FloatArray, *, total_kpa: float | FloatArray, touching: BoolArray | None = None
 ) -> Contact:
     """Press a rigid profile on a surface, at many positions at once.
 
@@ -120,7 +120,7 @@ def solve_contact(
     profile_mm : (n,) array
         Head's face above its lowest point.
     total_kpa
-        Sum of the cells' pressures: force per unit length over the width of a cell. Above 0.
+        Sum of the cells' pressures: force per unit length over the width of a cell. Above 0; one, or (m,) of them.
     touching : (n,) or (m, n) bool array, optional
         A first guess of the cells in contact.
 
@@ -130,23 +130,24 @@ def solve_contact(
     primal-dual active set method; Hintermueller, Ito & Kunisch 2003). A position at which that does not end is solved
     cell by cell, which always ends.
     """
-    if not (np.isfinite(total_kpa) and total_kpa > 0):
-        raise BadDataError(f"the head's force is {total_kpa:g}", way_out="it must be above 0")
     m, n = compliance.shape[:2]
+    total = np.broadcast_to(np.asarray(total_kpa, dtype=np.float64), (m,))
+    if not (np.isfinite(total).all() and (total > 0).all()):
+        raise BadDataError(f"the head's force is {total.min():g}", way_out="it must be above 0")
     active = np.ones((m, n), dtype=bool) if touching is None else np.broadcast_to(touching, (m, n)).copy()
     pressure, gap, depth = np.zeros((m, n)), np.zeros((m, n)), np.zeros(m)
     open_ = np.arange(m)
     rounds = 0
     while len(open_) and rounds < _MOST_ROUNDS:
         rounds += 1
-        p, w, d = _given_contact(compliance[open_], profile_mm, active[open_], total_kpa)
+        p, w, d = _given_contact(compliance[open_], profile_mm, active[open_], total[open_])
         new = (active[open_] & (p > 0)) | (~active[open_] & (w < -_tolerance(profile_mm, d)))
         pressure[open_], gap[open_], depth[open_] = p, w, d
         changed = (new != active[open_]).any(axis=1)
         active[open_] = new
         open_ = open_[changed]
     for i in open_:
-        pressure[i], gap[i], depth[i] = _cell_by_cell(compliance[i], profile_mm, total_kpa)
+        pressure[i], gap[i], depth[i] = _cell_by_cell(compliance[i], profile_mm, float(total[i]))
     return Contact(np.maximum(pressure, 0.0), np.maximum(gap, 0.0), depth, rounds)
 
 
@@ -156,7 +157,7 @@ def _tolerance(profile_mm: FloatArray, depth_mm: FloatArray) -> FloatArray:
 
 
 def _given_contact(
-    compliance: FloatArray, profile: FloatArray, active: BoolArray, total: float
+    compliance: FloatArray, profile: FloatArray, active: BoolArray, total: float | FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pressures (0 off `active`), gaps (0 on it) and depths when the touching cells are known."""
     n = len(profile)

@@ -24,7 +24,7 @@ _BOX = 0.75
 _LEAST_ABOVE = 0.35
 # Beyond the outermost head position (72 mm) the body goes on for this many thicknesses.
 _BEYOND = 3.0
-_REACH_MM = 72.0
+REACH_MM = 72.0
 # Elements per unit of fineness: along the arc below the skin (where the bump's shape is made), from there down to the
 # fat-gland boundary, on either part below it, and along the rays outside and inside the lump.
 _TOP, _UP, _DOWN, _OUT, _IN = 8, 4, 2, 2, 2
@@ -62,7 +62,7 @@ def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
     """
     box = _Box.around(body, fineness)
     ring = _rays(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
-    across = _graded(box.half_width_mm, _REACH_MM + _BEYOND * body.layers.thickness_mm, box.row_mm, fineness)
+    across = _graded(box.half_width_mm, REACH_MM + _BEYOND * body.layers.thickness_mm, box.row_mm, fineness)
     rows = np.concatenate([box.above_mm[:-1], box.side_mm[:-1], box.below_mm])
     blocks = [ring, _grid(across, rows), _grid(box.bottom_x_mm, box.below_mm)]
     if len(box.above_mm) > 1:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.solid_scene import SceneBody, SolidLump, check_solid
+from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump, check_solid
 from tactile_bayes.geometry import FloatArray, rigid, rotation_from_quaternion
 from tactile_bayes.presets import HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS
 
@@ -193,7 +193,7 @@ class SceneLandmarks:
 class Scene:
     """Everything `simulate` needs but the random numbers.
 
-    What lies below the skin is given either as Gaussian bumps (`lumps`) or as tissue (`body`, `solid_lumps`).
+    What lies below the skin is given either as Gaussian bumps (`lumps`) or as tissue (`body`, `solid_lumps`, `ribs`).
     """
 
     seed: int = 1
@@ -204,6 +204,7 @@ class Scene:
     lumps: tuple[Lump, ...] = ()
     body: SceneBody | None = None
     solid_lumps: tuple[SolidLump, ...] = ()
+    ribs: tuple[Rib, ...] = ()
     strokes: Strokes = field(default_factory=Strokes)
     head: Head = field(default_factory=Head)
     noise: Noise = field(default_factory=Noise)
@@ -228,12 +229,22 @@ class Scene:
                 "some lumps are bumps (amplitude, sigma) and some are tissue (depth_ratio)",
                 way_out="describe all lumps of a scene in one way",
             )
-        check_solid(self.body or SceneBody(), self.solid_lumps)
+        if self.lumps and self.ribs:
+            raise BadDataError(
+                "lump[0] is a bump and rib[0] is tissue", way_out="give the lump depth_ratio, or leave out the rib"
+            )
+        check_solid(self.body or SceneBody(), self.solid_lumps, self.ribs)
 
     @property
     def fidelity(self) -> str:
         """The model the scene is written for: ``"solid"`` when it gives tissue, else ``"empirical-gaussian"``."""
-        return "solid" if self.solid_lumps or (self.body is not None and not self.lumps) else "empirical-gaussian"
+        tissue = self.solid_lumps or self.ribs or (self.body is not None and not self.lumps)
+        return "solid" if tissue else "empirical-gaussian"
+
+    @property
+    def stiff_balls(self) -> tuple[SolidLump, ...]:
+        """The lumps of tissue and the balls of the ribs."""
+        return (*self.solid_lumps, *(ball for rib in self.ribs for ball in rib.balls()))
 
     def _check_head(self) -> None:
         half = self.head.rows * self.head.pitch_mm / 2

@@ -1,4 +1,4 @@
-"""A scan with known truth: Gaussian lumps on a background, felt through a moving, noisy, late instrument."""
+"""A scan with known truth: one of four models of what lies below the skin, felt by a moving, noisy, late instrument."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from tactile_bayes.forward.instrument import SimulatedScan, head_positions, leve
 from tactile_bayes.forward.scene import Scene, normalised_pressure
 from tactile_bayes.geometry import FloatArray
 
-FIDELITIES: Final = ("empirical-gaussian", "solid")
+FIDELITIES: Final = ("empirical-gaussian", "empirical", "plane-strain", "solid")
+"""A bump's own formula; and for lumps of tissue Eqs 1 to 4, a body in two dimensions, and one in three."""
 
 
 def simulate(
@@ -34,7 +35,7 @@ def simulate(
     fidelity
         One of `FIDELITIES`; None takes the one the scene is written for (`Scene.fidelity`).
     progress
-        Called with frames done and frames in all; only the solid model takes long enough to call it.
+        Called with frames done and frames in all; the bumps alone are too quick to call it.
 
     Returns
     -------
@@ -43,15 +44,19 @@ def simulate(
     """
     chosen = scene.fidelity if fidelity is None else fidelity
     if chosen not in FIDELITIES:
-        raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {' or '.join(FIDELITIES)}")
+        raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
     if chosen == "solid":
         from tactile_bayes.forward.solid_scan import simulate_solid
 
         return simulate_solid(scene, rng=rng, progress=progress)
-    if scene.solid_lumps:
+    if chosen in ("plane-strain", "empirical"):
+        from tactile_bayes.forward.plane_scan import simulate_plane
+
+        return simulate_plane(scene, rng=rng, fidelity=chosen, progress=progress)
+    if scene.solid_lumps or scene.ribs:
+        named = "lump[0] gives depth_ratio and no amplitude" if scene.solid_lumps else "rib[0] is of tissue"
         raise BadDataError(
-            "lump[0] gives depth_ratio and no amplitude",
-            way_out="use --fidelity solid, or describe the bump with amplitude, sigma_x_mm and sigma_y_mm",
+            named, way_out="use --fidelity solid, or describe the bump with amplitude, sigma_x_mm and sigma_y_mm"
         )
     return _simulate_gaussian(scene, rng=rng)
 

@@ -29,7 +29,7 @@ def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress
     Parameters
     ----------
     scene
-        Its Gaussian lumps must be none; without a body it takes the default one.
+        Its Gaussian lumps must be none; without a body it takes the default one. Ribs are rows of balls.
     rng
         Used by the instrument alone: the tissue has no chance in it.
     progress
@@ -40,27 +40,37 @@ def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress
     The mean over the taxels follows the scene's background, as an examiner holds it by the tone; where the head sinks
     less, over a lump, its pose says so. Tilts are the scene's. Each frame is at rest: nothing slides, creeps or lags.
     """
-    if scene.lumps:
-        raise BadDataError(
-            "lump[0] gives no depth_ratio",
-            way_out="the solid model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
-        )
-    body = scene.body or SceneBody()
+    refuse_bumps(scene, "solid")
     time = frame_times(scene)
     pressure, depth = solid_frames(scene, time, progress=progress)
-    truth = {
-        "model": "solid",
-        "lumps": [_lump_truth(lump, body, fat_thickness(body, scene.solid_lumps)) for lump in scene.solid_lumps],
-        "body": asdict(body) | {"fat_mm": fat_thickness(body, scene.solid_lumps)},
-        "background": asdict(scene.background),
-    }
     return record(
         scene,
         felt=lambda at: pressure[np.searchsorted(time, at)],
         depth=lambda at: np.interp(at, time, depth),
-        truth=truth,
+        truth={"model": "solid", **tissue_truth(scene)},
         rng=rng,
     )
+
+
+def tissue_truth(scene: Scene) -> dict[str, Any]:
+    """What lies below the skin, as plain data; the balls of a rib are no lumps."""
+    body = scene.body or SceneBody()
+    fat = fat_thickness(body, scene.solid_lumps)
+    return {
+        "lumps": [_lump_truth(lump, body, fat) for lump in scene.solid_lumps],
+        "ribs": [asdict(rib) | {"ball_x_mm": [ball.x_mm for ball in rib.balls()]} for rib in scene.ribs],
+        "body": asdict(body) | {"fat_mm": fat},
+        "background": asdict(scene.background),
+    }
+
+
+def refuse_bumps(scene: Scene, model: str) -> None:
+    """Raise BadDataError where the scene's lumps are no tissue, which `model` needs."""
+    if scene.lumps:
+        raise BadDataError(
+            "lump[0] gives no depth_ratio",
+            way_out=f"the {model} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
+        )
 
 
 def solid_frames(
@@ -126,7 +136,7 @@ def _placed(scene: Scene) -> list[PlacedLump]:
         return condensed_lump(SolidLump(d_mm=d_mm, height_mm=height_mm, depth_ratio=depth_ratio), body, fat)
 
     placed = []
-    for lump in scene.solid_lumps:
+    for lump in scene.stiff_balls:
         around = condensed(lump.d_mm, lump.vertical_mm, lump.depth_ratio)
         change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
         placed.append(PlacedLump(change, lump.x_mm, lump.y_mm))

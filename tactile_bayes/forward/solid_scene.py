@@ -82,6 +82,53 @@ class SolidLump:
         return self.d_mm if self.height_mm is None else self.height_mm
 
 
+@dataclass(frozen=True, slots=True)
+class Rib:
+    """A row of stiff balls along x, across the head: what a rib looks like to a map.
+
+    Parameters
+    ----------
+    x_mm, y_mm
+        Middle of the row in the scene's `plane`.
+    d_mm, depth_mm
+        Diameter of the balls, and the depth of their centres. The balls have no seat: the boundary of fat and gland is
+        the lumps' or the body's.
+    spacing_mm
+        From ball to ball; they may overlap.
+    half_length_mm
+        The row's outermost balls lie at most this far from its middle.
+    stiffness_ratio
+        Their modulus over that of fat.
+    """
+
+    x_mm: float = 0.0
+    y_mm: float = 26.0
+    d_mm: float = 12.0
+    depth_mm: float = 12.0
+    spacing_mm: float = 8.0
+    half_length_mm: float = 40.0
+    stiffness_ratio: float = 100.0
+
+    def balls(self) -> tuple[SolidLump, ...]:
+        """The row as lumps."""
+        each_side = int(self.half_length_mm / self.spacing_mm + 1e-9)
+        ratio = self.depth_mm / self.d_mm
+        return tuple(
+            SolidLump(
+                x_mm=self.x_mm + i * self.spacing_mm,
+                y_mm=self.y_mm,
+                d_mm=self.d_mm,
+                depth_ratio=ratio,
+                stiffness_ratio=self.stiffness_ratio,
+            )
+            for i in range(-each_side, each_side + 1)
+        )
+
+
+# Every ball is solved for in every frame.
+MOST_BALLS = 60
+
+
 def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:
     """Depth of the boundary between fat and gland that the scene means, checked against every lump.
 
@@ -112,7 +159,7 @@ def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:
     return fat
 
 
-def check_solid(body: SceneBody, lumps: Sequence[SolidLump]) -> None:
+def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib] = ()) -> None:
     """Refuse what cannot be, naming the key, its value and the allowed range.
 
     Raises
@@ -133,7 +180,27 @@ def check_solid(body: SceneBody, lumps: Sequence[SolidLump]) -> None:
         if lump.seat is not None and not lump.seat >= 0:
             raise BadDataError(f"lump[{i}].seat is {lump.seat}", way_out="it must be at least 0")
         _check_depth(i, lump, body)
+    for i, rib in enumerate(ribs):
+        _check_rib(i, rib, body)
     fat_thickness(body, lumps)
+
+
+def _check_rib(index: int, rib: Rib, body: SceneBody) -> None:
+    for name in ("d_mm", "depth_mm", "spacing_mm", "half_length_mm", "stiffness_ratio"):
+        _above_zero(f"rib[{index}].{name}", getattr(rib, name))
+    half = (1.0 + _LEAST_COVER) * rib.d_mm / 2
+    if not half <= rib.depth_mm <= body.thickness_mm - half:
+        where = "stands out of the skin" if rib.depth_mm < half else "reaches into the chest wall"
+        raise BadDataError(
+            f"rib[{index}].depth_mm is {rib.depth_mm:g}: the rib {where}",
+            way_out=f"it must lie in {half:.4g} to {body.thickness_mm - half:.4g} mm for this diameter and body",
+        )
+    count = 2 * int(rib.half_length_mm / rib.spacing_mm + 1e-9) + 1
+    if count > MOST_BALLS:
+        raise BadDataError(
+            f"rib[{index}] is a row of {count} balls",
+            way_out=f"give spacing_mm or half_length_mm for {MOST_BALLS} or fewer",
+        )
 
 
 def _check_depth(index: int, lump: SolidLump, body: SceneBody) -> None:

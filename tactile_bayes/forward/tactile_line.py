@@ -102,16 +102,16 @@ def press(
     x_c_mm: FloatArray,
     *,
     head: Head = _NOMINAL_HEAD,
-    mean_kpa: float = MEAN_KPA,
+    mean_kpa: float | FloatArray = MEAN_KPA,
 ) -> LineFrames:
-    """Frames of a head pressed with constant force at positions `x_c_mm`.
+    """Frames of a head pressed with given force at positions `x_c_mm`.
 
     Parameters
     ----------
     stiffness_ratio
         E2/E1 of the lump; None for the body without a lump.
     mean_kpa
-        Force over the head's area.
+        Force over the head's area: one for all, or (m,) of them.
 
     Raises
     ------
@@ -127,25 +127,30 @@ def press(
             way_out="condense the body with a larger reach_mm",
         )
     matrix = surface.without_lump() if stiffness_ratio is None else surface.with_lump(stiffness_ratio)
-    total = mean_kpa * len(profile)
-    touching = press_layers(surface.body.layers, head=head, mean_kpa=mean_kpa, cell_mm=cell).pressure_kpa[0] > 0
+    level = np.broadcast_to(np.asarray(mean_kpa, dtype=np.float64), (len(first),))
+    usual = press_layers(surface.body.layers, head=head, mean_kpa=float(np.median(level)), cell_mm=cell)
+    touching = usual.pressure_kpa[0] > 0
     pressure = np.empty((len(first), len(profile)))
     for chunk in np.array_split(np.arange(len(first)), int(np.ceil(len(first) / 64))):
         windows = _windows(matrix, first[chunk], len(profile))
-        pressure[chunk] = solve_contact(windows, profile, total_kpa=total, touching=touching).pressure_kpa
+        pressure[chunk] = solve_contact(
+            windows, profile, total_kpa=level[chunk] * len(profile), touching=touching
+        ).pressure_kpa
     return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(len(profile), cell), pressure)
 
 
 def press_layers(
-    layers: Layers, *, head: Head = _NOMINAL_HEAD, mean_kpa: float = MEAN_KPA, cell_mm: float = CELL_MM
+    layers: Layers, *, head: Head = _NOMINAL_HEAD, mean_kpa: float | FloatArray = MEAN_KPA, cell_mm: float = CELL_MM
 ) -> LineFrames:
-    """The one frame of a body without a lump, the same wherever the head stands (at 0 here): P1."""
+    """The frame of a body without a lump, the same wherever the head stands (at 0 here): P1, for each mean given."""
     profile = head.cell_profile_mm(cell_mm)
     index = np.arange(len(profile))
     row = surface_compliance(np.asarray(cell_mm * index), cell_mm=cell_mm, layers=layers)
     matrix = row[np.abs(index[:, None] - index[None, :])]
-    found = solve_contact(matrix[None], profile, total_kpa=mean_kpa * len(profile))
-    return LineFrames(np.zeros(1), _cell_centres(len(profile), cell_mm), found.pressure_kpa)
+    level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
+    windows = np.broadcast_to(matrix, (len(level), *matrix.shape))
+    found = solve_contact(windows, profile, total_kpa=level * len(profile))
+    return LineFrames(np.zeros(len(level)), _cell_centres(len(profile), cell_mm), found.pressure_kpa)
 
 
 def _cell_centres(count: int, cell_mm: float) -> FloatArray:
