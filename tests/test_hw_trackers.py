@@ -98,11 +98,7 @@ class TestEveryProtocol:
             assert all(map(math.isfinite, (*pose.position_mm, *pose.quaternion_wxyz)))
 
 
-# OpenIGTLink comes over TCP, which loses none; a byte lost in its size would cost more.
-SERIAL = {name: protocol for name, protocol in PROTOCOLS.items() if name != "igtlink"}
-
-
-@pytest.mark.parametrize("protocol", SERIAL.values(), ids=SERIAL)
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=PROTOCOLS)
 def test_one_lost_byte_costs_at_most_two_records(protocol):
     make, record = protocol
     for place in range(len(record)):
