@@ -23,12 +23,16 @@ class BumpPrior:
         Log-normal on the geometric mean of the two widths.
     log_ratio_sd
         Normal on q and r, half the log of the axis ratio (and its direction).
+    tilt_sd
+        Normal on the level's slope along each axis, in units of the map's scale over half a window. It counts where
+        a tilt is weighed against none; once there is one it is flat.
     """
 
     amplitude_sd: float = 2.0
     width_median_mm: float = 5.0
     log_width_sd: float = 1.0
     log_ratio_sd: float = 0.5
+    tilt_sd: float = 0.1
 
     def as_dict(self) -> dict[str, float]:
         """The numbers, for the report."""
@@ -37,6 +41,7 @@ class BumpPrior:
             "width_median_mm": self.width_median_mm,
             "log_width_sd": self.log_width_sd,
             "log_ratio_sd": self.log_ratio_sd,
+            "tilt_sd": self.tilt_sd,
         }
 
 

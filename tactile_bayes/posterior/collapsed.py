@@ -1,124 +1,139 @@
-r"""Posterior of a bump's place and shape with all the rest integrated out: amplitude, level, tilt, noise scale, field.
+r"""Posterior of a scene's place and shape with all the rest integrated out: amplitudes, level, tilt, noise.
 
-For one noise field h (length and share) the map is linear in level, tilt and amplitude given the bump's centre and
-widths. With flat priors on them and the Jeffreys prior on the noise scale,
+For one noise field h (length and share) the map is linear in level, tilt and amplitudes given the places and widths.
+With flat priors on level and tilt, a normal one of variance s^2 on each of v amplitudes and the Jeffreys prior on the
+noise scale,
 
 .. math::
-    p(y \mid \theta, h) \propto |C_h|^{-1/2}\, |X^T C_h^{-1} X|^{-1/2}\, S_h(\theta)^{-(n-c)/2},
+    p(y \mid \theta, h) \propto |C_h|^{-1/2}\, |X^T C_h^{-1} X|^{-1/2}\, |P|^{-1/2}\,
+        \Gamma(\nu/2)\,(\pi S)^{-\nu/2}\; N(\hat a;\, 0,\, s^2 + P^{-1} S / \nu), \qquad \nu = n - c - v,
 
-S the generalised least-squares sum of squares and c the number of columns of X. Fields are mixed with their evidence.
+X the c columns of level and tilt, P the amplitudes' precision and S the generalised least-squares sum of squares. Only
+the last factor is approximate: the prior is taken at the mean noise scale. Fields are mixed with their evidence.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
-from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import FitCells
-from tactile_bayes.posterior.field import SHARES, Whitening, whitenings
+from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Whitening
+from tactile_bayes.posterior.linear import FieldColumns, LinearSolution, joined, solve
+from tactile_bayes.posterior.scene import Scene
+from tactile_bayes.posterior.window import Profiles, Projected, Window
 
 BLOCK = 64
 NEGLIGIBLE = 1e-3
-"""Fields with a smaller share of the evidence are left out of the mixture."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearSolution:
-    """The linear parameters' conditional posterior for draws of the shape and fields: a multivariate t.
-
-    Parameters
-    ----------
-    amplitude, level : (m,) arrays
-        Conditional means.
-    amplitude_variance : (m,) array
-        Over tau^2.
-    level_slope, level_variance : (m,) arrays
-        By how much the level falls as the amplitude rises, and its variance over tau^2 given the amplitude.
-    sum_of_squares : (m,) array
-    """
-
-    amplitude: FloatArray
-    level: FloatArray
-    amplitude_variance: FloatArray
-    level_slope: FloatArray
-    level_variance: FloatArray
-    sum_of_squares: FloatArray
+"""Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for."""
+FADED = np.log(1e-4)
+"""Shorter lengths are not looked at once one's best evidence lies this far below the best of all."""
+LOG_FIELD_PRIOR = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 class CollapsedTarget:
-    """Log density of ``(u, v, x_mm, y_mm[, r])`` for one window, mixed over noise fields.
-
-    u = p + q and v = p - q are the logs of sigma_x and sigma_y while r is 0; they come first because they matter most
-    (see `importance`). p, q, r are those of `covariance_from_log_widths`.
+    """Log density of a scene's shape parameters (see `Scene`) for one window, mixed over noise fields.
 
     Parameters
     ----------
-    cells
-        The window.
+    window
+        The cells; targets of several scenes share one, and with it the fields.
+    scene
+        What is in it.
     prior
-        On the widths; the amplitude's is flat here (detection has the proper one).
-    level
-        Fixed background, or None to integrate a level and a tilt out.
-    rotated
-        Whether r is a parameter.
+        On widths and amplitudes.
     widest_mm, radius_mm
         Bounds of the widths, and of the centre about the window's middle.
+    amplitude_scale
+        Unit of the amplitudes' prior, see `cells.value_scale`.
     """
 
     def __init__(
         self,
-        cells: FitCells,
+        window: Window,
+        scene: Scene,
         *,
         prior: BumpPrior,
-        level: float | None,
-        rotated: bool,
         widest_mm: float,
         radius_mm: float,
+        amplitude_scale: float = 1.0,
     ) -> None:
-        self.cells, self.prior, self.rotated = cells, prior, rotated
+        self.window, self.scene, self.prior = window, scene, prior
         self.widest_mm, self.radius_mm = widest_mm, radius_mm
-        self.middle = (float(np.mean(cells.x_mm)), float(np.mean(cells.y_mm)))
-        self.variance = _independent_variance(cells)
-        self.data = cells.value - (0.0 if level is None else level)
-        self.design = _level_and_tilt(cells) if level is None else np.zeros((len(cells), 0))
-        self._all_fields = whitenings(cells.x_mm, cells.y_mm, variance=self.variance)
-        self.fields: list[Whitening] = list(self._all_fields)
-        self._shares = [np.array(SHARES) for _ in self.fields]
+        self.amplitude_scale = amplitude_scale
+        self.amplitude_sd = prior.amplitude_sd * amplitude_scale
+        # without its mean, a large level does not cost the digits that the bump is in
+        self._mean = float(np.mean(window.cells.value))
+        centred = window.cells.value - self._mean
+        self._plain = np.concatenate([linear_columns(window.cells, tilt=scene.tilt), centred[None]])
+        scaled = self._plain / window.variance
+        self._weighted_plain = window.on_grid(scaled)
+        self._plain_gram = self._plain @ scaled.T
+        self._plain_low = window.project(Profiles(grid=window.on_grid(self._plain)), self._weighted_plain).low
+        self._fields: list[FieldColumns] | None = None
+        self._made_up = 0.0
+
+    def of_scene(self, scene: Scene) -> CollapsedTarget:
+        """The same window and priors with another scene."""
+        return CollapsedTarget(
+            self.window,
+            scene,
+            prior=self.prior,
+            widest_mm=self.widest_mm,
+            radius_mm=self.radius_mm,
+            amplitude_scale=self.amplitude_scale,
+        )
 
     @property
     def dimension(self) -> int:
         """Number of shape parameters."""
-        return 5 if self.rotated else 4
+        return len(self.scene.names)
 
     @property
-    def columns(self) -> int:
-        """Linear parameters: level and tilt where they are free, and the amplitude."""
-        return int(self.design.shape[1]) + 1
+    def rotated(self) -> bool:
+        """Whether the ellipse may turn."""
+        return self.scene.shape == "rotated"
+
+    @property
+    def structures(self) -> int:
+        """Amplitudes: the bump's, and that of what lies beside it."""
+        return 2 if self.scene.extra else 1
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom of the noise scale."""
+        return max(len(self.window.cells) - len(self._plain) + 1 - self.structures, 1)
+
+    @property
+    def fields(self) -> list[FieldColumns]:
+        """The noise fields of the mixture, a length each with its shares; all of them until they are settled."""
+        if self._fields is None:
+            self._fields = [self._under_length(self.window.field(length)) for length in LENGTHS_MM]
+        return self._fields
 
     def __call__(self, theta: FloatArray) -> FloatArray:
-        """(m,) log density of (m, dimension) shape vectors."""
-        parts = [self._block(theta[i : i + BLOCK]) for i in range(0, len(theta), BLOCK)]
-        total = np.logaddexp.reduce(np.concatenate(parts), axis=1) + self.log_prior(theta)
+        """(m,) log density of (m, dimension) shape vectors, normalised up to a constant of the data."""
+        total = np.logaddexp.reduce(self.by_field(theta), axis=1) + self.log_prior(theta)
         return np.where(np.isfinite(total), total, -np.inf)
 
-    def shape(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """p, q, r of (..., dimension) parameter vectors."""
-        u, v = theta[..., 0], theta[..., 1]
-        r = theta[..., 4] if self.rotated else np.zeros(theta.shape[:-1])
-        return (u + v) / 2.0, (u - v) / 2.0, r
+    def by_field(self, theta: FloatArray) -> FloatArray:
+        """(m, fields) log evidence of each field times the field's prior; the shape's prior left out."""
+        parts = []
+        for i in range(0, len(theta), BLOCK):
+            projected, cross = self._project(self.scene.templates(theta[i : i + BLOCK], self.window))
+            parts.append(np.concatenate([self._under(projected, cross, one)[0] for one in self.fields], axis=1))
+        return np.concatenate(parts) + LOG_FIELD_PRIOR + self._made_up
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
-        """(m,) log prior of widths and centre; -inf outside the window and where the bump is wider than it."""
-        p, q, r = self.shape(theta)
-        ratio = np.hypot(q, r)
-        inside = np.hypot(theta[:, 2] - self.middle[0], theta[:, 3] - self.middle[1]) <= self.radius_mm
-        inside &= p + ratio <= np.log(self.widest_mm)
-        z = (p - np.log(self.prior.width_median_mm)) / self.prior.log_width_sd
-        return np.where(inside, -0.5 * (z**2 + (ratio / self.prior.log_ratio_sd) ** 2), -np.inf)
+        """(m,) log prior of the shape; -inf outside the window and where the bump is wider than it."""
+        return self.scene.log_prior(
+            theta, prior=self.prior, middle=self.window.middle, radius_mm=self.radius_mm, widest_mm=self.widest_mm
+        )
 
     def settle_fields(self, theta: FloatArray) -> bool:
         """Keep, of all fields, those that carry the evidence at one shape; the others cost time and say nothing.
@@ -128,132 +143,158 @@ class CollapsedTarget:
         bool
             Whether the set changed.
         """
-        before = [(f.length_mm, tuple(s)) for f, s in zip(self.fields, self._shares, strict=True)]
-        self.fields, self._shares = list(self._all_fields), [np.array(SHARES) for _ in self._all_fields]
-        evidence = self._block(theta[None])[0].reshape(len(self.fields), -1)
-        kept = evidence > np.logaddexp.reduce(evidence.ravel()) + np.log(NEGLIGIBLE)
-        if not kept.any():
-            return False
-        keep = [i for i in range(len(self.fields)) if kept[i].any()]
-        self._shares = [self._shares[i][kept[i]] for i in keep]
-        self.fields = [self.fields[i].pruned(float(shares.max())) for i, shares in zip(keep, self._shares, strict=True)]
-        return before != [(f.length_mm, tuple(s)) for f, s in zip(self.fields, self._shares, strict=True)]
+        before = self.chosen_fields()
+        projected, cross = self._project(self.scene.templates(theta[None], self.window))
+        found = self._walk(lambda columns: self._under(projected, cross, columns)[0][0])
+        evidence = np.concatenate([one for _, one in found])
+        if not np.isfinite(evidence.max()):
+            self._fields, self._made_up = None, 0.0
+            return before != self.chosen_fields()
+        total = float(np.logaddexp.reduce(evidence))
+        kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in found]
+        self._fields = [
+            self._under_length(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
+            for columns, keep in kept
+            if keep.any()
+        ]
+        left = np.concatenate([self._under(projected, cross, columns)[0][0] for columns in self._fields])
+        self._made_up = total - float(np.logaddexp.reduce(left))
+        return before != self.chosen_fields()
+
+    def chosen_fields(self) -> list[tuple[float, tuple[float, ...]]]:
+        """Lengths in the mixture, each with its shares."""
+        return [(columns.field.length_mm, tuple(columns.shares)) for columns in self._fields or ()]
+
+    def null_log_evidence(self) -> float:
+        """Log evidence of level and tilt alone under all fields, on the scale of the log density."""
+        dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
+        found = self._walk(lambda columns: columns.null_evidence(dof=dof))
+        return float(np.logaddexp.reduce(np.concatenate([one for _, one in found])) + LOG_FIELD_PRIOR)
+
+    def _walk(self, evidence: Callable[[FieldColumns], FloatArray]) -> list[tuple[FieldColumns, FloatArray]]:
+        """Evidence of the fields from the longest down, until they have faded."""
+        found: list[tuple[FieldColumns, FloatArray]] = []
+        best = -np.inf
+        for length in sorted(LENGTHS_MM, reverse=True):
+            columns = self._under_length(self.window.field(length))
+            one = evidence(columns)
+            found.append((columns, one))
+            if one.max() < best + FADED:
+                break
+            best = max(best, float(one.max()))
+        return found
 
     def field_summary(self, theta: FloatArray) -> dict[str, float]:
         """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
-        evidence = self._block(theta[None])[0]
+        evidence = self.by_field(theta[None])[0]
         weight = np.exp(evidence - np.logaddexp.reduce(evidence))
-        pairs = zip(self.fields, self._shares, strict=True)
-        length = np.concatenate([np.full(len(shares), field.length_mm) for field, shares in pairs])
-        share = np.concatenate(self._shares)
+        length = np.concatenate([np.full(len(one.shares), one.field.length_mm) for one in self.fields])
+        share = np.concatenate([one.shares for one in self.fields])
         return {"field_length_mm": float(weight @ length), "field_share": float(weight @ (share / (1.0 + share)))}
 
     def draw_linear(self, theta: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Amplitude, level and noise scale for (m, dimension) draws of the shape: exact, field drawn first."""
-        amplitude, level, noise = (np.empty(len(theta)) for _ in range(3))
-        dof = len(self.data) - self.columns
-        for i in range(0, len(theta), BLOCK):
-            part = theta[i : i + BLOCK]
-            evidence, solutions = self._solve(part)
-            index = _choose(evidence, rng)
-            solution = _pick(solutions, index)
-            tau = np.sqrt(solution.sum_of_squares / rng.chisquare(dof, size=len(part)))
-            z = rng.standard_normal((2, len(part)))
-            off = tau * np.sqrt(solution.amplitude_variance) * z[0]
-            amplitude[i : i + BLOCK] = solution.amplitude + off
-            about = tau * np.sqrt(solution.level_variance) * z[1]
-            level[i : i + BLOCK] = solution.level - solution.level_slope * off + about
-            noise[i : i + BLOCK] = tau * np.sqrt(self.variance.mean())
+        """Amplitudes (m, v), level (m,) and noise scale (m,) for draws of the shape: exact, field drawn first."""
+        unique, back = np.unique(theta, axis=0, return_inverse=True)
+        back = back.reshape(-1)
+        amplitude, level, noise = np.empty((len(theta), self.structures)), np.empty(len(theta)), np.empty(len(theta))
+        order = np.argsort(back, kind="stable")
+        edges = np.searchsorted(back[order], np.arange(0, len(unique) + BLOCK, BLOCK))
+        for i, (first, last) in enumerate(pairwise(edges)):
+            rows = order[first:last]
+            evidence, solution = self._solve(unique[i * BLOCK : (i + 1) * BLOCK])
+            of = back[rows] - i * BLOCK
+            h = choose(evidence[of], rng)
+            tau2 = solution.sum_of_squares[of, h] / rng.chisquare(self.dof, size=len(rows))
+            a = self._draw_amplitudes(solution.amplitude[of, h], solution.power[of, h], tau2, rng)
+            about = np.sqrt(tau2 * solution.level_covariance[h, 0, 0]) * rng.standard_normal(len(rows))
+            amplitude[rows] = a
+            at_zero = self._mean + solution.level[h, 0]
+            level[rows] = at_zero - np.sum(solution.level_slope[of, h, :, 0] * a, axis=1) + about
+            noise[rows] = np.sqrt(tau2 * self.window.variance.mean())
         return amplitude, level, noise
 
-    def _block(self, theta: FloatArray) -> FloatArray:
-        return self._solve(theta)[0]
+    def _draw_amplitudes(
+        self, centre: FloatArray, power: FloatArray, tau2: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """(m, v) draws given the noise scale: the flat prior's normal times the amplitudes' own."""
+        data = power / tau2[:, None, None]
+        covariance = np.linalg.inv(data + np.eye(self.structures) / self.amplitude_sd**2)
+        mean = (covariance @ (data @ centre[..., None]))[..., 0]
+        return np.asarray(mean + (np.linalg.cholesky(covariance) @ rng.standard_normal((*mean.shape, 1)))[..., 0])
 
-    def _bumps(self, theta: FloatArray) -> FloatArray:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return cell_mean_gaussian(
-                self.cells.x_mm - theta[:, 2, None],
-                self.cells.y_mm - theta[:, 3, None],
-                covariance_mm2=covariance_from_log_widths(*self.shape(theta)),
-                cell_mm=self.cells.cell_mm,
-            )
+    def tilt_log_odds(self, theta: FloatArray) -> float:
+        """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
+        evidence, solution = self._solve(theta[None])
+        weight = evidence[0] - np.logaddexp.reduce(evidence[0])
+        slope = solution.level_slope[0][:, :, 1:]
+        mean = solution.level[:, 1:] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
+        spread = np.einsum("hvc,hvw,hwd->hcd", slope, np.linalg.inv(solution.power[0]), slope)
+        tau2 = solution.sum_of_squares[0] / self.dof
+        covariance = tau2[:, None, None] * (solution.level_covariance[:, 1:, 1:] + spread)
+        square = np.einsum("hc,hcd,hd->h", mean, np.linalg.inv(covariance), mean)
+        at_zero = -0.5 * (square + np.linalg.slogdet(covariance)[1]) - np.log(2.0 * np.pi)
+        prior = -np.log(2.0 * np.pi * (self.prior.tilt_sd * self.amplitude_scale) ** 2)
+        return float(prior - np.logaddexp.reduce(weight + at_zero))
 
-    def _solve(self, theta: FloatArray) -> tuple[FloatArray, list[LinearSolution]]:
-        """Log evidence (m, fields x shares) and the conditional solutions, in one pass over the fields."""
-        bumps = self._bumps(theta)
-        plain = np.concatenate([self.design.T, self.data[None]])
-        scaled = plain / self.variance
-        bump_plain, bump_square = bumps @ scaled.T, np.square(bumps) @ (1.0 / self.variance)
-        plain_gram = plain @ scaled.T
-        evidence, solutions = [], []
-        for field, shares in zip(self.fields, self._shares, strict=True):
-            bump_low, plain_low = bumps @ field.rotated, plain @ field.rotated
-            for share in shares:
-                weight = field.shrinkage(float(share))
-                cross = bump_plain - (bump_low * weight) @ plain_low.T
-                square = bump_square - np.square(bump_low) @ weight
-                gram = plain_gram - (plain_low * weight) @ plain_low.T
-                log_det = float(field.log_determinant(float(share)))
-                one, solution = _marginal(cross, square, gram, log_det, n=len(self.data))
-                evidence.append(one)
-                solutions.append(solution)
-        return np.stack(evidence, axis=1), solutions
+    def gains(self, templates: Profiles, theta: FloatArray) -> FloatArray:
+        """(m,) log evidence of the scene at `theta` with each template added, over that without; -inf for a dent.
 
+        Fields are those settled; the scene has one structure.
+        """
+        (bump,) = self.scene.templates(theta[None], self.window)
+        alone, _ = self._project([bump])
+        base = np.concatenate([self._under(alone, None, columns)[0][0] for columns in self.fields])
+        beside, _ = self._project([templates])
+        cross = self.window.product(bump, templates)
+        number = len(beside[0].square)
+        both = [Projected(*(np.repeat(v, number, axis=0) for v in (alone[0].low, alone[0].plain, alone[0].square)))]
+        with_it = [
+            solve(both + beside, cross, columns, dof=self.dof - 1, amplitude_sd=self.amplitude_sd)[0]
+            for columns in self.fields
+        ]
+        return np.asarray(np.logaddexp.reduce(np.concatenate(with_it, axis=1), axis=1) - np.logaddexp.reduce(base))
 
-def _marginal(
-    cross: FloatArray, square: FloatArray, gram: FloatArray, log_det: float, *, n: int
-) -> tuple[FloatArray, LinearSolution]:
-    """Log evidence of one field, from the whitened inner products of bumps, level, tilt and data.
+    def _under_length(self, field: Whitening, shares: FloatArray | None = None) -> FieldColumns:
+        """Level, tilt and data under one length's field."""
+        chosen = np.array(SHARES) if shares is None else shares
+        return FieldColumns.of(field, chosen, plain_low=self._plain_low, plain_gram=self._plain_gram)
 
-    Parameters
-    ----------
-    cross : (m, c + 1) array
-        Bumps with the c level columns and with the data.
-    square : (m,) array
-        Bumps with themselves.
-    gram : (c + 1, c + 1) array
-        Level columns and data with each other.
-    """
-    c = gram.shape[0] - 1
-    inverse = np.linalg.inv(gram[:c, :c]) if c else np.zeros((0, 0))
-    to_level = cross[:, :c] @ inverse
-    power = np.maximum(square - np.einsum("mc,mc->m", to_level, cross[:, :c]), 1e-300)
-    along = cross[:, c] - to_level @ gram[:c, c]
-    rest = gram[c, c] - gram[c, :c] @ inverse @ gram[:c, c]
-    amplitude = along / power
-    sum_of_squares = np.maximum(rest - power * amplitude**2, 1e-12 * rest)
-    log_gram = float(np.linalg.slogdet(gram[:c, :c])[1]) if c else 0.0
-    evidence = -0.5 * (log_det + log_gram + np.log(power)) - 0.5 * (n - c - 1) * np.log(sum_of_squares)
-    # a dent is no lump: only rises have density
-    evidence = np.where(amplitude > 0, evidence, -np.inf)
-    level = (inverse @ gram[:c, c])[0] - to_level[:, 0] * amplitude if c else np.zeros(len(amplitude))
-    slope = to_level[:, 0] if c else np.zeros(len(amplitude))
-    variance = np.full(len(amplitude), inverse[0, 0] if c else 0.0)
-    return evidence, LinearSolution(amplitude, level, 1.0 / power, slope, variance, sum_of_squares)
+    def _project(self, templates: list[Profiles]) -> tuple[list[Projected], FloatArray | None]:
+        projected = [self.window.project(one, self._weighted_plain) for one in templates]
+        return projected, self.window.product(*templates) if len(templates) == 2 else None
+
+    def _under(
+        self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns
+    ) -> tuple[FloatArray, LinearSolution]:
+        return solve(projected, cross, columns, dof=self.dof, amplitude_sd=self.amplitude_sd)
+
+    def _solve(self, theta: FloatArray) -> tuple[FloatArray, LinearSolution]:
+        """Log evidence (m, fields) and the conditional solutions."""
+        projected, cross = self._project(self.scene.templates(theta, self.window))
+        found = [self._under(projected, cross, columns) for columns in self.fields]
+        return np.concatenate([one for one, _ in found], axis=1), joined([solution for _, solution in found])
 
 
-def _independent_variance(cells: FitCells) -> FloatArray:
+def independent_variance(cells: FitCells) -> FloatArray:
     """(n,) independent variance of the cells, mean 1: reading variance over count where readings were counted."""
     reading = float(np.sum(cells.variance * cells.count) / np.sum(cells.count))
     variance = 1.0 / cells.count if reading > 0 else np.ones(len(cells))
     return np.asarray(variance / variance.mean())
 
 
-def _level_and_tilt(cells: FitCells) -> FloatArray:
+def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
+    """(c, n) level, and tilt across the window in units of its half width."""
+    ones = np.ones((1, len(cells)))
+    if not tilt:
+        return ones
     x, y = cells.x_mm - cells.x_mm.mean(), cells.y_mm - cells.y_mm.mean()
     size = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
-    return np.stack([np.ones(len(cells)), x / size, y / size], axis=1)
+    return np.concatenate([ones, np.stack([x, y]) / size])
 
 
-def _choose(evidence: FloatArray, rng: np.random.Generator) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
+def choose(evidence: FloatArray, rng: np.random.Generator) -> IntArray:
     """(m,) one field for each draw, with its share of the evidence."""
     weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
     edges = np.cumsum(weight, axis=1)
     uniform = rng.uniform(size=len(evidence)) * edges[:, -1]
     return np.asarray((edges < uniform[:, None]).sum(axis=1))
-
-
-def _pick(solutions: list[LinearSolution], index: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> LinearSolution:
-    rows = np.arange(len(index))
-    names = ("amplitude", "level", "amplitude_variance", "level_slope", "level_variance", "sum_of_squares")
-    return LinearSolution(*(np.stack([getattr(s, name) for s in solutions], axis=1)[rows, index] for name in names))

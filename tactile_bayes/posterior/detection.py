@@ -82,7 +82,12 @@ def detect(
             lump.append(pair[1])
     occam = _log_occam_factor(tactile_map, bump, theta=theta, covariance=covariance, prior=prior)
     log_factor = float(np.logaddexp.reduce(lump) - np.logaddexp.reduce(null)) + occam
-    return Detection(float(1.0 / (1.0 + np.exp(-np.clip(log_factor, -700, 700)))), log_factor)
+    return detection_from_odds(log_factor)
+
+
+def detection_from_odds(log_bayes_factor: float) -> Detection:
+    """The probability that goes with a Bayes factor at even prior odds."""
+    return Detection(float(1.0 / (1.0 + np.exp(-np.clip(log_bayes_factor, -700, 700)))), log_bayes_factor)
 
 
 def _blocks(tactile_map: TactileMap, bump: Bump, theta: FloatArray) -> _Blocks:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
@@ -21,6 +21,9 @@ from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
 from tactile_bayes.posterior.size_calibration import SizeCalibration
 from tactile_bayes.presets import CELL_PER_SIGMA
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.field_estimate import FieldAnswer
 
 Status = Literal["estimate", "no_estimate"]
 ROTATION_ODDS = 3.0
@@ -47,6 +50,8 @@ class EstimateOptions:
         Of the ensemble; None for its default.
     accuracy_sd
         Of interval ends, in posterior SDs, for importance sampling; None for its default.
+    scene
+        One of `scene_choice.SCENES`, under a noise field.
     """
 
     method: str = "ensemble"
@@ -55,6 +60,7 @@ class EstimateOptions:
     least_probability: float = DETECTED
     max_steps: int | None = None
     accuracy_sd: float | None = None
+    scene: str = "auto"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,12 +144,16 @@ def estimate_map(
     if chosen.fault or chosen.fit is None:
         return Estimate("no_estimate", _fault_reason(candidates), candidates=candidates)
     fit = chosen.fit
-    detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
+    seen = _look(tactile_map, fit, options)
+    detection = seen if isinstance(seen, Detection) else seen.detection
     if detection.probability < options.least_probability:
         reason = f"no lump detected (probability {detection.probability:.2g}, needed {options.least_probability:g})"
         return Estimate("no_estimate", reason, detection=detection, candidates=candidates)
-    if options.fit.noise == "field":
-        draws, posterior, noise = _under_field(fit, options, rng=rng, progress=progress)
+    if not isinstance(seen, Detection):
+        seen = _draw_under_field(seen, tactile_map, options, rng=rng, progress=progress)
+        detection, draws, noise = seen.detection, seen.draws, dict(seen.diagnostics)
+        assert draws is not None
+        posterior = MapPosterior(**seen.posterior)
     else:
         fit, odds = _choose_rotation(tactile_map, fit, options)
         draws = _draw(fit, options, rng=rng, progress=progress)
@@ -278,35 +288,52 @@ def _size(
     )
 
 
-def _under_field(
-    fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Callable[[int, int], None] | None
-) -> tuple[ParameterDraws, MapPosterior, dict[str, object]]:
-    """The posterior under correlated errors, started from the least-squares bump."""
-    from tactile_bayes.posterior.field_posterior import choose_field_fit, draw_field, shape_draws
+def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Detection | FieldAnswer:
+    """Whether there is a lump; under a noise field with the fit that says so."""
+    if options.fit.noise != "field":
+        return detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
+    from tactile_bayes.posterior.field_estimate import look
 
-    chosen, odds = choose_field_fit(fit, options.prior, options.fit, least_odds=ROTATION_ODDS)
-    draws = draw_field(
-        chosen,
+    try:
+        return look(
+            tactile_map,
+            fit,
+            prior=options.prior,
+            radius_mm=options.fit.radius_mm,
+            scene=_scene(options),
+            least_odds=ROTATION_ODDS,
+        )
+    except NotConvergedError:
+        # no mode: under these errors nothing stands out that could be weighed
+        return Detection(0.0, -np.inf)
+
+
+def _scene(options: EstimateOptions) -> str:
+    """The scene asked for; the option that turns the ellipse decides where none was named."""
+    turned = {"on": "rotated", "off": "ellipse"}.get(options.fit.rotation, "auto")
+    return turned if options.scene == "auto" else options.scene
+
+
+def _draw_under_field(
+    seen: FieldAnswer,
+    tactile_map: TactileMap,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] | None,
+) -> FieldAnswer:
+    from tactile_bayes.posterior.field_estimate import draw
+
+    return draw(
+        seen,
+        tactile_map,
         options.method,
         rng=rng,
+        scene=_scene(options),
         accuracy_sd=options.accuracy_sd,
         max_steps=options.max_steps,
         progress=progress,
     )
-    sigma_x, sigma_y, angle = shape_draws(chosen, draws.theta)
-    amplitude, level, noise_sd = (v.reshape(sigma_x.shape) for v in chosen.target.draw_linear(draws.flat, rng))
-    posterior = MapPosterior(
-        amplitude=amplitude,
-        sigma_x_mm=sigma_x,
-        sigma_y_mm=sigma_y,
-        x_mm=draws.theta[..., 2],
-        y_mm=draws.theta[..., 3],
-        angle_rad=angle,
-        background=level,
-        noise_sd=noise_sd,
-    )
-    figures: dict[str, object] = {"rotation_odds": odds, "rotated": chosen.rotated, "noise": "field"}
-    return draws, posterior, figures | chosen.target.field_summary(chosen.mode)
 
 
 def _judged_noise(fit: BumpFit, odds: float | None) -> dict[str, object]:

@@ -36,14 +36,14 @@ class Whitening:
     ----------
     length_mm
         Correlation length.
-    rotated : (n, k) array
-        Basis turned so that the field's precision is diagonal: ``D^-1 Phi S^1/2 Q``.
+    turn : (cosines^2, k) array
+        Takes inner products with the cosines, ``D^-1 Phi``, to directions in which the field's precision is diagonal.
     eigenvalues : (k,) array
         Of ``S^1/2 Phi' D^-1 Phi S^1/2``.
     """
 
     length_mm: float
-    rotated: FloatArray
+    turn: FloatArray
     eigenvalues: FloatArray
 
     def shrinkage(self, share: float | FloatArray) -> FloatArray:
@@ -54,34 +54,57 @@ class Whitening:
     def pruned(self, share: float) -> Whitening:
         """Without the directions that the field hardly touches at this share or a smaller one."""
         keep = share * self.eigenvalues > TOUCHED
-        return Whitening(self.length_mm, np.ascontiguousarray(self.rotated[:, keep]), self.eigenvalues[keep])
+        return Whitening(self.length_mm, np.ascontiguousarray(self.turn[:, keep]), self.eigenvalues[keep])
 
     def log_determinant(self, share: float | FloatArray) -> FloatArray:
         """(...) log determinant of the covariance over that of D."""
         return np.asarray(np.log1p(np.asarray(share)[..., None] * self.eigenvalues).sum(axis=-1))
 
 
-def cosine_basis(x_mm: FloatArray, y_mm: FloatArray, *, cosines: int = COSINES) -> tuple[FloatArray, FloatArray]:
-    """Cosines on a rectangle around points, and their squared angular frequencies.
+def cosine_profiles(axis_mm: FloatArray, *, cosines: int = COSINES) -> tuple[FloatArray, FloatArray]:
+    """Cosines along one axis, and their squared angular frequencies.
 
     Returns
     -------
-    basis : (n, cosines^2) array
-        Orthonormal on the rectangle, scaled so that equal coefficients give equal mean squares.
-    frequency2 : (cosines^2,) array of 1/mm^2
+    profiles : (n, cosines) array
+        Of mean square 1 over the axis and its margins.
+    frequency2 : (cosines,) array of 1/mm^2
     """
-    columns, squares = [], []
-    for values in (x_mm, y_mm):
-        middle = 0.5 * (values.max() + values.min())
-        side = MARGIN * max(float(np.ptp(values)), 1e-6)
-        phase = (values - middle) / side + 0.5
-        order = np.arange(cosines)
-        one = np.cos(np.pi * order * phase[:, None])
-        one[:, 1:] *= np.sqrt(2.0)
-        columns.append(one)
-        squares.append((np.pi * order / side) ** 2)
-    basis = columns[0][:, :, None] * columns[1][:, None, :]
-    return basis.reshape(len(x_mm), -1), (squares[0][:, None] + squares[1][None, :]).ravel()
+    phase, side = _phase(axis_mm)
+    order = np.arange(cosines)
+    profiles = np.cos(np.pi * order * phase[:, None])
+    profiles[:, 1:] *= np.sqrt(2.0)
+    return profiles, np.asarray((np.pi * order / side) ** 2, dtype=np.float64)
+
+
+def _phase(axis_mm: FloatArray) -> tuple[FloatArray, float]:
+    middle = 0.5 * (axis_mm.max() + axis_mm.min())
+    side = MARGIN * max(float(np.ptp(axis_mm)), 1e-6)
+    return (axis_mm - middle) / side + 0.5, side
+
+
+def gram_of_cosines(x_mm: FloatArray, y_mm: FloatArray, *, weight: FloatArray, cosines: int = COSINES) -> FloatArray:
+    """Inner products of the plane's cosines under (ny, nx) weights: (cosines^2, cosines^2), y's order counted first.
+
+    A product of two cosines is half the sum of the cosines of the sum and the difference: all products come from the
+    weights' own transform.
+    """
+    order = np.arange(2 * cosines - 1)
+    along = np.cos(np.pi * order * _phase(y_mm)[0][:, None])
+    across = np.cos(np.pi * order * _phase(x_mm)[0][:, None])
+    transform = along.T @ weight @ across
+    i = np.arange(cosines)
+    total, apart = i[:, None] + i, np.abs(i[:, None] - i)
+    scale = np.where(i > 0, np.sqrt(2.0), 1.0)
+    pair = 0.25 * (
+        transform[total][..., total]
+        + transform[total][..., apart]
+        + transform[apart][..., total]
+        + transform[apart][..., apart]
+    )
+    # axes: y, y', x, x'
+    pair *= (scale[:, None] * scale)[:, :, None, None] * (scale[:, None] * scale)
+    return np.asarray(pair.transpose(0, 2, 1, 3).reshape(cosines**2, cosines**2))
 
 
 def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
@@ -90,25 +113,16 @@ def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
     return np.asarray(density / density.sum())
 
 
-def whitenings(
-    x_mm: FloatArray, y_mm: FloatArray, *, variance: FloatArray, lengths_mm: tuple[float, ...] = LENGTHS_MM
-) -> list[Whitening]:
-    """Prepare the fields of several lengths on one set of cells.
+def whitening(gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> Whitening:
+    """Prepare the field of one length.
 
     Parameters
     ----------
-    x_mm, y_mm : (n,) arrays
-    variance : (n,) array
-        Independent variance of each cell, up to the common factor tau^2.
+    gram : (k, k) array
+        ``Phi' D^-1 Phi``, see `gram_of_cosines`.
+    frequency2 : (k,) array of 1/mm^2
     """
-    basis, frequency2 = cosine_basis(x_mm, y_mm)
-    scaled = basis / variance[:, None]
-    gram = basis.T @ scaled
-    found = []
-    for length in lengths_mm:
-        root = np.sqrt(spectrum(frequency2, length))
-        values, vectors = np.linalg.eigh(root[:, None] * gram * root)
-        keep = values > 1e-9 * values[-1]
-        rotated = scaled @ (root[:, None] * vectors[:, keep])
-        found.append(Whitening(length, rotated, values[keep]))
-    return found
+    root = np.sqrt(spectrum(frequency2, length_mm))
+    values, vectors = np.linalg.eigh(root[:, None] * gram * root)
+    keep = values > 1e-9 * values[-1]
+    return Whitening(length_mm, root[:, None] * vectors[:, keep], values[keep])

@@ -1,9 +1,9 @@
-"""The posterior of a bump under correlated errors: shape by one of the methods, the rest drawn exactly."""
+"""The posterior of a scene under correlated errors: its mode, a Gaussian for each field, and draws."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,15 +11,45 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.cells import FitCells
-from tactile_bayes.posterior.collapsed import CollapsedTarget
-from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.fit import WIDEST_IN_RADII, BumpFit, FitOptions
+from tactile_bayes.posterior.collapsed import CollapsedTarget, independent_variance
+from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
+from tactile_bayes.posterior.fit import WIDEST_IN_RADII, BumpFit
 from tactile_bayes.posterior.importance import importance, importance_options
-from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
+from tactile_bayes.posterior.laplace import mode_and_covariance
+from tactile_bayes.posterior.scene import Scene
+from tactile_bayes.posterior.target import finite_differences, stencil
+from tactile_bayes.posterior.window import Window
 
-START_SCALE = np.array([0.06, 0.06, 0.3, 0.3, 0.06])
 MOST_SETTLINGS = 6
+LEAST_SHARE = 1e-2
+"""Fields with a smaller share of the posterior have no Gaussian of their own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixture:
+    """One Gaussian for each noise field that matters: what `laplace` draws from.
+
+    Parameters
+    ----------
+    weight : (h,) array
+        Sum 1.
+    mean, covariance : (h, p), (h, p, p) arrays
+    log_evidence
+        Log of the integral of the density that the mixture stands for.
+    """
+
+    weight: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    log_evidence: float
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """(p,) mean and (p, p) covariance of the whole."""
+        mean = self.weight @ self.mean
+        off = self.mean - mean
+        return mean, np.asarray(
+            np.einsum("h,hpq->pq", self.weight, self.covariance) + (self.weight[:, None] * off).T @ off
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,12 +61,20 @@ class FieldFit:
     target
         Its density, with the noise fields that matter there.
     mode, covariance : (p,), (p, p) arrays
-        Of ``(u, v, x, y[, r])``, see `CollapsedTarget`.
+        Of the scene's parameters; the covariance is the mixture's, not the curvature at the mode.
+    mixture
+        A Gaussian a field.
     """
 
     target: CollapsedTarget
     mode: FloatArray
     covariance: FloatArray
+    mixture: Mixture
+
+    @property
+    def scene(self) -> Scene:
+        """What the model has."""
+        return self.target.scene
 
     @property
     def rotated(self) -> bool:
@@ -46,78 +84,129 @@ class FieldFit:
     @property
     def dof(self) -> float:
         """Degrees of freedom of the noise scale."""
-        return float(len(self.target.data) - self.target.columns)
+        return float(self.target.dof)
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence of the scene by the Gaussians' volumes."""
+        return self.mixture.log_evidence
+
+    def sd(self, name: str) -> float:
+        """Posterior standard deviation of one parameter."""
+        i = self.scene.names.index(name)
+        return float(np.sqrt(self.covariance[i, i]))
 
 
-def fit_field(
-    cells: FitCells,
-    start: FloatArray,
-    *,
-    prior: BumpPrior,
-    rotated: bool,
-    widest_mm: float,
-    radius_mm: float,
+def field_window(least_squares: BumpFit) -> Window:
+    """The window of a least-squares bump."""
+    return Window(least_squares.cells, independent_variance(least_squares.cells))
+
+
+def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:
+    """Where the search for a scene's mode begins: the least-squares bump."""
+    p, q, r = (float(v) for v in least_squares.bump.shape_parameters(least_squares.theta))
+    turned = np.array([p + q, p - q, least_squares.theta[1], least_squares.theta[2], r])
+    return Scene("rotated").carried(turned, scene)
+
+
+def fit_scene(
+    window: Window, scene: Scene, start: FloatArray, *, prior: BumpPrior, radius_mm: float, amplitude_scale: float = 1.0
 ) -> FieldFit:
     """Find the mode; the fields that matter and the mode are settled in turn, because each depends on the other.
 
     Parameters
     ----------
-    start : (5,) array
-        ``(u, v, x, y, r)``, for example from least squares.
+    start : (p,) array
+        The scene's parameters, for example from least squares.
 
     Raises
     ------
     NotConvergedError
         When there is no mode.
     """
-    target = CollapsedTarget(cells, prior=prior, level=None, rotated=rotated, widest_mm=widest_mm, radius_mm=radius_mm)
-    scale = START_SCALE[: target.dimension]
-    target.settle_fields(start[: target.dimension])
-    mode, covariance, _ = mode_and_covariance(target, start[: target.dimension], scale=scale)
+    target = CollapsedTarget(
+        window,
+        scene,
+        prior=prior,
+        widest_mm=WIDEST_IN_RADII * radius_mm,
+        radius_mm=radius_mm,
+        amplitude_scale=amplitude_scale,
+    )
+    target.settle_fields(start)
+    mode, covariance, _ = mode_and_covariance(target, start, scale=scene.steps)
     for _ in range(MOST_SETTLINGS):
         if not target.settle_fields(mode):
             break
-        mode, covariance, _ = mode_and_covariance(target, mode, scale=scale)
+        mode, covariance, _ = mode_and_covariance(target, mode, scale=scene.steps)
     if not np.isfinite(target(mode[None])[0]):
         raise NotConvergedError("the posterior has no density at the fitted bump: there is no rise under this noise")
-    return FieldFit(target, mode, covariance)
+    mixture = gaussian_mixture(target, mode, covariance)
+    return FieldFit(target, mode, mixture.moments()[1], mixture)
 
 
-def choose_field_fit(
-    least_squares: BumpFit, prior: BumpPrior, options: FitOptions, *, least_odds: float
-) -> tuple[FieldFit, float | None]:
-    """Fit from the least-squares bump, turned only where the map favours it by `least_odds` (or as the options say).
+def gaussian_mixture(target: CollapsedTarget, mode: FloatArray, covariance: FloatArray) -> Mixture:
+    """One Gaussian a field, each by one Newton step from the common mode; the one common Gaussian if that fails.
 
-    Returns
-    -------
-    fit
-    odds
-        Of a turned ellipse against one along the head's axes; None when the options decided.
+    The common curvature is sharper than the mixture is wide where fields with modes of their own share the evidence.
     """
-    p, q, r = (float(v) for v in least_squares.bump.shape_parameters(least_squares.theta))
-    start = np.array([p + q, p - q, least_squares.theta[1], least_squares.theta[2], r])
+    scale = np.sqrt(np.diag(covariance))
+    points = stencil(mode, step=0.3 * scale)
+    by_field = target.by_field(points) + target.log_prior(points)[:, None]
+    whole = float(np.logaddexp.reduce(by_field[0]))
+    if not np.isfinite(whole):
+        return _common(mode, covariance, whole)
+    share = np.exp(by_field[0] - whole)
+    means, covariances, masses = [], [], []
+    for h in np.flatnonzero(share > LEAST_SHARE):
+        if not np.isfinite(by_field[:, h]).all():
+            return _common(mode, covariance, whole)
+        gradient, hessian = finite_differences(by_field[:, h], step=0.3 * scale)
+        found = _newton_gaussian(gradient, hessian, scale, limit=covariance)
+        if found is None:
+            return _common(mode, covariance, whole)
+        step, one, gained = found
+        means.append(mode + step)
+        covariances.append(one)
+        masses.append(by_field[0, h] + gained + 0.5 * float(np.linalg.slogdet(2.0 * np.pi * one)[1]))
+    mass = np.array(masses)
+    total = float(np.logaddexp.reduce(mass))
+    left_out = float(np.log(share[share > LEAST_SHARE].sum()))
+    return Mixture(np.exp(mass - total), np.array(means), np.array(covariances), total - left_out)
 
-    def fit(rotated: bool) -> FieldFit:
-        return fit_field(
-            least_squares.cells,
-            start,
-            prior=prior,
-            rotated=rotated,
-            widest_mm=WIDEST_IN_RADII * options.radius_mm,
-            radius_mm=options.radius_mm,
-        )
 
-    if options.rotation != "auto":
-        return fit(options.rotation == "on"), None
-    turned = fit(True)
-    odds = rotation_odds(turned, prior)
-    return (turned, odds) if odds > least_odds else (fit(False), odds)
+def _newton_gaussian(
+    gradient: FloatArray, hessian: FloatArray, scale: FloatArray, *, limit: FloatArray
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Step to a field's own mode, its covariance and what the step gains; None where that is no maximum nearby."""
+    values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
+    if not values[0] > 0.05:
+        return None
+    covariance = (vectors / values) @ vectors.T * np.outer(scale, scale)
+    step = covariance @ gradient
+    if np.sqrt(step @ np.linalg.solve(limit, step)) > 3.0:
+        return None
+    return step, covariance, 0.5 * float(gradient @ step)
 
 
-def rotation_odds(turned: FieldFit, prior: BumpPrior) -> float:
-    """Bayes factor of a turned ellipse against one along the head's axes: the Savage-Dickey ratio at r = 0."""
-    r, sd = float(turned.mode[4]), float(np.sqrt(turned.covariance[4, 4]))
-    return float(np.exp(np.clip(np.log(sd / prior.log_ratio_sd) + 0.5 * (r / sd) ** 2, -700, 700)))
+def _common(mode: FloatArray, covariance: FloatArray, log_density: float) -> Mixture:
+    volume = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+    return Mixture(np.ones(1), mode[None], covariance[None], log_density + volume)
+
+
+def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDEPENDENT_DRAWS) -> ParameterDraws:
+    """Draws from the Gaussians of the fields, with the t tails of an estimated noise scale.
+
+    Where several fields share the evidence one Gaussian was up to 25 % too narrow; a Gaussian for each is within a
+    few per cent.
+    """
+    number = rng.multinomial(draws, fit.mixture.weight)
+    widen = (fit.dof + len(fit.mode)) / fit.dof
+    parts = [
+        student_draws(mean, widen * covariance, dof=fit.dof, number=int(n), rng=rng)
+        for mean, covariance, n in zip(fit.mixture.mean, fit.mixture.covariance, number, strict=True)
+    ]
+    flat = rng.permutation(np.concatenate(parts))
+    return ParameterDraws(flat[None], "laplace", {"draws": float(draws), "fields": float(len(number))})
 
 
 def draw_field(
@@ -131,11 +220,10 @@ def draw_field(
 ) -> ParameterDraws:
     """Draws of the shape by ``"laplace"``, ``"importance"`` or ``"ensemble"``."""
     if method == "laplace":
-        return laplace(fit.target, fit.mode, scale=np.sqrt(np.diag(fit.covariance)), dof=fit.dof, rng=rng)
+        return laplace_mixture(fit, rng=rng)
     if method == "importance":
-        return importance(fit.target, fit.mode, fit.covariance, rng=rng, options=importance_options(accuracy_sd))
-    from dataclasses import replace
-
+        mean, covariance = fit.mixture.moments()
+        return importance(fit.target, mean, covariance, rng=rng, options=importance_options(accuracy_sd))
     from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
 
     settings = EnsembleOptions() if max_steps is None else replace(EnsembleOptions(), max_steps=max_steps)
@@ -144,4 +232,4 @@ def draw_field(
 
 def shape_draws(fit: FieldFit, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """sigma_x_mm, sigma_y_mm and angle_rad of (..., p) draws."""
-    return principal_widths(*fit.target.shape(theta))
+    return principal_widths(*fit.scene.widths(theta))

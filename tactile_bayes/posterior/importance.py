@@ -8,14 +8,16 @@ import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
+from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.laplace import LogDensity
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.sobol import BITS, shifted_sobol
 
-SCALES = np.array([1.0, 1.6, 3.0])
-SHARES = np.array([0.6, 0.3, 0.1])
-"""The proposal: normals about the mode whose SDs are these multiples of the curvature's, mixed in these shares."""
+STRETCH = 0.3
+"""Bend of the proposal's tails: normal coordinates z become sinh(b z) / b, normal in the middle, log-normal outside."""
+POOR = 0.5
+"""Below this share of effective draws the proposal is moved to the weighted moments of the points so far."""
+MOST_MOVES = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +33,14 @@ class ImportanceOptions:
     first, most
         Points of a replicate to begin with, and at most.
     keep
-        Equal-weight draws returned.
+        Equal-weight draws returned, at least: twice the points where those are more.
     """
 
     accuracy_sd: float = 0.02
-    replicates: int = 8
-    first: int = 128
-    most: int = 16384
-    keep: int = INDEPENDENT_DRAWS
+    replicates: int = 4
+    first: int = 256
+    most: int = 32768
+    keep: int = 8192
 
 
 def importance_options(accuracy_sd: float | None) -> ImportanceOptions:
@@ -70,39 +72,68 @@ def importance(
 
     Notes
     -----
-    The points are a Sobol set under random digital shifts, the proposal a mixture of normals about the mode, so that
-    its density is exact and its tails are wider than the target's. Put the parameters that matter first: a Sobol set
-    fills its first coordinates most evenly, and the proposal's root is triangular.
+    The points are a Sobol set under random digital shifts. The proposal is smooth, close to a normal in its middle and
+    wider in its tails, so that the points stay even and the weights bounded where the density falls a little more
+    slowly than a normal. Put the parameters that matter first: a Sobol set fills its first coordinates most evenly,
+    and the proposal's root is triangular.
     """
     options = options or ImportanceOptions()
-    sampler = _Sampler(log_density, mode, covariance, replicates=options.replicates, rng=rng)
-    points = options.first
-    sampler.extend(points)
+    sampler = _settled(log_density, mode, covariance, rng=rng, options=options)
     while True:
         weights, shape = sampler.weights()
         error = sampler.end_error(weights)
         trusted = (np.isfinite(shape) and shape <= TRUSTED_SHAPE) or shape == -np.inf
         if trusted and error <= options.accuracy_sd:
             break
-        if points >= options.most:
+        if sampler.points >= options.most:
             raise NotConvergedError(
                 f"importance sampling stopped at {sampler.number} points with an end-point error of {error:.3f} SD "
                 f"(wanted {options.accuracy_sd:g}) and Pareto shape {shape:.2f} (wanted {TRUSTED_SHAPE:g} or less); "
                 "use --method ensemble",
                 diagnostics={"pareto_k": float(shape), "end_error_sd": error},
             )
-        sampler.extend(points)
-        points *= 2
-    draws = sampler.theta[systematic(weights, options.keep, rng)]
+        sampler.extend(sampler.points)
+    keep = max(options.keep, 2 * sampler.number)
+    draws = sampler.theta[systematic(weights, keep, rng)]
     figures = {
         "pareto_k": float(shape),
         "end_error_sd": error,
-        "evaluations": float(sampler.number),
+        "evaluations": float(sampler.evaluations),
         "effective_draws": float(1.0 / np.sum(weights**2)),
         "log_evidence": sampler.log_evidence(),
-        "draws": float(options.keep),
+        "log_evidence_error": sampler.log_evidence_error(),
+        "draws": float(keep),
     }
     return ParameterDraws(draws[None], "importance", figures)
+
+
+def _settled(
+    log_density: LogDensity,
+    mode: FloatArray,
+    covariance: FloatArray,
+    *,
+    rng: np.random.Generator,
+    options: ImportanceOptions,
+) -> _Sampler:
+    """The first points, from a proposal that was moved while it was poor."""
+    spent = 0
+    for _ in range(MOST_MOVES):
+        sampler = _Sampler(log_density, mode, covariance, replicates=options.replicates, rng=rng, spent=spent)
+        sampler.extend(options.first)
+        weights, _ = sampler.weights()
+        if not np.isfinite(weights).all():
+            raise NotConvergedError(
+                "importance sampling found no density about the mode; use --method ensemble",
+                diagnostics={"pareto_k": float("nan")},
+            )
+        if 1.0 / np.sum(weights**2) > POOR * sampler.number:
+            break
+        moved = sampler.theta - weights @ sampler.theta
+        about = (weights[:, None] * moved).T @ moved
+        if not np.linalg.eigvalsh(about)[0] > 1e-6 * np.linalg.eigvalsh(covariance)[0]:
+            break
+        mode, covariance, spent = weights @ sampler.theta, about, sampler.evaluations
+    return sampler
 
 
 class _Sampler:
@@ -116,12 +147,13 @@ class _Sampler:
         *,
         replicates: int,
         rng: np.random.Generator,
+        spent: int,
     ) -> None:
         p = len(mode)
         self._log_density, self._mode = log_density, mode
         self._root = np.linalg.cholesky(covariance)
-        self._shifts = rng.integers(2**BITS, size=(replicates, p + 1), dtype=np.uint32)
-        self._done = 0
+        self._shifts = rng.integers(2**BITS, size=(replicates, p), dtype=np.uint32)
+        self._spent = spent
         self._theta = np.empty((replicates, 0, p))
         self._log_weights = np.empty((replicates, 0))
 
@@ -131,27 +163,32 @@ class _Sampler:
         return self._log_weights.size
 
     @property
+    def points(self) -> int:
+        """Points in each replicate."""
+        return self._log_weights.shape[1]
+
+    @property
+    def evaluations(self) -> int:
+        """Densities asked for, those of earlier proposals included."""
+        return self._spent + self.number
+
+    @property
     def theta(self) -> FloatArray:
         """(n, p) all points."""
         return self._theta.reshape(-1, len(self._mode))
 
     def extend(self, points: int) -> None:
         """Add `points` to every replicate."""
-        uniform = shifted_sobol(self._done, points, shifts=self._shifts)
-        component = np.searchsorted(np.cumsum(SHARES)[:-1], uniform[..., -1])
-        z = normal_quantile(uniform[..., :-1]) * SCALES[component][..., None]
-        theta = self._mode + z @ self._root.T
+        z = normal_quantile(shifted_sobol(self.points, points, shifts=self._shifts))
+        theta = self._mode + np.sinh(STRETCH * z) / STRETCH @ self._root.T
         log_target = self._log_density(theta.reshape(-1, len(self._mode))).reshape(theta.shape[:2])
         self._theta = np.concatenate([self._theta, theta], axis=1)
         self._log_weights = np.concatenate([self._log_weights, log_target - self._log_proposal(z)], axis=1)
-        self._done += points
 
     def _log_proposal(self, z: FloatArray) -> FloatArray:
-        p = z.shape[-1]
-        square = np.sum(z**2, axis=-1)[..., None]
-        parts = np.log(SHARES) - p * np.log(SCALES) - 0.5 * square / SCALES**2
         log_det = float(np.log(np.diag(self._root)).sum())
-        return np.asarray(np.logaddexp.reduce(parts, axis=-1) - log_det - 0.5 * p * np.log(2 * np.pi))
+        parts = -0.5 * z**2 - np.log(np.cosh(STRETCH * z)) - 0.5 * np.log(2 * np.pi)
+        return np.asarray(parts.sum(axis=-1) - log_det)
 
     def weights(self) -> tuple[FloatArray, float]:
         """Smoothed weights of all points, and the Pareto shape of their tail."""
@@ -162,8 +199,14 @@ class _Sampler:
         flat = self._log_weights.ravel()
         return float(np.logaddexp.reduce(flat) - np.log(len(flat)))
 
+    def log_evidence_error(self) -> float:
+        """Standard error of `log_evidence`, from the replicates."""
+        each = np.logaddexp.reduce(self._log_weights, axis=1)
+        share = np.exp(each - each.max())
+        return float(share.std(ddof=1) / share.mean() / np.sqrt(len(share)))
+
     def end_error(self, weights: FloatArray) -> float:
-        """Largest Monte-Carlo error of an end of a 95 % interval over the parameters, in SDs."""
+        """Largest Monte-Carlo error of the ends of a 95 % interval over the parameters, in SDs."""
         by_replicate = weights.reshape(self._log_weights.shape)
         worst = 0.0
         for i in range(len(self._mode)):
@@ -171,7 +214,8 @@ class _Sampler:
             mean = float(np.sum(weights * values.ravel()))
             sd = float(np.sqrt(np.sum(weights * (values.ravel() - mean) ** 2)))
             ends = [weighted_quantile(v, w, (0.025, 0.975)) for v, w in zip(values, by_replicate, strict=True)]
-            worst = max(worst, float((np.std(ends, axis=0, ddof=1) / np.sqrt(len(ends))).max()) / sd if sd > 0 else 0.0)
+            error = float(np.sqrt(np.mean(np.var(ends, axis=0, ddof=1)) / len(ends)))
+            worst = max(worst, error / sd if sd > 0 else 0.0)
         return worst
 
 

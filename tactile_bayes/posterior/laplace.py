@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
-from tactile_bayes.posterior.target import numerical_gradient_and_hessian
+from tactile_bayes.posterior.target import finite_differences, stencil
 
 LogDensity = Callable[[FloatArray], FloatArray]
 
@@ -63,7 +63,7 @@ def mode_and_covariance(
     value = float(log_density(theta[None])[0])
     damping = 1e-8
     for taken in range(1, max_steps + 1):
-        gradient, hessian = numerical_gradient_and_hessian(log_density, theta, step=1e-2 * scale)
+        gradient, hessian = _slopes(log_density, theta, step=1e-2 * scale)
         step = scale * _newton_step(gradient * scale, -hessian * np.outer(scale, scale), damping)
         trial = theta + step
         trial_value = float(log_density(trial[None])[0])
@@ -78,6 +78,16 @@ def mode_and_covariance(
     raise NotConvergedError(f"no posterior mode found in {max_steps} Newton steps; try --method ensemble")
 
 
+def _slopes(log_density: LogDensity, theta: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradient and Hessian, or an error where a neighbouring point has no density."""
+    values = log_density(stencil(theta, step=step))
+    if not np.isfinite(values).all():
+        raise NotConvergedError(
+            "the posterior's mode lies at the edge of what the window allows; try --method ensemble"
+        )
+    return finite_differences(values, step=step)
+
+
 def _newton_step(gradient: FloatArray, curvature: FloatArray, damping: float) -> FloatArray:
     """Uphill step in standardised units; negative curvature is turned round."""
     values, vectors = np.linalg.eigh(curvature)
@@ -86,7 +96,7 @@ def _newton_step(gradient: FloatArray, curvature: FloatArray, damping: float) ->
 
 
 def _covariance(log_density: LogDensity, theta: FloatArray, *, scale: FloatArray) -> FloatArray:
-    _, hessian = numerical_gradient_and_hessian(log_density, theta, step=5e-2 * scale)
+    _, hessian = _slopes(log_density, theta, step=5e-2 * scale)
     values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
     if not values[0] > 1e-9 * values[-1]:
         raise NotConvergedError("the posterior has no maximum in every direction; try --method ensemble")

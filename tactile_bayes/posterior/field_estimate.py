@@ -1,0 +1,131 @@
+"""A bump under correlated errors, from its least-squares fit to detection, scene and draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.cells import trusted
+from tactile_bayes.posterior.detection import Detection, detection_from_odds
+from tactile_bayes.posterior.draws import ParameterDraws
+from tactile_bayes.posterior.field_posterior import FieldFit, draw_field, field_window, shape_draws, start_vector
+from tactile_bayes.posterior.fit import BumpFit
+from tactile_bayes.posterior.scene import Scene
+from tactile_bayes.posterior.scene_choice import SceneChoice, add_beside, choose_shape
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldAnswer:
+    """What the map says under correlated errors.
+
+    Parameters
+    ----------
+    detection
+        Whether there is a lump.
+    choice
+        The scene.
+    draws
+        Of the scene's parameters; None where they were not asked for.
+    posterior
+        Joint draws by the names of `MapPosterior`, each (chain, draw).
+    diagnostics
+        Figures of the fit and the noise.
+    """
+
+    detection: Detection
+    choice: SceneChoice
+    draws: ParameterDraws | None = None
+    posterior: Mapping[str, FloatArray] = field(default_factory=dict)
+    diagnostics: Mapping[str, object] = field(default_factory=dict)
+
+
+def look(
+    tactile_map: TactileMap,
+    fit: BumpFit,
+    *,
+    prior: BumpPrior,
+    radius_mm: float,
+    scene: str = "auto",
+    least_odds: float,
+) -> FieldAnswer:
+    """Fit the bump under correlated errors and weigh it against none.
+
+    Raises
+    ------
+    NotConvergedError
+        When the density has no mode.
+    """
+    choice = choose_shape(
+        field_window(fit),
+        start_vector(fit, Scene("rotated")),
+        prior=prior,
+        radius_mm=radius_mm,
+        amplitude_scale=fit.bump.scale,
+        scene=scene,
+        least_odds=least_odds,
+    )
+    return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
+
+
+def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: float) -> Detection:
+    """Odds of a bump somewhere on the map against level, tilt and the same noise fields alone.
+
+    The window's evidence has the centre anywhere in the window; the search over the rest of the map is paid for.
+    """
+    area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2
+    window = np.pi * plain.target.radius_mm**2
+    searched = np.log(max(area / window, 1.0))
+    return detection_from_odds(log_evidence - plain.target.null_log_evidence() - searched)
+
+
+def draw(
+    answer: FieldAnswer,
+    tactile_map: TactileMap,
+    method: str,
+    *,
+    rng: np.random.Generator,
+    scene: str = "auto",
+    accuracy_sd: float | None = None,
+    max_steps: int | None = None,
+    progress: Progress | None = None,
+) -> FieldAnswer:
+    """The same with a second structure where the map asks for one, and draws."""
+    choice = add_beside(answer.choice, scene=scene)
+    draws = draw_field(choice.fit, method, rng=rng, accuracy_sd=accuracy_sd, max_steps=max_steps, progress=progress)
+    detection = answer.detection
+    if choice.fit is choice.plain and "log_evidence" in draws.diagnostics:
+        detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
+    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng), _diagnostics(choice))
+
+
+def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator) -> dict[str, FloatArray]:
+    theta, shape = draws.theta, draws.theta.shape[:2]
+    sigma_x, sigma_y, angle = shape_draws(fit, theta)
+    amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng)
+    return {
+        "amplitude": amplitude[:, 0].reshape(shape),
+        "sigma_x_mm": sigma_x,
+        "sigma_y_mm": sigma_y,
+        "x_mm": fit.scene.column(theta, "x"),
+        "y_mm": fit.scene.column(theta, "y"),
+        "angle_rad": angle,
+        "background": level.reshape(shape),
+        "noise_sd": noise_sd.reshape(shape),
+    }
+
+
+def _diagnostics(choice: SceneChoice) -> dict[str, object]:
+    odds = {one.name: one.odds for one in choice.structures}
+    found: dict[str, object] = {
+        "noise": "field",
+        "rotation_odds": odds.get("rotated"),
+        "rotated": choice.fit.rotated,
+    }
+    return found | choice.fit.target.field_summary(choice.fit.mode)

@@ -1,0 +1,185 @@
+"""What is linear in a map given the places and widths, solved at once for many shapes and noise fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import lgamma, log, pi
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.field import Whitening
+from tactile_bayes.posterior.window import Projected
+
+FLOOR = 1e-12
+"""Least share of the data's sum of squares that is noise: a map without any still has the rounding of its numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearSolution:
+    """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t.
+
+    Parameters
+    ----------
+    amplitude : (m, h, v) array
+        Conditional means under a flat prior.
+    power : (m, h, v, v) array
+        Their precision times tau^2.
+    level, level_covariance : (h, c), (h, c, c) arrays
+        Level and tilt at amplitudes of 0, and their covariance over tau^2 given the amplitudes.
+    level_slope : (m, h, v, c) array
+        By how much level and tilt fall as an amplitude rises.
+    sum_of_squares : (m, h) array
+    """
+
+    amplitude: FloatArray
+    power: FloatArray
+    level: FloatArray
+    level_covariance: FloatArray
+    level_slope: FloatArray
+    sum_of_squares: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldColumns:
+    """Fixed columns and data under one length's field and its shares: what does not depend on the shape.
+
+    Parameters
+    ----------
+    field
+        The length.
+    shares : (h,) array
+    weight : (k, h) array
+        Of the squared projections that the field takes away, a column a share.
+    plain : (k, h * (c + 1)) array
+        Projections of the fixed columns and the data, so weighted.
+    gram : (h, c + 1, c + 1) array
+        Columns and data with each other.
+    inverse : (h, c, c) array
+        Of the columns' part.
+    log_det : (h,) array
+        Log determinant of the covariance (over that of D) and of the columns' part.
+    """
+
+    field: Whitening
+    shares: FloatArray
+    weight: FloatArray
+    plain: FloatArray
+    gram: FloatArray
+    inverse: FloatArray
+    log_det: FloatArray
+
+    @classmethod
+    def of(cls, field: Whitening, shares: FloatArray, *, plain_low: FloatArray, plain_gram: FloatArray) -> FieldColumns:
+        """From (c + 1, cosines^2) projections and (c + 1, c + 1) products of the fixed columns and the data."""
+        low = plain_low @ field.turn
+        weight = field.shrinkage(shares)
+        weighted = low * weight[:, None, :]
+        gram = plain_gram - weighted @ low.T
+        c = len(plain_gram) - 1
+        inverse = np.linalg.inv(gram[:, :c, :c])
+        volume: FloatArray = np.asarray(np.linalg.slogdet(gram[:, :c, :c])[1], dtype=np.float64)
+        plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
+        log_det = field.log_determinant(shares) + volume
+        return cls(field, shares, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det)
+
+    def rest(self) -> FloatArray:
+        """(h,) sum of squares that the fixed columns leave."""
+        c = self.inverse.shape[1]
+        right = self.gram[:, :c, c]
+        return np.asarray(self.gram[:, c, c] - np.einsum("hc,hcd,hd->h", right, self.inverse, right))
+
+    def null_evidence(self, *, dof: int) -> FloatArray:
+        """(h,) log evidence of the fixed columns alone."""
+        return -0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * np.maximum(self.rest(), 1e-300))
+
+
+def solve(
+    projected: list[Projected], cross: FloatArray | None, columns: FieldColumns, *, dof: int, amplitude_sd: float
+) -> tuple[FloatArray, LinearSolution]:
+    """Log evidence (m, h) and the solutions of one or two structures under one length's field.
+
+    Parameters
+    ----------
+    projected
+        Of each structure's (m,) templates.
+    cross : (m,) array
+        Products of the two structures' templates; None when there is one.
+    dof
+        Cells minus linear parameters.
+    amplitude_sd
+        Of the normal prior on each amplitude.
+    """
+    c = columns.inverse.shape[1]
+    h = len(columns.log_det)
+    low = [one.low @ columns.field.turn for one in projected]
+    plain = [
+        one.plain[:, None, :] - (z @ columns.plain).reshape(len(z), h, c + 1)
+        for one, z in zip(projected, low, strict=True)
+    ]
+    to_level = [np.matmul(one[:, :, None, :c], columns.inverse)[:, :, 0] for one in plain]
+    right = columns.gram[:, :c, c]
+    along = [one[:, :, c] - np.sum(t * right, axis=2) for one, t in zip(plain, to_level, strict=True)]
+
+    def power(i: int, j: int, product: FloatArray) -> FloatArray:
+        shared = (low[i] * low[j]) @ columns.weight
+        return np.asarray(product[:, None] - shared - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
+
+    diagonal = [np.maximum(power(i, i, one.square), 1e-300) for i, one in enumerate(projected)]
+    rest = columns.rest()
+    if cross is None:
+        found = _one(along[0], diagonal[0], rest, dof=dof, amplitude_sd=amplitude_sd)
+    else:
+        found = _two(along, diagonal, power(0, 1, cross), rest, dof=dof, amplitude_sd=amplitude_sd)
+    log_factor, amplitude, matrix, squares = found
+    evidence = -0.5 * columns.log_det + log_factor + lgamma(dof / 2) - 0.5 * dof * (log(pi) + np.log(squares))
+    # a dent is no lump: only rises have density
+    evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
+    level = np.einsum("hcd,hd->hc", columns.inverse, right)
+    slope = np.stack(to_level, axis=2)
+    return evidence, LinearSolution(amplitude, matrix, level, columns.inverse, slope, squares)
+
+
+def joined(solutions: list[LinearSolution]) -> LinearSolution:
+    """The fields of several lengths one after another."""
+    by_field = {"level", "level_covariance"}
+    return LinearSolution(
+        *(
+            np.concatenate([getattr(one, name) for one in solutions], axis=0 if name in by_field else 1)
+            for name in LinearSolution.__slots__
+        )
+    )
+
+
+def _one(
+    along: FloatArray, power: FloatArray, rest: FloatArray, *, dof: int, amplitude_sd: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Log factor, amplitudes, their precision and sum of squares for one structure."""
+    amplitude = along / power
+    squares = np.maximum(rest - along * amplitude, FLOOR * rest + 1e-300)
+    variance = amplitude_sd**2 + squares / dof / power
+    log_factor = -0.5 * (np.log(power) + np.log(2 * pi * variance) + amplitude**2 / variance)
+    return log_factor, amplitude[..., None], power[..., None, None], squares
+
+
+def _two(
+    along: list[FloatArray],
+    diagonal: list[FloatArray],
+    off: FloatArray,
+    rest: FloatArray,
+    *,
+    dof: int,
+    amplitude_sd: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """As `_one` for two structures: two by two matrices written out."""
+    one, two = diagonal
+    det = np.maximum(one * two - off**2, 1e-12 * one * two)
+    first, second = (two * along[0] - off * along[1]) / det, (one * along[1] - off * along[0]) / det
+    squares = np.maximum(rest - along[0] * first - along[1] * second, FLOOR * rest + 1e-300)
+    tau2 = squares / dof
+    a, b, between = amplitude_sd**2 + tau2 * two / det, amplitude_sd**2 + tau2 * one / det, -tau2 * off / det
+    volume = a * b - between**2
+    square = (b * first**2 + a * second**2 - 2 * between * first * second) / volume
+    log_factor = -0.5 * (np.log(det) + np.log((2 * pi) ** 2 * volume) + square)
+    matrix = np.stack([np.stack([one, off], axis=-1), np.stack([off, two], axis=-1)], axis=-2)
+    return log_factor, np.stack([first, second], axis=-1), matrix, squares

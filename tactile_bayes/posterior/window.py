@@ -1,0 +1,173 @@
+r"""A window's cells as a grid, and inner products of many bumps with a few fixed vectors and a field's cosines on it.
+
+A Gaussian along the grid's axes is a product of two profiles, and so are the cosines: an inner product costs the work
+of the grid's rows, not of its cells times the cosines. Cells that the map does not cover have weight 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.cells import FitCells
+from tactile_bayes.posterior.field import COSINES, Whitening, cosine_profiles, gram_of_cosines, whitening
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projected:
+    """Inner products of m templates, every cell weighted by its inverse independent variance.
+
+    Parameters
+    ----------
+    low : (m, cosines^2) array
+        With the cosines.
+    plain : (m, c) array
+        With the fixed vectors.
+    square : (m,) array
+        With themselves.
+    """
+
+    low: FloatArray
+    plain: FloatArray
+    square: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profiles:
+    """m templates on the grid: products of `rows` (m, ny) and `columns` (m, nx), or `grid` (m, ny, nx) as it is."""
+
+    rows: FloatArray | None = None
+    columns: FloatArray | None = None
+    grid: FloatArray | None = None
+
+    def full(self) -> FloatArray:
+        """(m, ny, nx) templates."""
+        if self.grid is not None:
+            return self.grid
+        assert self.rows is not None
+        assert self.columns is not None
+        return np.asarray(self.rows[:, :, None] * self.columns[:, None, :])
+
+
+class Window:
+    """The grid of one window, its cosines, and the noise fields of several lengths (prepared when first asked for).
+
+    Parameters
+    ----------
+    cells
+        The window's cells.
+    variance : (k,) array
+        Independent variance of each cell, up to a common factor.
+    """
+
+    def __init__(self, cells: FitCells, variance: FloatArray) -> None:
+        self.cells, self.variance = cells, variance
+        self.x_mm, self._column = np.unique(cells.x_mm, return_inverse=True)
+        self.y_mm, self._row = np.unique(cells.y_mm, return_inverse=True)
+        self.weight = self.on_grid(1.0 / variance)
+        self._across, self._frequency_x = cosine_profiles(self.x_mm)
+        self._along, self._frequency_y = cosine_profiles(self.y_mm)
+        by_row = self.weight.T[:, :, None] * self._across[:, None, :]
+        self._weighted_across = by_row.reshape(len(self.x_mm), -1)
+        self._fields: dict[float, Whitening] = {}
+        self._gram: FloatArray | None = None
+
+    def on_grid(self, values: FloatArray) -> FloatArray:
+        """(..., ny, nx) grid of (..., k) cell values, 0 where there is no cell."""
+        grid = np.zeros((*values.shape[:-1], len(self.y_mm), len(self.x_mm)))
+        grid[..., self._row, self._column] = values
+        return grid
+
+    def field(self, length_mm: float) -> Whitening:
+        """The noise field of one correlation length."""
+        if length_mm not in self._fields:
+            if self._gram is None:
+                self._gram = gram_of_cosines(self.x_mm, self.y_mm, weight=self.weight)
+            frequency2 = (self._frequency_y[:, None] + self._frequency_x[None, :]).ravel()
+            self._fields[length_mm] = whitening(self._gram, frequency2, length_mm=length_mm)
+        return self._fields[length_mm]
+
+    def project(self, templates: Profiles, plain: FloatArray) -> Projected:
+        """Inner products of templates with the cosines, with (c, ny, nx) weighted vectors, and with themselves."""
+        if templates.grid is not None:
+            return self._project_grid(templates.grid, plain)
+        rows, columns = templates.rows, templates.columns
+        assert rows is not None
+        assert columns is not None
+        m, c = len(rows), len(plain)
+        half = (columns @ self._weighted_across).reshape(m, len(self.y_mm), COSINES)
+        low = np.matmul(self._along.T, half * rows[:, :, None]).reshape(m, -1)
+        beside = (columns @ plain.transpose(2, 1, 0).reshape(len(self.x_mm), -1)).reshape(m, -1, c)
+        with_plain = np.matmul(rows[:, None, :], beside)[:, 0]
+        square = np.einsum("mr,mr->m", rows**2, columns**2 @ self.weight.T)
+        return Projected(low, with_plain, square)
+
+    def _project_grid(self, grid: FloatArray, plain: FloatArray) -> Projected:
+        m = len(grid)
+        weighted = grid * self.weight
+        half = (weighted.reshape(-1, len(self.x_mm)) @ self._across).reshape(m, len(self.y_mm), COSINES)
+        low = np.matmul(self._along.T, half).reshape(m, -1)
+        with_plain = grid.reshape(m, -1) @ plain.reshape(len(plain), -1).T
+        return Projected(low, with_plain, np.einsum("mrc,mrc->m", weighted, grid))
+
+    def product(self, one: Profiles, other: Profiles) -> FloatArray:
+        """(m,) inner products of templates with templates, pairwise."""
+        if one.grid is None and other.grid is None:
+            assert one.rows is not None
+            assert one.columns is not None
+            assert other.rows is not None
+            assert other.columns is not None
+            across = (one.columns * other.columns) @ self.weight.T
+            return np.asarray(np.einsum("mr,mr->m", one.rows * other.rows, across))
+        return np.asarray(np.einsum("mrc,mrc->m", one.full() * self.weight, other.full()))
+
+    def bumps(
+        self, x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, r: FloatArray | None
+    ) -> Profiles:
+        """Cell means of (m,) Gaussians of unit height; along the grid's axes when r is None."""
+        cell = self.cells.cell_mm
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            if r is None:
+                columns = cell_mean_profile(self.x_mm - x_mm[:, None], sigma_mm=np.exp(p + q), cell_mm=cell)
+                rows = cell_mean_profile(self.y_mm - y_mm[:, None], sigma_mm=np.exp(p - q), cell_mm=cell)
+                return Profiles(rows, columns)
+            grid = cell_mean_gaussian(
+                self.x_mm - x_mm[:, None, None],
+                self.y_mm[:, None] - y_mm[:, None, None],
+                covariance_mm2=covariance_from_log_widths(p, q, r)[:, None],
+                cell_mm=cell,
+            )
+        return Profiles(grid=grid)
+
+    def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> Profiles:
+        """Straight ridges of unit height, Gaussian across, `offset_mm` from `middle` in direction `angle_rad`."""
+        x, y = self.middle
+        across_x = np.cos(angle_rad)[:, None] * (self.x_mm - x)
+        across_y = np.sin(angle_rad)[:, None] * (self.y_mm - y)
+        distance = across_x[:, None, :] + across_y[:, :, None] - offset_mm[:, None, None]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            # a square cell is as wide as a box of its side in every direction, as far as its variance goes
+            variance = np.exp(2.0 * log_width) + self.cells.cell_mm**2 / 12.0
+            height = np.exp(log_width) / np.sqrt(variance)
+            return Profiles(grid=height[:, None, None] * np.exp(-0.5 * distance**2 / variance[:, None, None]))
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Mean of the cells' centres, mm."""
+        return float(np.mean(self.cells.x_mm)), float(np.mean(self.cells.y_mm))
+
+
+def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> FloatArray:
+    """(m, k) means over cells of one-dimensional Gaussians of unit height, the factors of `cell_mean_gaussian`.
+
+    The two corrections of that function's series are multiplied here and added there: a difference of the order of
+    the terms that both leave out.
+    """
+    wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
+    square = distance_mm**2 / wide
+    gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
+    fourth = (square * (square - 6.0) + 3.0) / wide**2
+    return np.asarray(gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
