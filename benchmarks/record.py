@@ -44,6 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=10, help="kills (10)")
     parser.add_argument("--busy", type=int, nargs="+", default=[0, 2, 4], help="load: busy processes (0 2 4)")
     parser.add_argument("--live", action="store_true", help="load: with the live view")
+    parser.add_argument("--size-calibration", type=Path, metavar="FILE", help="load: sizes in the live view")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures as JSON")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as name:
@@ -172,6 +173,8 @@ def devices(folder: Path, scan: Path) -> Iterator[tuple[list[str], dict[str, int
 def load(folder: Path, scan: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
     """Record the whole scan while others are busy."""
     live = ["--live"] if options.live else []
+    if options.size_calibration:
+        live += ["--size-calibration", str(options.size_calibration.absolute())]
     rows = []
     for busy in options.busy:
         others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]

@@ -154,6 +154,30 @@ def test_the_missing_extra_is_one_line(monkeypatch):
         open_tracker("ndi", "/dev/x")
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--tracker-protocol", "ndi", "--tracker-rom", "none.rom"], "none.rom is not a file"),
+        (["--tracker-protocol", "bird", "--tracker-rom", "none.rom"], "none.rom is not for bird"),
+    ],
+)
+def test_a_tools_description_is_for_ndi_and_must_be_there(run_cli, tmp_path, words, said):
+    done = run_cli("record", "-o", "a.mcap", "--head", "loop://", "--tracker", "loop://", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert said in done.stderr
+
+
+def test_faults_have_nothing_to_act_on(run_cli, tmp_path):
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.scan_mcap import write_scan
+
+    write_scan(tmp_path / "a.mcap", short_scan(0.2), provenance=Provenance("test", {}))
+    done = run_cli("emulate", "tracker", "a.mcap", "--protocol", "ndi", "--drop", "0.1", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "sends nothing by itself" in done.stderr
+
+
 def test_the_emulated_tracker_speaks_as_the_guide_prints_it():
     assert crc16(b"123456789") == 0xBB3D
     device = EmulatedNdi(short_scan(0.2).poses)

@@ -99,6 +99,11 @@ def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path)
     if kind == "tracker" and len(scan.poses) and protocol == "ndi":
         from tactile_bayes.hardware.emulated_ndi import EmulatedNdi
 
+        if faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None:
+            raise UsageError(
+                "an NDI tracker sends nothing by itself: --drop, --corrupt, --stall and --disconnect have nothing to "
+                "act on; leave them out, or emulate another protocol"
+            )
         return EmulatedNdi(scan.poses, hold=faults.hold)
     if kind == "tracker" and len(scan.poses):
         return EmulatedTracker(scan.poses, protocol=protocol, hold=faults.hold)

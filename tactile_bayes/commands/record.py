@@ -78,6 +78,12 @@ def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
 
     refuse_existing(output, force=bool(options["force"]))
     request = Request(output=output, **options)
+    if request.tracker_rom is not None and (request.tracker_protocol != "ndi" or not request.tracker_rom.is_file()):
+        raise UsageError(
+            f"--tracker-rom {request.tracker_rom} is "
+            + ("not a file" if request.tracker_protocol == "ndi" else f"not for {request.tracker_protocol}")
+            + "; give a wireless NDI tool's .rom file with --tracker-protocol ndi"
+        )
     report, interrupted = _record(request)
     click.echo(record_text(report, output=str(output)), nl=False)
     if report.fault:

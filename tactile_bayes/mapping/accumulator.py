@@ -267,7 +267,11 @@ class MapAccumulator:
         return anew
 
     def snapshot(self) -> TactileMap:
-        """The map so far; later frames do not change it. Without a frame it has no cell."""
+        """The map so far; later frames do not change it. Without a frame it has no cell.
+
+        What a frame's readings share (`tactile_bayes.mapping.shared_frames`) is not in its quality: the errors of
+        frames are not kept, and with the next frame they would be others.
+        """
         sums, instrument = self._sums.trimmed(), self.instrument
         mean = sums.mean()
         window = (float(instrument.pressure_window_kpa[0]), float(instrument.pressure_window_kpa[1]))
