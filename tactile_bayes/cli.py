@@ -22,6 +22,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "plan": ("plan", "Plan a trial: power and the worth of more maps, by simulation."),
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
+    "tradeoff": ("tradeoff", "Measure what more accuracy costs, here and now: `tradeoff forward`."),
     "simulate": ("simulate", "Make a scan with known truth from a scene."),
     "record": ("record", "Record a scan head and a tracker into a scan file."),
     "repair": ("repair", "Close a scan file that was cut off: what is intact is kept."),

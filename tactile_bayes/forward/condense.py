@@ -140,6 +140,11 @@ def _tissue(mesh: QuadMesh, body: Body) -> FloatArray:
     return np.where(mesh.gland, body.gland_ratio, 1.0) * body.fat_kpa
 
 
+def rim_nodes(body: Body, *, fineness: int) -> int:
+    """How many nodes lie on the lump's half circle, elements' middles included."""
+    return len(_rim(disc_mesh(body, fineness=fineness, layered=False), body))
+
+
 def _rim(mesh: QuadMesh, body: Body) -> IntArray:
     """Nodes on the lump's circle, from its highest point to its lowest: the same order in every mesh of a body."""
     x, z = mesh.nodes[:, 0], mesh.nodes[:, 1] - body.centre_mm

@@ -51,6 +51,8 @@ class SolidSettings:
         Of the mesh; twice is half the element. See `mesh_size`.
     rank_tolerance
         See `solid.skin_perturbation`.
+    mesh_reach_mm
+        Radius at which the mesh ends, on a rim that does not move.
     """
 
     head: Head = field(default_factory=Head)
@@ -64,6 +66,7 @@ class SolidSettings:
     fit_radius_mm: float = FIT_RADIUS_MM
     fineness: int = FINENESS
     rank_tolerance: float = RANK_TOLERANCE
+    mesh_reach_mm: float = MeshSize().reach_mm
 
     def __post_init__(self) -> None:
         half = self.head.rows * self.head.pitch_mm / 2
@@ -81,12 +84,20 @@ class SolidSettings:
         """The body of a case."""
         return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
+    def geometry(self, body: Body) -> LumpGeometry:
+        """The ball in the body."""
+        layers, radius = body.layers, body.radius_mm
+        return LumpGeometry(radius, radius, body.centre_mm, layers.fat_mm, layers.thickness_mm)
+
     def condensed(self, body: Body) -> CondensedLump:
         """What surrounds the ball, condensed."""
-        layers, radius = body.layers, body.radius_mm
-        geometry = LumpGeometry(radius, radius, body.centre_mm, layers.fat_mm, layers.thickness_mm)
         tissue = Tissue(body.fat_kpa, body.gland_ratio, body.poisson)
-        return condense_lump(geometry, tissue, size=mesh_size(self.fineness))
+        return condense_lump(self.geometry(body), tissue, size=self.mesh_size)
+
+    @property
+    def mesh_size(self) -> MeshSize:
+        """Of the fineness and the reach."""
+        return mesh_size(self.fineness, reach_mm=self.mesh_reach_mm)
 
     def on(self, body: Body) -> SolidHead:
         """The head on the body without its lump."""
@@ -106,7 +117,7 @@ class SolidSettings:
         return PlacedLump(change, 0.0, 0.0)
 
 
-def mesh_size(fineness: int) -> MeshSize:
+def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSize:
     """The mesh of a fineness; 2 is the default one, and twice the fineness has half the element everywhere."""
     default = MeshSize()
     share = fineness / FINENESS
@@ -115,7 +126,7 @@ def mesh_size(fineness: int) -> MeshSize:
         rings=round(default.rings * share),
         core=int(np.ceil(default.core * share)),
         grade=float(default.grade ** (1.0 / share)),
-        reach_mm=default.reach_mm,
+        reach_mm=reach_mm,
     )
 
 

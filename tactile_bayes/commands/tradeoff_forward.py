@@ -1,0 +1,140 @@
+"""`tradeoff forward`: error in amplitude, width and size against CPU time, for one lump and every forward model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from tactile_bayes.forward.tradeoff import LumpCase, Measured
+    from tactile_bayes.report.tradeoff_text import SizeRule, TradeoffReport
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.command("forward")
+@click.argument("scene", required=False, metavar="[SCENE.toml]", type=_FILE)
+@click.option(
+    "--size-calibration", metavar="SIZE.json", type=_FILE, help="Eq 6 for the sizes; else it is learned on the spot."
+)
+@click.option("--figure", metavar="OUT.png", type=_FILE, help="Draw error in size against time.")
+@click.option(
+    "--tolerance-percent",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=0.5,
+    show_default=True,
+    help="A smaller error in size is not worth paying for.",
+)
+@click.option("--runs", type=click.IntRange(min=1), default=1, show_default=True, help="The least time of so many.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option("--force", is_flag=True, help="Overwrite an existing figure.")
+def command(
+    *,
+    scene: Path | None,
+    size_calibration: Path | None,
+    figure: Path | None,
+    tolerance_percent: float,
+    runs: int,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Measure error in amplitude, width and size against CPU time, for the lump of a scene.
+
+    The empirical model, plane strain at several cells and the solid model at several meshes, ranks and rims compute the
+    map of one lump, here and now; each model's finest setting is the reference of its others. Without SCENE.toml: a
+    hard ball of 15 mm at h/d 1, its centre on the gland. Without --size-calibration Eq 6 is learned from each model's
+    own lumps in the same body, which takes most of a minute.
+
+    Example: tactile-bayes tradeoff forward --figure tradeoff.png
+    """
+    import json
+
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.report.tradeoff_text import tradeoff_document, tradeoff_text
+
+    if figure is not None:
+        refuse_existing(figure, force=force)
+    report = run_tradeoff(_case(scene), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
+    if figure is not None:
+        from tactile_bayes.report.tradeoff_figures import draw_tradeoff
+
+        draw_tradeoff(report, figure, force=force)
+    if as_json:
+        click.echo(json.dumps(tradeoff_document(report), indent=2))
+        return
+    click.echo(tradeoff_text(report))
+    if figure is not None:
+        click.echo(f"the figure is in {figure}")
+    click.echo(RESEARCH_USE)
+
+
+def _case(path: Path | None) -> LumpCase:
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.files.scene_toml import read_scene
+    from tactile_bayes.forward.scene import Scene
+    from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
+    from tactile_bayes.forward.tradeoff import case_of
+
+    if path is None:
+        return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)))
+    try:
+        return case_of(read_scene(path))
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def run_tradeoff(case: LumpCase, calibration: Path | None, *, tolerance: float, runs: int) -> TradeoffReport:
+    """Learn Eq 6 or read it, then measure every setting."""
+    import time
+
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.commands.study import fit_line
+    from tactile_bayes.commands.study_raster import fit_raster
+    from tactile_bayes.forward.tradeoff import PLANE, SOLID, measure, settings_of, teach
+    from tactile_bayes.report.tradeoff_text import TradeoffReport, learned_rule
+
+    rules: dict[str, SizeRule] = {}
+    for model in (PLANE, SOLID):
+        if calibration is not None:
+            rules[model] = _calibrated(calibration)
+            continue
+        with progress_bar(f"lumps for Eq 6, {model}") as progress:
+            rules[model] = learned_rule(teach(case, model, fit=fit_line, raster_fit=fit_raster, progress=progress))
+    found: list[Measured] = []
+    settings = settings_of(case)
+    measure(case, settings[0], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)  # imports cost nothing
+    measure(case, settings[-1], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)
+    with progress_bar("settings") as progress:
+        for number, setting in enumerate(settings, start=1):
+            clock: Callable[[], float] = time.process_time
+            found.append(measure(case, setting, fit=fit_line, raster_fit=fit_raster, clock=clock, runs=runs))
+            progress(number, len(settings))
+    return TradeoffReport(case, tuple(found), rules, tolerance)
+
+
+def _calibrated(path: Path) -> SizeRule:
+    """The point estimate of a calibration's Eq 6, each axis of the head its own."""
+    import numpy as np
+
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.size_calibration import SizeCalibration
+    from tactile_bayes.report.tradeoff_text import SizeRule
+
+    calibration = read_size_calibration(path)
+    if not isinstance(calibration, SizeCalibration):
+        raise BadDataError("is not of the form Eq 6", way_out="give a calibration of `calibrate size`", path=str(path))
+
+    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
+        a = np.array([amplitude])
+        found = [float(calibration.x.size_mm(np.array([sigma_x_mm]), a)[0])]
+        if sigma_y_mm is not None:
+            found.append(float(calibration.y.size_mm(np.array([sigma_y_mm]), a)[0]))
+        return found
+
+    scatter = calibration.x.draws.mean(axis=0)[4]
+    return SizeRule(sizes, float(scatter), f"Eq 6 of {path.name}")

@@ -1,0 +1,224 @@
+"""The trade-off of the forward models as text and as data, with what the case does not need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.forward.study import StudyRow, learn_as_printed, seat_name
+from tactile_bayes.forward.tradeoff import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, change, cheapest
+from tactile_bayes.geometry import FloatArray
+
+# Settings that differ in how finely the same thing is computed.
+_MESHES = ("mesh", "default", "contact cell", "reference")
+_NAME = 52
+
+Sizes = Callable[[float, float, float | None], list[float]]
+"""Diameters in mm from an amplitude and the widths across and along the head."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SizeRule:
+    """How a width becomes a size.
+
+    Parameters
+    ----------
+    sizes
+        Diameters; the largest is the size, as `estimate` has it.
+    scatter
+        Standard deviation of ln d that it leaves on what it was learned from.
+    source
+        In words.
+    """
+
+    sizes: Sizes
+    scatter: float
+    source: str
+
+    def size_mm(self, one: Measured) -> float:
+        """Size of a measured map; NaN where its amplitude has none."""
+        if not one.amplitude > 0:
+            return float("nan")
+        return max(self.sizes(one.amplitude, one.sigma_x_mm, one.sigma_y_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TradeoffReport:
+    """Everything that was measured.
+
+    Parameters
+    ----------
+    case
+        The lump.
+    found
+        Every setting.
+    rules
+        Eq 6 for plane strain and for the solid model.
+    tolerance
+        Error in size, as a share, below which nothing is gained.
+    """
+
+    case: LumpCase
+    found: tuple[Measured, ...]
+    rules: Mapping[str, SizeRule]
+    tolerance: float
+
+    def of(self, model: str) -> list[Measured]:
+        """What was measured of one model."""
+        return [one for one in self.found if one.setting.model == model]
+
+    def reference(self, model: str) -> Measured:
+        """The finest setting of the model; plane strain's for the empirical one."""
+        family = PLANE if model == EMPIRICAL else model
+        (found,) = (one for one in self.of(family) if one.setting.kind == "reference")
+        return found
+
+    def size_mm(self, one: Measured) -> float:
+        """Size by the model's own Eq 6; plane strain's for the empirical one."""
+        return self.rules[SOLID if one.setting.model == SOLID else PLANE].size_mm(one)
+
+    def size_error(self, one: Measured) -> float:
+        """Against the model's reference, as a share."""
+        return change(self.size_mm(one), self.size_mm(self.reference(one.setting.model)))
+
+
+def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
+    """Eq 6 in two stages from a study's rows, each axis of the head its own, and what it leaves of them."""
+    axes = ["x", "y"] if rows[0].sigma_y_mm is not None else ["x"]
+    learned = [learn_as_printed(rows, axis=axis) for axis in axes]
+
+    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
+        widths = (sigma_x_mm, sigma_y_mm)
+        return [
+            one.m * width / (one.e * amplitude**one.f) + one.b_mm
+            for one, width in zip(learned, widths, strict=False)
+            if one is not None and width is not None
+        ] or [float("nan")]
+
+    shown = [row for row in rows if row.detectable]
+    left = [max(sizes(row.amplitude, row.sigma_x_mm, row.sigma_y_mm)) / row.d_mm for row in shown]
+    scatter = float(np.sqrt(np.mean(np.log(np.maximum(left, 1e-3)) ** 2))) if shown else float("nan")
+    return SizeRule(sizes, scatter, f"Eq 6 in two stages from {len(shown)} hard lumps of 10 to 25 mm in this body")
+
+
+def tradeoff_text(report: TradeoffReport) -> str:
+    """A table of every setting, and what the case does not need."""
+    case = report.case
+    lines = [
+        f"ball of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat, "
+        f"{seat_name(case.seat)}",
+        "",
+        f"{'':<{_NAME}}{'element':>8}{'a lump':>8}{'a map':>8}{'':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}"
+        f"   off from the model's finest, %",
+        f"{'model and setting':<{_NAME}}{'mm':>8}{'s CPU':>8}{'s CPU':>8}{'a':>8}{'mm':>8}{'mm':>8}{'mm':>7}"
+        f"{'a':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}",
+    ]
+    lines += [_line(one, report) for one in report.found]
+    return "\n".join([*lines, "", *advice(report)])
+
+
+def _line(one: Measured, report: TradeoffReport) -> str:
+    best = report.reference(one.setting.model)
+    mark = {"default": " (default)", "reference": " (finest)"}.get(one.setting.kind, "")
+    name = f"{one.setting.model}, {one.setting.label}{mark}"
+    along = "" if one.sigma_y_mm is None else f"{one.sigma_y_mm:.3f}"
+    off = (
+        change(one.amplitude, best.amplitude),
+        change(one.sigma_x_mm, best.sigma_x_mm),
+        change(one.sigma_y_mm, best.sigma_y_mm),
+        report.size_error(one),
+    )
+    shares = [f"{100 * value:+.2f}" if np.isfinite(value) else "" for value in off]
+    return (
+        f"{name:<{_NAME}}{one.element_mm:>8.2f}{one.lump_s:>8.2f}{one.map_s:>8.2f}{one.amplitude:>8.4f}"
+        f"{one.sigma_x_mm:>8.3f}{along:>8}{report.size_mm(one):>7.2f}"
+        f"{shares[0]:>8}{shares[1]:>8}{shares[2]:>8}{shares[3]:>7}"
+    )
+
+
+def advice(report: TradeoffReport) -> list[str]:
+    """Which setting is enough, what is wasted, and what the models themselves cost."""
+    lines = [_enough(report, SOLID), _enough(report, PLANE)]
+    solid, plane, empirical = report.reference(SOLID), report.reference(PLANE), report.of(EMPIRICAL)[0]
+    if report.rules[PLANE].source == report.rules[SOLID].source:
+        mistaken = f"a cylinder's map read by the same Eq 6 gives {report.size_mm(plane):.1f} mm"
+    else:
+        mistaken = f"a ball's map read by the cylinder's Eq 6 gives {report.rules[PLANE].size_mm(solid):.1f} mm"
+    lines.append(
+        f"two dimensions: a cylinder shows {_percent(change(plane.amplitude, solid.amplitude))} in amplitude and "
+        f"{_percent(change(plane.sigma_x_mm, solid.sigma_x_mm))} in width against a ball; {mistaken} for "
+        f"{report.case.d_mm:g}: no mesh mends that"
+    )
+    lines.append(f"Eqs 1 to 4 stand in for plane strain with {_percent(report.size_error(empirical))} in size")
+    for model in (SOLID, PLANE):
+        rule = report.rules[model]
+        lines.append(
+            f"{model}: sizes by {rule.source}, which itself leaves {100 * rule.scatter:.0f} % (SD of ln d); "
+            f"the default mesh leaves {_percent(report.size_error(_default(report, model)))}"
+        )
+    return lines
+
+
+def _enough(report: TradeoffReport, model: str) -> str:
+    """The cheapest sufficient setting of a model, against its default and its reference."""
+    found = [one for one in report.of(model) if one.setting.kind in _MESHES]
+    errors: FloatArray = np.array([report.size_error(one) for one in found])
+    least = cheapest(found, errors, tolerance=report.tolerance)
+    limit = f"{100 * report.tolerance:g} %"
+    if least is None or least.setting.kind == "reference":
+        return f"{model}: only the finest setting keeps the size within {limit}"
+    finest, default = report.reference(model), _default(report, model)
+    text = (
+        f"{model}: {least.setting.label} (elements of {least.element_mm:.1f} mm) keeps the size within {limit} at "
+        f"{least.seconds:.2f} s CPU; a mesh finer than {least.element_mm:.1f} mm is wasted below that, "
+        f"the finest costs {finest.seconds / least.seconds:.0f} times as much"
+    )
+    return text if default is least else f"{text}, the default {default.seconds / least.seconds:.1f} times"
+
+
+def _default(report: TradeoffReport, model: str) -> Measured:
+    return next(one for one in report.of(model) if one.setting.kind == "default")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:+.1f} %"
+
+
+def tradeoff_document(report: TradeoffReport) -> dict[str, Any]:
+    """The same as plain data; errors as shares."""
+    case = report.case
+    return {
+        "schema": "tactile-bayes/tradeoff-forward/1",
+        "lump": {
+            "d_mm": case.d_mm,
+            "depth_ratio": case.depth_ratio,
+            "stiffness_ratio": case.stiffness_ratio,
+            "seat": case.seat,
+        },
+        "tolerance": report.tolerance,
+        "sizes": {model: {"source": rule.source, "sd_ln_d": rule.scatter} for model, rule in report.rules.items()},
+        "settings": [_row(one, report) for one in report.found],
+        "advice": advice(report),
+    }
+
+
+def _row(one: Measured, report: TradeoffReport) -> dict[str, Any]:
+    best = report.reference(one.setting.model)
+    return {
+        "model": one.setting.model,
+        "setting": one.setting.label,
+        "kind": one.setting.kind,
+        "element_mm": one.element_mm,
+        "lump_cpu_s": one.lump_s,
+        "map_cpu_s": one.map_s,
+        "amplitude": one.amplitude,
+        "sigma_x_mm": one.sigma_x_mm,
+        "sigma_y_mm": one.sigma_y_mm,
+        "size_mm": report.size_mm(one),
+        "amplitude_error": change(one.amplitude, best.amplitude),
+        "sigma_x_error": change(one.sigma_x_mm, best.sigma_x_mm),
+        "size_error": report.size_error(one),
+    }

@@ -1,0 +1,157 @@
+"""The trade-off of the forward models: what is measured, what is advised, and what it refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import numpy as np
+import pytest
+
+from tactile_bayes.commands.study import fit_line
+from tactile_bayes.commands.study_raster import fit_raster
+from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
+from tactile_bayes.forward.scene import Head, Lump, Scene
+from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump
+from tactile_bayes.forward.study import Geometry, StudyRow, StudySettings, run_geometry
+from tactile_bayes.forward.tradeoff import (
+    EMPIRICAL,
+    PLANE,
+    SOLID,
+    LumpCase,
+    Measured,
+    case_of,
+    cheapest,
+    measure,
+    settings_of,
+)
+from tactile_bayes.report.tradeoff_text import SizeRule, TradeoffReport, learned_rule, tradeoff_document, tradeoff_text
+
+Run = Callable[..., "CompletedProcess[str]"]
+CASE = case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)))
+SETTINGS = settings_of(CASE)
+
+
+def report(case: LumpCase = CASE) -> TradeoffReport:
+    """Made-up measurements: the finer, the dearer and the nearer to a = 0.3, sigma = 5 mm."""
+    found = []
+    for setting in SETTINGS:
+        fineness = setting.settings.fineness
+        off = {"reference": 0.0, "default": 0.002, "rim": 0.4}.get(setting.kind, 0.004 if fineness > 1 else 0.05)
+        sigma_y = 4.0 * (1 + off) if setting.model == SOLID else None
+        found.append(Measured(setting, 3 / fineness, 0.1 * fineness**2, 0.1, 0.3, 5.0 * (1 + off), sigma_y))
+    rule = SizeRule(lambda _, x, y: [3 * x, 3 * (y or 0.0)], 0.12, "a rule")
+    return TradeoffReport(case, tuple(found), {PLANE: rule, SOLID: rule}, 0.005)
+
+
+def test_each_model_has_one_default_and_one_reference() -> None:
+    for model in (PLANE, SOLID):
+        kinds = [setting.kind for setting in SETTINGS if setting.model == model]
+        assert kinds.count("default") == kinds.count("reference") == 1
+        (default,) = (one for one in SETTINGS if one.model == model and one.kind == "default")
+        assert default.settings == (CASE.plane if model == PLANE else CASE.solid)
+    assert [setting.model for setting in SETTINGS].count(EMPIRICAL) == 1
+
+
+def test_the_default_plane_setting_is_the_study() -> None:
+    (setting,) = (one for one in SETTINGS if one.model == PLANE and one.kind == "default")
+    ticks = count()
+    found = measure(CASE, setting, fit=fit_line, raster_fit=fit_raster, clock=lambda: float(next(ticks)), runs=2)
+    (row,) = run_geometry(Geometry(0.0, 15.0, 1.0, (100.0,)), settings=StudySettings(), fit=fit_line)
+    assert (found.amplitude, found.sigma_x_mm) == pytest.approx((row.amplitude, row.sigma_x_mm), rel=1e-9)
+    assert (found.lump_s, found.map_s, found.sigma_y_mm) == (1.0, 1.0, None)
+    assert found.element_mm == pytest.approx(0.74, abs=0.01)  # half of 47.1 mm over 32 elements
+
+
+def test_a_scene_gives_its_body_and_head_to_both_models() -> None:
+    body = SceneBody(fat_kpa=4.0, gland_ratio=6.0, thickness_mm=50.0, nu=0.49, fat_mm=16.0)
+    scene = Scene(body=body, solid_lumps=(SolidLump(d_mm=12.0, depth_ratio=0.9),), head=Head(radius_mm=40.0))
+    case = case_of(scene)
+    assert case.seat == pytest.approx((16.0 - 10.8) / 6.0)
+    for settings in (case.plane, case.solid):
+        assert (settings.fat_kpa, settings.gland_ratio, settings.thickness_mm, settings.poisson) == (
+            4.0,
+            6.0,
+            50.0,
+            0.49,
+        )
+        assert settings.head.radius_mm == 40.0
+
+
+def test_eq_6_is_learned_axis_by_axis_and_says_what_it_leaves() -> None:
+    level = 0.6 ** (1 / 0.3)  # the amplitude at which 0.6 a^-0.3 is 1
+    rows = []
+    for d in (10.0, 15.0, 20.0):
+        for h, a in ((0.8, 0.9), (1.0, level), (1.2, 0.05)):
+            change = 0.6 * a**-0.3
+            x, y = (d + 5) / 6 * change, (d + 2) / 5 * change
+            rows.append(StudyRow("centred", d, h, 100.0, a, x, 0.0, True, y))
+    rule = learned_rule(rows)
+    assert rule.sizes(0.9, rows[0].sigma_x_mm, rows[0].sigma_y_mm) == pytest.approx([10.0, 10.0])
+    assert rule.scatter < 1e-9
+
+
+def test_the_advice_names_the_cheapest_that_is_enough() -> None:
+    made = report()
+    text = tradeoff_text(made)
+    assert "solid: fineness 2 (elements of 1.5 mm) keeps the size within 0.5 % at 0.50 s CPU" in text
+    assert "a mesh finer than 1.5 mm is wasted below that, the finest costs 2 times as much" in text
+    assert "plane-strain: fineness 2, cell 0.5 mm" in text
+    assert "a rule, which itself leaves 12 % (SD of ln d)" in text
+    strict = dataclasses.replace(made, tolerance=1e-9)
+    assert "solid: only the finest setting keeps the size within" in tradeoff_text(strict)
+    errors = np.array([made.size_error(one) for one in made.found])
+    assert cheapest(made.found, errors, tolerance=-1.0) is None
+
+
+def test_the_document_is_plain_data() -> None:
+    document = json.loads(json.dumps(tradeoff_document(report())))
+    assert len(document["settings"]) == len(SETTINGS)
+    (finest,) = (row for row in document["settings"] if (row["model"], row["kind"]) == (SOLID, "reference"))
+    assert finest["size_error"] == 0.0
+
+
+def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
+    from tactile_bayes.report.tradeoff_figures import draw_tradeoff
+
+    for name in ("one.png", "two.png"):
+        draw_tradeoff(report(), tmp_path / name)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+BALL = SolidLump(seat=0.0)
+REFUSED = {
+    "bumps": (Scene(lumps=(Lump(),)), "the scene has bumps; give one lump of tissue"),
+    "none": (Scene(), "the scene has 0 lumps"),
+    "two": (Scene(solid_lumps=(BALL, dataclasses.replace(BALL, x_mm=30.0))), "the scene has 2 lumps"),
+    "rib": (Scene(solid_lumps=(BALL,), ribs=(Rib(),)), "the scene has a rib"),
+    "flat": (Scene(solid_lumps=(dataclasses.replace(BALL, height_mm=8.0),)), r"lump\[0\].height_mm is 8"),
+    "high": (Scene(solid_lumps=(dataclasses.replace(BALL, seat=2.5),)), "seat is 2.5"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_not_one_ball_is_refused(name: str) -> None:
+    scene, words = REFUSED[name]
+    with pytest.raises(BadDataError, match=words):
+        case_of(scene)
+
+
+def test_a_scene_that_cannot_be_is_told_with_its_file(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text("[[lump]]\namplitude = 0.2\n")
+    done = run_cli("tradeoff", "forward", "s.toml", cwd=tmp_path)
+    assert done.returncode == EXIT_BAD_DATA
+    assert done.stderr.splitlines()[-1].startswith("error: s.toml: the scene has bumps")
+
+
+@pytest.mark.slow
+def test_the_command_measures_draws_and_advises(run_cli: Run, tmp_path: Path) -> None:
+    done = run_cli("tradeoff", "forward", "--figure", "t.png", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "solid: fineness 2" in done.stdout
+    assert "plane-strain: fineness 1" in done.stdout  # elements of 1.5 mm are enough for 0.5 % in this lump's size
+    assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")
