@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
     "tradeoff": ("tradeoff", "Measure what more accuracy costs, here and now: `tradeoff forward`."),
+    "population": ("population", "Simulate and fit exams of varied bodies: what a calibration is learned from."),
     "simulate": ("simulate", "Make a scan with known truth from a scene."),
     "record": ("record", "Record a scan head and a tracker into a scan file."),
     "repair": ("repair", "Close a scan file that was cut off: what is intact is kept."),

@@ -187,7 +187,7 @@ def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
         (["a.nc", "-o", "no/p.nc"], 2, "not a directory"),
         (["a.nc", "--interval", "1"], 2, "--interval"),
         (["a.nc", "--fit-radius-mm", "0"], 2, "--fit-radius-mm"),
-        (["a.nc", "--figure", "f.png"], 2, "--size-calibration"),
+        (["a.nc", "--figure", "f.png", "--size-calibration", "none"], 2, "--size-calibration"),
         ([], 2, "MAP.nc"),
     ],
 )

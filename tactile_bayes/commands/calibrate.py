@@ -27,6 +27,13 @@ def command() -> None:
 @click.argument("table", metavar="TABLE.csv", type=_FILE)
 @click.option("-o", "--output", required=True, metavar="SIZE.json", type=_FILE, help="Where to write the calibration.")
 @click.option(
+    "--form",
+    type=click.Choice(["eq6", "log-quadratic"]),
+    default="eq6",
+    show_default=True,
+    help="eq6: as printed, one row a lump; log-quadratic: from a table of `population`, one row an exam.",
+)
+@click.option(
     "--normalise",
     type=click.Choice(NORMALISE),
     default="mean",
@@ -56,14 +63,28 @@ def command() -> None:
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
+@click.pass_context
 def size(
-    table: Path, output: Path, normalise: str, background: str, fit_radius_mm: float, noise: str, seed: int, force: bool
+    ctx: click.Context,
+    /,
+    table: Path,
+    output: Path,
+    form: str,
+    normalise: str,
+    background: str,
+    fit_radius_mm: float,
+    noise: str,
+    seed: int,
+    force: bool,
 ) -> None:
-    """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms.
+    """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or a quadratic in logarithms.
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
     stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The
     declared options say how the table's maps were made; `estimate` refuses a map made otherwise.
+
+    The log-quadratic form, ln d as a quadratic in ln a and ln sigma, tells apart what differs between bodies and
+    between exams of one body. Its table comes from `population`, which made the maps: nothing is declared.
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
@@ -80,6 +101,10 @@ def size(
     from tactile_bayes.report.calibration_text import calibration_text
 
     refuse_existing(output, force=force)
+    if form == "log-quadratic":
+        _refuse_declared(ctx)
+        click.echo(_log_quadratic(table, output, force=force), nl=False)
+        return
     rows = read_table(table, "size_table.table.json")
     recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise)
     rng = np.random.default_rng(seed)
@@ -92,6 +117,40 @@ def size(
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, calibration, provenance=provenance, force=force)
     click.echo(calibration_text(calibration), nl=False)
+
+
+def _refuse_declared(ctx: click.Context) -> None:
+    from tactile_bayes.errors import UsageError
+
+    for name in ("normalise", "background", "fit_radius_mm", "noise", "seed"):
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option} is for --form eq6: a table of `population` fixes how its maps were made")
+
+
+def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.size_quadratic_json import write_log_quadratic
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from tactile_bayes.posterior.learn_log_quadratic import learn_log_quadratic
+    from tactile_bayes.posterior.measure import measuring_options, population_table
+    from tactile_bayes.posterior.size_calibration import Recipe
+    from tactile_bayes.report.quadratic_text import log_quadratic_text
+
+    rows = read_table(table, "population.table.json")
+    fit = measuring_options().fit
+    recipe = Recipe("mean", fit.background, fit.radius_mm, declared=False, noise=fit.noise)
+    source = "balls in a population of bodies, scanned by the solid model"
+    try:
+        calibration = learn_log_quadratic(population_table(rows.columns), recipe=recipe, source=source)
+    except BadDataError as error:
+        raise error.at(table) from None
+    settings = {"form": "log-quadratic", **as_settings(BodyPrior(), ExamPrior())}
+    provenance = Provenance("calibrate size", settings, hash_inputs(table=table))
+    write_log_quadratic(output, calibration, provenance=provenance, force=force)
+    return log_quadratic_text(calibration)
 
 
 @command.command("array")

@@ -4,60 +4,31 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.errors import (
-    EXIT_DONE,
-    EXIT_NO_ESTIMATE,
-    BadDataError,
-    TactileBayesError,
-    UsageError,
-)
-from tactile_bayes.presets import FIT_RADIUS_MM, INTERVAL, METHODS, NOISE
+from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.presets import INTERVAL, METHODS, NOISE
 
 if TYPE_CHECKING:
-    from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
-    from tactile_bayes.posterior.size_calibration import SizeCalibration
+    from tactile_bayes.posterior.estimate import Estimate
 
 _FILE = click.Path(path_type=Path)
 _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """The options of one call, as given; picklable, so that a worker can have them."""
-
-    calibration: Path | None
-    method: str
-    seed: int
-    interval: float
-    background: str | None
-    fit_radius_mm: float | None
-    rotation: str
-    centre_mm: tuple[float, float] | None
-    max_steps: int | None
-    noise: str | None
-    accuracy_sd: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What one map came to: its JSON object and its text, or an error with its exit code."""
-
-    document: dict[str, Any] | None
-    text: str
-    exit_code: int
-
-
 @click.command("estimate")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
-@click.option("--size-calibration", metavar="SIZE.json", type=_FILE, help="Eq 6; without it, widths only.")
+@click.option(
+    "--size-calibration",
+    metavar="solid|plane-strain|none|SIZE.json",
+    help="From widths to sizes: one that comes with the program (solid, if nothing is said), yours, or none: "
+    "widths only.",
+)
 @click.option(
     "--method",
     type=click.Choice(METHODS),
@@ -102,6 +73,21 @@ class Answer:
     help="Of importance: error of interval ends, in posterior SDs; 0.02 if not given.",
 )
 @click.option(
+    "--between-map-sd",
+    type=click.FloatRange(min=0.0, max=2.0),
+    metavar="SD",
+    help="Spread of ln size between maps of one mass, taken as known; if not given, learned, about the paper's 0.15.",
+)
+@click.option(
+    "--known",
+    type=(str, float),
+    multiple=True,
+    metavar="NAME VALUE",
+    help="Of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, stiffness_ratio, fat_kpa, "
+    "gland_ratio or thickness_mm.",
+)
+@click.option("--pool", is_flag=True, help="The maps are of one mass: one size from all of them.")
+@click.option(
     "--workers", type=click.IntRange(min=1), default=1, show_default=True, help="Processes, for several maps."
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Send several maps to a dask scheduler (extra [cluster]).")
@@ -112,7 +98,7 @@ def command(
     ctx: click.Context,
     /,
     maps: tuple[Path, ...],
-    size_calibration: Path | None,
+    size_calibration: str | None,
     method: str,
     seed: int,
     interval: float,
@@ -127,6 +113,9 @@ def command(
     max_steps: int | None,
     noise: str | None,
     accuracy_sd: float | None,
+    between_map_sd: float | None,
+    known: tuple[tuple[str, float], ...],
+    pool: bool,
     workers: int,
     scheduler: str | None,
     force: bool,
@@ -134,11 +123,11 @@ def command(
 ) -> None:
     """Estimate a lump's size from tactile maps, with a credible interval.
 
-    Every posterior draw of the map's Gaussian (Eq 7) goes through Eq 6 with a draw of its coefficients and of its
-    residual scatter. Where the map shows no lump that can be measured there is no number: the reason is printed and
-    the exit code is 6.
+    Every posterior draw of the map's Gaussian (Eq 7) goes through a size calibration with a draw of its coefficients
+    and of what no map shows. Where the map shows no lump that can be measured there is no number: the reason is
+    printed and the exit code is 6. With --pool the maps are repeats of one mass, and their spread is learned.
 
-    Example: tactile-bayes estimate map.nc --size-calibration size.json --figure size.png
+    Example: tactile-bayes estimate map.nc --figure size.png
     """
     settings = Settings(
         size_calibration,
@@ -152,10 +141,19 @@ def command(
         max_steps,
         noise,
         accuracy_sd,
+        between_map_sd,
+        known,
     )
     outputs = {"output": output, "figure": figure, "map figure": map_figure}
-    _check_outputs([path for path in outputs.values() if path], maps, size_calibration, force=force)
+    _check_outputs([path for path in outputs.values() if path], maps, _named(size_calibration), pool, force=force)
     begun = time.perf_counter()
+    if pool:
+        from tactile_bayes.commands.estimate_pool import estimate_pool
+
+        if map_figure:
+            raise UsageError("--map-figure draws one map; leave out --pool")
+        answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
+        ctx.exit(estimate_pool(maps, answers, settings, output, figure, as_json=as_json, force=force))
     if len(maps) == 1:
         answers = [_one_map(maps[0], settings, output, figure, map_figure, force=force)]
     else:
@@ -166,14 +164,22 @@ def command(
     ctx.exit(_exit_code(answers))
 
 
-def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], calibration: Path | None, *, force: bool) -> None:
+def _named(calibration: str | None) -> Path | None:
+    from tactile_bayes.files.shipped import size_calibration_path
+
+    return None if calibration is None else size_calibration_path(calibration)
+
+
+def _check_outputs(
+    outputs: list[Path], maps: tuple[Path, ...], calibration: Path | None, pool: bool, *, force: bool
+) -> None:
     """Stop before any work is done if an output cannot be written or would destroy an input."""
     from tactile_bayes.files.atomic import refuse_existing
 
     twice = [path for index, path in enumerate(maps) if path in maps[:index]]
     if twice:
         raise UsageError(f"{twice[0]} is given twice; give each map once")
-    if outputs and len(maps) > 1:
+    if outputs and len(maps) > 1 and not pool:
         raise UsageError("--output and the figures take one map at a time; use --json for several")
     if len({path.absolute() for path in outputs}) < len(outputs):
         raise UsageError("two outputs have one name; choose another for one of them")
@@ -196,7 +202,7 @@ def _one_map(
     from tactile_bayes.commands.progress import progress_bar
 
     with progress_bar("effective draws") as progress:
-        tactile_map, estimate, provenance = _run(path, settings, progress=progress)
+        tactile_map, estimate, provenance = run_map(path, settings, progress=progress)
     if estimate.status == "estimate":
         if output:
             from tactile_bayes.files.posterior_nc import write_posterior
@@ -206,7 +212,7 @@ def _one_map(
             _draw_size(estimate, figure, settings.interval, force=force)
         if map_figure:
             _draw_map(tactile_map, estimate, map_figure, force=force)
-    return _answer(tactile_map, estimate, provenance, settings)
+    return answer_of(tactile_map, estimate, provenance, settings)
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
@@ -221,75 +227,6 @@ def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, sche
             partial(answer_map, settings=settings), maps, key=str, executor=executor, progress=progress
         )
     return [o.value if o.value is not None else Answer(None, f"error: {o.key}: {o.error}", 1) for o in outcomes]
-
-
-def answer_map(path: Path, *, settings: Settings) -> Answer:
-    """One map of several, in whichever process; a fault of this map is its answer."""
-    try:
-        tactile_map, estimate, provenance = _run(path, settings, progress=None)
-    except TactileBayesError as error:
-        text = str(error) if str(path) in str(error) else f"{path}: {error}"
-        return Answer(None, f"error: {text}", error.exit_code)
-    return _answer(tactile_map, estimate, provenance, settings)
-
-
-def _run(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMap, Estimate, Provenance]:
-    import numpy as np
-
-    from tactile_bayes.files.map_nc import read_map
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.estimate import estimate_map
-
-    tactile_map = read_map(path)
-    calibration = read_size_calibration(settings.calibration) if settings.calibration else None
-    options = _options(settings, calibration)
-    inputs = {"map": path} | ({"size_calibration": settings.calibration} if settings.calibration else {})
-    digests = hash_inputs(**inputs)
-    # the map's own digest is part of the seed: a map's answer does not depend on its place in a list
-    rng = np.random.default_rng([settings.seed, int(digests["map"][:16], 16)])
-    try:
-        estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
-    except BadDataError as error:
-        raise error.at(path) from None
-    recorded = {
-        "method": settings.method,
-        "interval": settings.interval,
-        "background": options.fit.background,
-        "fit_radius_mm": options.fit.radius_mm,
-        "rotation": settings.rotation,
-        "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
-        "noise": options.fit.noise,
-        "accuracy_sd": settings.accuracy_sd,
-    }
-    return tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed)
-
-
-def _options(settings: Settings, calibration: SizeCalibration | None) -> EstimateOptions:
-    """What is not given is as the calibration's maps were fitted, else as the paper printed it."""
-    from tactile_bayes.posterior.estimate import EstimateOptions
-    from tactile_bayes.posterior.fit import FitOptions
-
-    noise = settings.noise or (calibration.recipe.noise if calibration else "independent")
-    printed = "free" if noise == "field" else "fixed"
-    background = settings.background or (calibration.recipe.background if calibration else printed)
-    radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
-    fit = FitOptions(background, radius, settings.rotation, settings.centre_mm, noise)
-    return EstimateOptions(
-        method=settings.method, fit=fit, max_steps=settings.max_steps, accuracy_sd=settings.accuracy_sd
-    )
-
-
-def _answer(tactile_map: TactileMap, estimate: Estimate, provenance: Provenance, settings: Settings) -> Answer:
-    from tactile_bayes.posterior.bump import BumpPrior
-    from tactile_bayes.report.estimate_document import estimate_document
-    from tactile_bayes.report.estimate_text import estimate_text
-
-    document = estimate_document(
-        estimate, tactile_map, probability=settings.interval, prior=BumpPrior(), provenance=provenance
-    )
-    text = estimate_text(estimate, tactile_map, probability=settings.interval)
-    return Answer(document, text, EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE)
 
 
 def _draw_size(estimate: Estimate, path: Path, probability: float, *, force: bool) -> None:

@@ -132,7 +132,8 @@ def estimate_text(tactile_map: TactileMap, calibration_path: str | None) -> str:
         # whether an ellipse is turned is a question for afterwards, and takes a third of the time
         fit = FitOptions(rotation="off")
         if calibration is not None:
-            fit = FitOptions(calibration.recipe.background, calibration.recipe.radius_mm, "off")
+            recipe = calibration.recipe
+            fit = FitOptions(recipe.background, recipe.radius_mm, "off", None, recipe.noise)
         options = EstimateOptions(method="laplace", fit=fit)
         found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
     except TactileBayesError as error:

@@ -160,8 +160,18 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
 
     calibration = read_size_calibration(path)
+    if isinstance(calibration, LogQuadratic):
+        kept = ("form", "source", "recipe", "parameters", "centre", "mean", "domain", "fit", "provenance")
+        return {
+            "schema": document["schema"],
+            "kind": "size calibration",
+            "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
+            **{name: document[name] for name in kept},
+            "variance_taken_away_by_knowing": calibration.unknowns,
+        }
     return {
         "schema": document["schema"],
         "kind": "size calibration",

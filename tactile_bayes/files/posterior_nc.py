@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.files.atomic import atomic_path
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import Estimate
+from tactile_bayes.posterior.size import SizePosterior
 from tactile_bayes.presets import RESEARCH_USE
 
 SCHEMA = "tactile-bayes/posterior/1"
@@ -54,6 +55,24 @@ def write_posterior(path: Path, estimate: Estimate, *, provenance: Provenance, f
         "diagnostics": json.dumps({k: v for k, v in estimate.diagnostics.items() if _plain(v)}),
     }
     data = to_inference_data({k: np.asarray(v) for k, v in variables.items()}, attributes=attributes)
+    with atomic_path(path, force=force) as partial:
+        data.to_netcdf(str(partial), engine="h5netcdf")
+
+
+def write_pooled(path: Path, size: SizePosterior, *, provenance: Provenance, force: bool = False) -> None:
+    """Write the draws of a mass's size, pooled over its maps, atomically."""
+    from tactile_bayes.posterior.inference_data import to_inference_data
+
+    names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
+    variables = {name: np.atleast_2d(getattr(size, name)) for name in names}
+    attributes = {
+        "schema": SCHEMA,
+        "research_use": RESEARCH_USE,
+        "method": "pooled",
+        "provenance": json.dumps(provenance.as_dict()),
+        "diagnostics": json.dumps({k: v for k, v in size.figures.items() if _plain(v)}),
+    }
+    data = to_inference_data(variables, attributes=attributes)
     with atomic_path(path, force=force) as partial:
         data.to_netcdf(str(partial), engine="h5netcdf")
 

@@ -54,16 +54,28 @@ def _validator(schema_name: str) -> Any:
 
 def read_json(path: Path, schema_name: str) -> dict[str, Any]:
     """Read a JSON file and check it against its schema; see `check_document` for the errors."""
+    document = load_json(path)
+    check_document(document, schema_name, path=path)
+    assert isinstance(document, dict)
+    return document
+
+
+def load_json(path: Path) -> object:
+    """Read a JSON file, whatever it holds.
+
+    Raises
+    ------
+    BadDataError
+        When it cannot be read or is not JSON.
+    """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document: object = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise unreadable(path, error) from None
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise BadDataError(
             f"not a JSON file ({error})", way_out="give a file this program wrote", path=str(path)
         ) from None
-    check_document(document, schema_name, path=path)
-    assert isinstance(document, dict)
     return document
 
 

@@ -1,4 +1,4 @@
-"""Size calibrations as JSON: draws of Eq 6's coefficients with their covariance, recipe and domain."""
+"""Size calibrations as JSON: Eq 6 with draws of its coefficients; files of the log-quadratic form are read here too."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files import size_quadratic_json as quadratic
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import check_document, dump_json, read_json
+from tactile_bayes.files.schema import check_document, dump_json, load_json
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, Recipe, SizeCalibration
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -43,15 +45,23 @@ def write_size_calibration(
     write_text(path, dump_json(document), force=force)
 
 
-def read_size_calibration(path: Path) -> SizeCalibration:
-    """Read a size calibration.
+def read_size_calibration(path: Path) -> SizeCalibration | LogQuadratic:
+    """Read a size calibration of either form.
 
     Raises
     ------
     BadDataError
         When the file is not one, or a field breaks the schema.
     """
-    document = read_json(path, SCHEMA_FILE)
+    document = load_json(path)
+    if isinstance(document, dict) and document.get("form") == "log-quadratic":
+        check_document(document, quadratic.SCHEMA_FILE, path=path)
+        return quadratic.parse_log_quadratic(document, path=path)
+    check_document(document, SCHEMA_FILE, path=path)
+    return _eq6(document, path=path)
+
+
+def _eq6(document: Any, *, path: Path) -> SizeCalibration:
     try:
         return SizeCalibration(
             x=_axis(document["x"]),

@@ -96,8 +96,8 @@ def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, So
 def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
     """One examination of a body still to be named; lumps go to its middle shifted by `off_centre_mm`."""
     lines = int(rng.integers(prior.lines[0], prior.lines[1] + 1))
-    mean = rng.uniform(*prior.mean_kpa)
-    background = Background(mean_kpa=mean, drift_kpa=rng.uniform(*prior.drift_kpa), drift_period_s=rng.uniform(1.5, 5.0))
+    mean, drift = rng.uniform(*prior.mean_kpa), rng.uniform(*prior.drift_kpa)
+    background = Background(mean_kpa=mean, drift_kpa=drift, drift_period_s=rng.uniform(1.5, 5.0))
     strokes = Strokes(
         lines=lines,
         spacing_mm=rng.uniform(*prior.spacing_mm),

@@ -16,8 +16,10 @@ from tactile_bayes.posterior.detection import Detection, detect
 from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, find_bump, rotation_odds
 from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.noise import level_offset
 from tactile_bayes.posterior.optimise import optimise
+from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
 from tactile_bayes.posterior.size_calibration import SizeCalibration
 from tactile_bayes.presets import CELL_PER_SIGMA
@@ -50,6 +52,8 @@ class EstimateOptions:
         Of the ensemble; None for its default.
     accuracy_sd
         Of interval ends, in posterior SDs, for importance sampling; None for its default.
+    size_priors
+        Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
     scene
         One of `scene_choice.SCENES`, under a noise field.
     """
@@ -60,6 +64,7 @@ class EstimateOptions:
     least_probability: float = DETECTED
     max_steps: int | None = None
     accuracy_sd: float | None = None
+    size_priors: SizePriors = field(default_factory=SizePriors)
     scene: str = "auto"
 
 
@@ -113,7 +118,7 @@ class Estimate:
 def estimate_map(
     tactile_map: TactileMap,
     *,
-    calibration: SizeCalibration | None,
+    calibration: SizeCalibration | LogQuadratic | None,
     options: EstimateOptions,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] | None = None,
@@ -159,11 +164,11 @@ def estimate_map(
         draws = _draw(fit, options, rng=rng, progress=progress)
         posterior = _map_posterior(fit, draws, options, rng=rng)
         noise = _judged_noise(fit, odds)
-    size = _size(posterior, calibration, rng=rng)
+    size = _size(posterior, calibration, options.size_priors, rng=rng)
     diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | noise
     diagnostics["method"] = draws.method
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
-        reason = f"Eq 6 gives no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
+        reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         return Estimate("no_estimate", reason, detection=detection, candidates=candidates, diagnostics=diagnostics)
     reason = "" if calibration is not None else "no size calibration was given: widths only"
     return Estimate(
@@ -180,7 +185,7 @@ def estimate_map(
     )
 
 
-def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration, fit: FitOptions) -> None:
+def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic, fit: FitOptions) -> None:
     """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
     differs = calibration.recipe.differences(
         normalise=tactile_map.recipe.normalise,
@@ -274,10 +279,19 @@ def _map_posterior(
 
 
 def _size(
-    posterior: MapPosterior, calibration: SizeCalibration | None, *, rng: np.random.Generator
+    posterior: MapPosterior,
+    calibration: SizeCalibration | LogQuadratic | None,
+    priors: SizePriors,
+    *,
+    rng: np.random.Generator,
 ) -> SizePosterior | None:
     if calibration is None:
         return None
+    if isinstance(calibration, LogQuadratic):
+        draws = ShapeDraws.of(posterior.amplitude, posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.angle_rad)
+        size = pooled_size([draws], calibration=calibration, priors=priors, rng=rng)
+        shape = posterior.amplitude.shape
+        return replace(size, d_x_mm=size.d_x_mm.reshape(shape), d_y_mm=size.d_y_mm.reshape(shape))
     return push_sizes(
         posterior.amplitude,
         posterior.sigma_x_mm,
@@ -348,12 +362,17 @@ def _judged_noise(fit: BumpFit, odds: float | None) -> dict[str, object]:
 
 
 def _diagnostics(
-    tactile_map: TactileMap, fit: BumpFit, posterior: MapPosterior, calibration: SizeCalibration | None
+    tactile_map: TactileMap,
+    fit: BumpFit,
+    posterior: MapPosterior,
+    calibration: SizeCalibration | LogQuadratic | None,
 ) -> dict[str, object]:
     medians = (np.median(v) for v in (posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.amplitude))
     sigma_x, sigma_y, amplitude = (float(value) for value in medians)
     outside: list[str] = []
-    if calibration is not None:
+    if isinstance(calibration, LogQuadratic):
+        outside = calibration.outside(amplitude, float(np.sqrt(sigma_x * sigma_y)))
+    elif calibration is not None:
         outside += [f"x: {text}" for text in calibration.x.outside(sigma_x, amplitude)]
         outside += [f"y: {text}" for text in calibration.y.outside(sigma_y, amplitude)]
     return {
@@ -365,7 +384,7 @@ def _diagnostics(
 
 
 def _left_out(
-    options: EstimateOptions, calibration: SizeCalibration | None, diagnostics: Mapping[str, object]
+    options: EstimateOptions, calibration: SizeCalibration | LogQuadratic | None, diagnostics: Mapping[str, object]
 ) -> tuple[str, ...]:
     notes = []
     odds = diagnostics["rotation_odds"]
@@ -373,7 +392,9 @@ def _left_out(
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
     if options.fit.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")
-    notes.append("spread between maps of one mass (15 % in the paper): this is one map")
-    if calibration is not None and calibration.axes == ("both",):
+    between = options.size_priors.between_maps
+    if not isinstance(calibration, LogQuadratic) or between.median <= 0:
+        notes.append("spread between maps of one mass (15 % in the paper): this is one map")
+    if isinstance(calibration, SizeCalibration) and calibration.axes == ("both",):
         notes.append("a difference between the head's axes: the calibration has one width")
     return tuple(notes)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,12 +24,18 @@ class SizePosterior:
         scatter; the three sum to 100.
     invalid
         Draws without a size: amplitude or diameter not positive.
+    figures
+        What else the calibration found: the probability of a lump that is not round, the spread between maps...
+    outliers
+        Of several maps, those that lie apart from the rest, by their place in the list.
     """
 
     d_x_mm: FloatArray
     d_y_mm: FloatArray
     variance_share: dict[str, float]
     invalid: int
+    figures: Mapping[str, float] = field(default_factory=dict)
+    outliers: tuple[int, ...] = ()
 
     @property
     def max_size_mm(self) -> FloatArray:

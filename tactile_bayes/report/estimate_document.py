@@ -91,6 +91,7 @@ def _diagnostics(estimate: Estimate) -> dict[str, Any]:
         found["log_bayes_factor"] = estimate.detection.log_bayes_factor
     if estimate.size is not None:
         found["invalid_draws"] = estimate.size.invalid
+        found |= estimate.size.figures
     return {
         name: (_round(value) if math.isfinite(value) else None) if isinstance(value, float) else value
         for name, value in found.items()

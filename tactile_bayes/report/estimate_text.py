@@ -9,6 +9,7 @@ from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.quantity import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_quantities
+from tactile_bayes.report.size_text import shape_text, variance_text
 
 ROWS = (
     ("max_size_mm", "largest size", "mm"),
@@ -65,9 +66,9 @@ def _findings(estimate: Estimate) -> list[str]:
     if estimate.detection is not None:
         lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
     if estimate.size is not None:
-        names = {"map": "the map", "calibration": "the coefficients of Eq 6", "residual": "the scatter about Eq 6"}
-        parts = [f"{share:.0f} % {names[key]}" for key, share in estimate.size.variance_share.items()]
-        lines.append(f"Variance of the largest size: {', '.join(parts)}.")
+        lines.append(variance_text(estimate.size.variance_share))
+        if "oval_probability" in estimate.size.figures:
+            lines.append(shape_text(estimate.size.figures))
         if estimate.size.invalid:
             lines.append(f"{estimate.size.invalid} draws gave no size and were left out.")
     if estimate.draws is not None and "rhat" in estimate.draws.diagnostics:

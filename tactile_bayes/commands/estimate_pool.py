@@ -1,0 +1,116 @@
+"""`estimate --pool`: one size from several maps of one mass."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+
+if TYPE_CHECKING:
+    from tactile_bayes.commands.estimate_run import Answer, Settings
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.posterior.pooling import PooledEstimate
+
+
+def estimate_pool(
+    maps: tuple[Path, ...],
+    answers: list[Answer],
+    settings: Settings,
+    output: Path | None,
+    figure: Path | None,
+    *,
+    as_json: bool,
+    force: bool,
+) -> int:
+    """Print, and write where asked, the size of the mass; return the exit code.
+
+    A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
+    """
+    from tactile_bayes.commands.estimate_run import size_priors
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
+    from tactile_bayes.posterior.pooling import pool_maps
+    from tactile_bayes.report.pooled import pooled_document, pooled_text
+
+    failed = [answer for answer in answers if answer.document is None]
+    for answer in failed:
+        click.echo(answer.text, err=True)
+    if failed:
+        return failed[0].exit_code
+    path = size_calibration_path(settings.calibration or DEFAULT)
+    calibration = _log_quadratic(path)
+    assert path is not None
+    digests = hash_inputs(**{f"map_{i + 1}": one for i, one in enumerate(maps)}, size_calibration=path)
+    import numpy as np
+
+    # the maps' digests in sorted order are part of the seed: their order on the command line leaves no trace
+    words = sorted(int(digest[:16], 16) for digest in digests.values())
+    pooled = pool_maps(
+        [answer.shape for answer in answers],
+        calibration=calibration,
+        priors=size_priors(settings),
+        rng=np.random.default_rng([settings.seed, *words]),
+    )
+    provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed)
+    documents = [answer.document for answer in answers if answer.document is not None]
+    document = pooled_document(
+        pooled,
+        [str(one) for one in maps],
+        documents,
+        calibration,
+        probability=settings.interval,
+        provenance=provenance,
+    )
+    check_document(document, "pooled.schema.json", path=Path("the report"))
+    if pooled.size is not None:
+        _write(pooled, settings, output, figure, provenance=provenance, force=force)
+    click.echo(dump_json(document) if as_json else pooled_text(document), nl=False)
+    return EXIT_DONE if pooled.size is not None else EXIT_NO_ESTIMATE
+
+
+def _log_quadratic(path: Path | None) -> LogQuadratic:
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+
+    if path is None:
+        raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
+    calibration = read_size_calibration(path)
+    if not isinstance(calibration, LogQuadratic):
+        raise UsageError(f"--pool needs a calibration of the log-quadratic form; {path} is of Eq 6: use solid")
+    return calibration
+
+
+def _plain(settings: Settings) -> dict[str, Any]:
+    """The settings as JSON holds them."""
+    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(settings).items() if name != "seed"}
+    return plain | {"known": dict(settings.known)}
+
+
+def _write(
+    pooled: PooledEstimate,
+    settings: Settings,
+    output: Path | None,
+    figure: Path | None,
+    *,
+    provenance: Any,
+    force: bool,
+) -> None:
+    size = pooled.size
+    assert size is not None
+    if output is not None:
+        from tactile_bayes.files.posterior_nc import write_pooled
+
+        write_pooled(output, size, provenance=provenance, force=force)
+    if figure is not None:
+        from tactile_bayes.posterior.quantity import summarise
+        from tactile_bayes.report.figures import SizeInterval, size_figure
+
+        draws = {"max": size.max_size_mm.ravel(), "min": size.min_size_mm.ravel()}
+        found = {n: summarise(d, probability=settings.interval, effective_draws=len(d)) for n, d in draws.items()}
+        intervals = {n: SizeInterval(q.low, q.high, q.probability, q.kind) for n, q in found.items()}
+        size_figure(draws["max"], draws["min"], figure, intervals=intervals, force=force)

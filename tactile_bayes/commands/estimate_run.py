@@ -1,0 +1,191 @@
+"""One map of `estimate`: the calibration and options that fit it, the estimate, its report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
+from tactile_bayes.presets import FIT_RADIUS_MM
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors
+    from tactile_bayes.posterior.size_calibration import SizeCalibration
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The options of one call, as given; picklable, so that a worker can have them.
+
+    `calibration` is as named on the command line, None where nothing was said: then the shipped one, if it fits.
+    """
+
+    calibration: str | None
+    method: str
+    seed: int
+    interval: float
+    background: str | None
+    fit_radius_mm: float | None
+    rotation: str
+    centre_mm: tuple[float, float] | None
+    max_steps: int | None
+    noise: str | None
+    accuracy_sd: float | None
+    between_map_sd: float | None = None
+    known: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one map came to: its JSON object and its text, or an error with its exit code.
+
+    `shape` holds what pooling needs of a map on which a lump was found.
+    """
+
+    document: dict[str, Any] | None
+    text: str
+    exit_code: int
+    shape: ShapeDraws | None = None
+
+
+def answer_map(path: Path, *, settings: Settings) -> Answer:
+    """One map of several, in whichever process; a fault of this map is its answer."""
+    try:
+        tactile_map, estimate, provenance = run_map(path, settings, progress=None)
+    except TactileBayesError as error:
+        text = str(error) if str(path) in str(error) else f"{path}: {error}"
+        return Answer(None, f"error: {text}", error.exit_code)
+    return answer_of(tactile_map, estimate, provenance, settings)
+
+
+def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMap, Estimate, Provenance]:
+    """Read a map and estimate."""
+    import numpy as np
+
+    from tactile_bayes.files.map_nc import read_map
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.posterior.estimate import estimate_map
+
+    tactile_map = read_map(path)
+    source, calibration, why_none = choose_calibration(settings, tactile_map)
+    options = _options(settings, calibration)
+    inputs = {"map": path} | ({"size_calibration": source} if source else {})
+    digests = hash_inputs(**inputs)
+    # the map's own digest is part of the seed: a map's answer does not depend on its place in a list
+    rng = np.random.default_rng([settings.seed, int(digests["map"][:16], 16)])
+    try:
+        estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
+    except BadDataError as error:
+        raise error.at(path) from None
+    if why_none and estimate.status == "estimate":
+        estimate = replace(estimate, reason=why_none)
+    recorded = {
+        "size_calibration": settings.calibration or ("solid (shipped)" if calibration is not None else "none"),
+        "method": settings.method,
+        "interval": settings.interval,
+        "background": options.fit.background,
+        "fit_radius_mm": options.fit.radius_mm,
+        "rotation": settings.rotation,
+        "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
+        "noise": options.fit.noise,
+        "accuracy_sd": settings.accuracy_sd,
+        "between_map_sd": settings.between_map_sd,
+        "known": dict(settings.known),
+    }
+    return tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed)
+
+
+def choose_calibration(
+    settings: Settings, tactile_map: TactileMap
+) -> tuple[Path | None, SizeCalibration | LogQuadratic | None, str]:
+    """The calibration that was named, or the shipped one where nothing was said and it fits the map and the options.
+
+    Returns
+    -------
+    path, calibration
+        None where there is none.
+    reason
+        Why the shipped one was not used; empty when it was, or when the user decided.
+    """
+    from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
+    from tactile_bayes.files.size_json import read_size_calibration
+
+    path = size_calibration_path(settings.calibration or DEFAULT)
+    if path is None:
+        return None, None, ""
+    calibration = read_size_calibration(path)
+    if settings.calibration is not None:
+        return path, calibration, ""
+    fit = _options(settings, calibration).fit
+    differs = calibration.recipe.differences(
+        normalise=tactile_map.recipe.normalise, background=fit.background, radius_mm=fit.radius_mm, noise=fit.noise
+    )
+    if differs or settings.method == "optimise":
+        what = "; ".join(differs) or "method optimise knows no noise field"
+        return None, None, f"the shipped calibration does not fit: {what}; widths only"
+    return path, calibration, ""
+
+
+def _options(settings: Settings, calibration: SizeCalibration | LogQuadratic | None) -> EstimateOptions:
+    """What is not given is as the calibration's maps were fitted, else as the paper printed it."""
+    from tactile_bayes.posterior.estimate import EstimateOptions
+    from tactile_bayes.posterior.fit import FitOptions
+
+    noise = settings.noise or (calibration.recipe.noise if calibration else "independent")
+    printed = "free" if noise == "field" else "fixed"
+    background = settings.background or (calibration.recipe.background if calibration else printed)
+    radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
+    fit = FitOptions(background, radius, settings.rotation, settings.centre_mm, noise)
+    return EstimateOptions(
+        method=settings.method,
+        fit=fit,
+        max_steps=settings.max_steps,
+        accuracy_sd=settings.accuracy_sd,
+        size_priors=size_priors(settings),
+    )
+
+
+def size_priors(settings: Settings) -> SizePriors:
+    """The spread between maps, known or to be learned."""
+    from tactile_bayes.posterior.pooling import BetweenMaps, SizePriors
+
+    for name, value in settings.known:
+        if not value > 0 and name != "seat":
+            raise UsageError(f"--known {name} is {value:g}; it must be above 0")
+    fixed = settings.between_map_sd
+    between = BetweenMaps() if fixed is None else BetweenMaps(fixed, 0.0)
+    return SizePriors(between_maps=between, known=dict(settings.known))
+
+
+def answer_of(tactile_map: TactileMap, estimate: Estimate, provenance: Provenance, settings: Settings) -> Answer:
+    """The report of one map."""
+    from tactile_bayes.posterior.bump import BumpPrior
+    from tactile_bayes.report.estimate_document import estimate_document
+    from tactile_bayes.report.estimate_text import estimate_text
+
+    document = estimate_document(
+        estimate, tactile_map, probability=settings.interval, prior=BumpPrior(), provenance=provenance
+    )
+    text = estimate_text(estimate, tactile_map, probability=settings.interval)
+    exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
+    return Answer(document, text, exit_code, _shape(tactile_map, estimate))
+
+
+def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
+    """What pooling needs of a map, with the direction of its axes in the patient where landmarks tell."""
+    import math
+
+    from tactile_bayes.posterior.pooling import ShapeDraws
+
+    posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
+    if posterior is None:
+        return None
+    angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
+    return ShapeDraws.of(
+        posterior.amplitude, posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.angle_rad, turn_rad=angle
+    )

@@ -1,0 +1,111 @@
+"""`population`: scans of bodies that differ, mapped and fitted as patients' are: the table of a size calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.measure import MassRow
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.command("population")
+@click.option("-o", "--output", required=True, metavar="TABLE.csv", type=_FILE, help="Where to write the table.")
+@click.option("--masses", type=click.IntRange(min=1), default=400, show_default=True, help="Bodies with a lump each.")
+@click.option("--scans", type=click.IntRange(min=1), default=2, show_default=True, help="Exams of each.")
+@click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True, help="Of the random numbers.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
+@click.option("--scheduler", metavar="ADDR", help="Send the masses to a dask scheduler (extra [cluster]).")
+@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+def command(output: Path, masses: int, scans: int, seed: int, workers: int, scheduler: str | None, force: bool) -> None:
+    """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from.
+
+    Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
+    pressure, strokes, head yaw, tilt, noise, tracker errors and latency. The solid model makes the scans; maps are
+    built and fitted as `map` and `estimate` do it. A mass takes about ten seconds. An interrupted run goes on where it
+    stopped. `calibrate size --form log-quadratic` learns from the table.
+
+    Example: tactile-bayes population --masses 100 --workers 4 -o population.csv
+    """
+    from functools import partial
+
+    from tactile_bayes.batch import open_executor, open_store, run_batch
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.files.atomic import refuse_existing, write_text
+    from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from tactile_bayes.presets import RESEARCH_USE
+
+    refuse_existing(output, force=force)
+    settings = {"scans": scans, "seed": seed, **as_settings(BodyPrior(), ExamPrior())}
+    kept = output.with_name(f"{output.name}.unfinished")
+    with (
+        open_executor(workers=workers, cluster=scheduler) as executor,
+        open_store(kept, settings=settings, encode=_encode, decode=_decode) as store,
+        progress_bar("masses") as progress,
+    ):
+        outcomes = run_batch(
+            partial(rows_of_mass, scans=scans, seed=seed),
+            range(masses),
+            key=str,
+            executor=executor,
+            store=store,
+            progress=progress,
+        )
+    rows = [row for outcome in outcomes for row in outcome.value or []]
+    write_text(output, table_text(rows), force=force)
+    failed = [outcome for outcome in outcomes if not outcome.ok]
+    for outcome in failed:
+        click.echo(f"mass {outcome.key} could not be simulated: {outcome.error}", err=True)
+    if not failed:
+        kept.unlink(missing_ok=True)
+    found = sum(row.detected for row in rows)
+    click.echo(f"{output}: {masses} masses, {len(rows)} exams, a lump found in {found}, seed {seed}")
+    click.echo(RESEARCH_USE)
+
+
+def rows_of_mass(index: int, *, scans: int, seed: int) -> list[MassRow]:
+    """The rows of one mass, in whichever process."""
+    import numpy as np
+
+    from tactile_bayes.forward.population import draw_mass
+    from tactile_bayes.forward.simulate import simulate
+    from tactile_bayes.posterior.measure import measure_mass
+
+    scenes = draw_mass(index, scans=scans, seed=seed)
+    return measure_mass(
+        scenes, body=index, scan=lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan
+    )
+
+
+def _encode(rows: list[MassRow]) -> list[dict[str, Any]]:
+    from dataclasses import asdict
+
+    return [asdict(row) for row in rows]
+
+
+def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
+    from tactile_bayes.posterior.measure import MassRow
+
+    return [MassRow(**row) for row in rows]
+
+
+def table_text(rows: list[MassRow]) -> str:
+    """The rows under the header that `data_schema/population.table.json` describes."""
+    from dataclasses import astuple, fields
+
+    from tactile_bayes.posterior.measure import MassRow
+
+    lines = [",".join(field.name for field in fields(MassRow))]
+    return "\n".join(lines + [",".join(map(_cell, astuple(row))) for row in rows]) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return str(value) if isinstance(value, int) else f"{value:.8g}"

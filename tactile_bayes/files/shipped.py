@@ -1,0 +1,21 @@
+"""Size calibrations that come with the program, by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+SHIPPED: Final = {"solid": "solid.json", "plane-strain": "plane_strain.json"}
+DEFAULT: Final = "solid"
+NONE: Final = "none"
+_FOLDER = Path(__file__).resolve().parents[1] / "calibrations"
+
+
+def size_calibration_path(name: str) -> Path | None:
+    """Where the calibration of a name or path is; None for ``none``.
+
+    A file of the same name in the working directory needs a ``./`` before it.
+    """
+    if name == NONE:
+        return None
+    return _FOLDER / SHIPPED[name] if name in SHIPPED else Path(name)

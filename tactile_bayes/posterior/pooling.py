@@ -1,0 +1,305 @@
+r"""Sizes from the maps of one mass, one or several, through the log-quadratic calibration.
+
+Map i gives :math:`g_i`, the log size by the calibration's quadratic, with its own noise. Maps of one mass differ by
+more than that: :math:`g_i = \ln d - B + E_i`, with :math:`E_i \sim N(0, \tau^2)` between maps. tau is learned from the
+maps at hand with a prior centred on the paper's 15 %; one map says nothing about it, so there the prior speaks. B, what
+no map shows of a body, is common to all of them and does not average out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.roundness import Elongation, ShapePrior, elongation, turned
+from tactile_bayes.posterior.size import SizePosterior
+
+OUTLYING = 3.0
+POOLED_DRAWS = 8000
+MOST_INVALID = 0.05
+_GRID = np.geomspace(1e-3, 1.5, 240)
+
+
+@dataclass(frozen=True, slots=True)
+class BetweenMaps:
+    """Prior on tau, the standard deviation of ln d between maps of one mass: log-normal.
+
+    Parameters
+    ----------
+    median
+        0.15 in the paper (section 4: within-mass SD 15 %); 0 leaves the term out.
+    log_sd
+        0 takes the median as known.
+    """
+
+    median: float = 0.15
+    log_sd: float = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class SizePriors:
+    """What the size of a mass assumes besides its calibration.
+
+    Parameters
+    ----------
+    known
+        Properties of the body that somebody knows, by the names of `HiddenTerms`.
+    """
+
+    between_maps: BetweenMaps = field(default_factory=BetweenMaps)
+    shape: ShapePrior = field(default_factory=ShapePrior)
+    known: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShapeDraws:
+    """Joint draws of what one map shows, each (n,).
+
+    Parameters
+    ----------
+    log_amplitude, log_width
+        ln a, and p, the log of the geometric mean width in mm.
+    q, r
+        Half log axis ratio along the map's x axis and 45 degrees from it.
+    turn_rad
+        From the axes that the maps of a mass share to this map's.
+    """
+
+    log_amplitude: FloatArray
+    log_width: FloatArray
+    q: FloatArray
+    r: FloatArray
+    turn_rad: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        amplitude: FloatArray,
+        sigma_x_mm: FloatArray,
+        sigma_y_mm: FloatArray,
+        angle_rad: FloatArray,
+        *,
+        turn_rad: float = 0.0,
+    ) -> ShapeDraws:
+        """From draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            log_a = np.log(np.where(amplitude > 0, amplitude, np.nan)).ravel()
+        half = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel()
+        angle = angle_rad.ravel()
+        p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
+        return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad)
+
+    def rows(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> ShapeDraws:
+        """Some of the draws."""
+        return ShapeDraws(self.log_amplitude[index], self.log_width[index], self.q[index], self.r[index], self.turn_rad)
+
+
+def pooled_size(
+    maps: Sequence[ShapeDraws],
+    *,
+    calibration: LogQuadratic,
+    priors: SizePriors,
+    rng: np.random.Generator,
+    number: int | None = None,
+) -> SizePosterior:
+    """Size of a mass from its maps.
+
+    Parameters
+    ----------
+    maps
+        One for each map on which the lump was found.
+    number
+        Draws of the result; None keeps those of a single map one by one.
+
+    Returns
+    -------
+    SizePosterior
+        Draws of shape (n,). `figures` holds ``between_map_sd`` (median), ``oval_probability``,
+        ``oval_half_log_ratio`` and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
+    """
+    n = len(maps[0].log_amplitude) if number is None else number
+    used = [m if number is None and len(maps) == 1 else m.rows(rng.integers(len(m.q), size=n)) for m in maps]
+    log_size = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
+    centre, noise = np.nanmean(log_size, axis=1), np.nanvar(log_size, axis=1)
+    tau = _draw_between(centre, noise, priors.between_maps, number=n, rng=rng)
+    weight = 1.0 / (noise[:, None] + tau**2 + 1e-12)
+    weight /= weight.sum(axis=0)
+    coefficients = calibration.draw(n, rng)
+    by_draw = np.stack([calibration.log_size(m.log_amplitude, m.log_width, coefficients) for m in used])
+    between = np.sum(weight * tau * rng.standard_normal(log_size.shape), axis=0)
+    middle_a = np.sum(weight * np.stack([m.log_amplitude for m in used]), axis=0)
+    middle_p = np.sum(weight * np.stack([m.log_width for m in used]), axis=0)
+    expected, left = _known_body(calibration, priors.known, calibration.terms(middle_a, middle_p))
+    body = left * calibration.body_sd(middle_a, coefficients) * rng.standard_normal(n)
+    oval, slope = _elongation(used, calibration, priors.shape)
+    half = oval.draw(n, rng)
+    log_d = np.sum(weight * by_draw, axis=0) + expected + between + body
+    valid = np.isfinite(log_d)
+    longer = np.hypot(half[:, 0], half[:, 1])
+    along_x = np.where(half[:, 0] >= 0, longer, -longer)
+    share = _shares(
+        {
+            "map": float(np.nanvar(np.sum(weight * log_size, axis=0))),
+            "between_maps": float(np.var(between)),
+            "calibration": float(np.nanvar(np.sum(weight * (by_draw - log_size), axis=0))),
+            "body": float(np.nanvar(body)),
+            "shape": float(np.var(longer)),
+        }
+    )
+    figures = {
+        "between_map_sd": float(np.median(tau)),
+        "oval_probability": oval.probability,
+        "oval_half_log_ratio": oval.magnitude,
+        "width_slope": slope,
+        **({f"weight_{i + 1}": float(w) for i, w in enumerate(weight.mean(axis=1))} if len(maps) > 1 else {}),
+    }
+    return SizePosterior(
+        np.where(valid, np.exp(log_d + along_x), np.nan),
+        np.where(valid, np.exp(log_d - along_x), np.nan),
+        share,
+        int((~valid).sum()),
+        figures,
+        outlying_maps(centre, noise, priors.between_maps),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PooledEstimate:
+    """The answer for one mass.
+
+    Parameters
+    ----------
+    status, reason
+        As of `Estimate`.
+    size
+        None without an estimate.
+    centres
+        ln d by each map alone, by its place in the list; maps without a lump are missing.
+    outlying
+        Places of the maps that lie apart from the rest.
+    outside
+        How maps lie outside the calibration's table, in words.
+    """
+
+    status: str
+    reason: str
+    size: SizePosterior | None = None
+    centres: Mapping[int, float] = field(default_factory=dict)
+    outlying: tuple[int, ...] = ()
+    outside: tuple[str, ...] = ()
+
+
+def pool_maps(
+    shapes: Sequence[ShapeDraws | None],
+    *,
+    calibration: LogQuadratic,
+    priors: SizePriors,
+    rng: np.random.Generator,
+) -> PooledEstimate:
+    """One size from the maps of a mass; None stands for a map on which no lump was found.
+
+    When fewer than half of the maps show the lump there is no size: those that do may be the noise's.
+    """
+    found = [i for i, shape in enumerate(shapes) if shape is not None]
+    if 2 * len(found) < len(shapes) or not found:
+        return PooledEstimate("no_estimate", f"a lump was found on {len(found)} of {len(shapes)} maps")
+    used = [shape for shape in shapes if shape is not None]
+    size = pooled_size(used, calibration=calibration, priors=priors, rng=rng, number=POOLED_DRAWS)
+    if size.invalid > MOST_INVALID * size.d_x_mm.size:
+        return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
+    centres = {
+        i: float(np.nanmean(calibration.log_size(shape.log_amplitude, shape.log_width)))
+        for i, shape in zip(found, used, strict=True)
+    }
+    outside = []
+    for i, shape in zip(found, used, strict=True):
+        amplitude, width = (float(np.exp(np.nanmedian(v))) for v in (shape.log_amplitude, shape.log_width))
+        outside += [f"map {i + 1}: {text}" for text in calibration.outside(amplitude, width)]
+    reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
+    outlying = tuple(found[i] for i in size.outliers)
+    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside))
+
+
+def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> tuple[int, ...]:
+    """Places of the maps that lie more than three standard deviations from what the others lead one to expect.
+
+    The spread between maps is taken from the others alone, so that an outlier cannot hide itself by widening it.
+    """
+    if len(centre) < 3:
+        return ()
+    found = []
+    for i in range(len(centre)):
+        others = np.delete(centre, i), np.delete(noise, i)
+        density = _between_density(*others, prior)
+        tau2 = float(density @ _grid(prior) ** 2)
+        weight = 1.0 / (others[1] + tau2)
+        expected, variance = float(weight @ others[0] / weight.sum()), float(1.0 / weight.sum() + noise[i] + tau2)
+        if abs(centre[i] - expected) > OUTLYING * np.sqrt(variance):
+            found.append(i)
+    return tuple(found)
+
+
+def _grid(prior: BetweenMaps) -> FloatArray:
+    """Values of tau that are looked at."""
+    return np.array([prior.median]) if prior.median <= 0 or prior.log_sd <= 0 else _GRID
+
+
+def _between_density(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> FloatArray:
+    """Posterior weights over `_grid`: restricted likelihood of the maps' centres times the prior."""
+    grid = _grid(prior)
+    if len(grid) == 1:
+        return np.ones(1)
+    variance = noise[:, None] + grid**2
+    weight = 1.0 / variance
+    mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
+    log = -0.5 * np.sum(np.log(variance) + weight * (centre[:, None] - mean) ** 2, axis=0)
+    log += -0.5 * np.log(weight.sum(axis=0)) - 0.5 * (np.log(grid / prior.median) / prior.log_sd) ** 2
+    density = np.exp(log - log.max())  # even steps in ln tau, in which the prior is normal
+    return np.asarray(density / density.sum())
+
+
+def _draw_between(
+    centre: FloatArray, noise: FloatArray, prior: BetweenMaps, *, number: int, rng: np.random.Generator
+) -> FloatArray:
+    return np.asarray(rng.choice(_grid(prior), size=number, p=_between_density(centre, noise, prior)))
+
+
+def _known_body(calibration: LogQuadratic, known: Mapping[str, float], terms: FloatArray) -> tuple[FloatArray, float]:
+    """Mean of B given what is known of the body, and the share of its standard deviation that is left."""
+    if not known:
+        return np.zeros(terms.shape[:-1]), 1.0
+    hidden = calibration.hidden
+    names = () if hidden is None else hidden.names
+    for name in known:
+        if name not in names:
+            raise UsageError(
+                f"the calibration knows nothing of {name}; it knows {', '.join(names) or 'nothing of a body'}"
+            )
+    assert hidden is not None
+    return hidden.expected_body(known, terms), float(np.sqrt(1.0 - hidden.share(*known)))
+
+
+def _elongation(maps: Sequence[ShapeDraws], calibration: LogQuadratic, prior: ShapePrior) -> tuple[Elongation, float]:
+    """Posterior of the lump's shape in the axes the maps share, and the slope that leads from map to lump."""
+    excess, covariance, slope = np.zeros(2), np.zeros((2, 2)), 0.0
+    k = len(maps)
+    for m in maps:
+        beyond = m.q - calibration.round_excess(m.log_amplitude, m.log_width)
+        both = np.stack([beyond, m.r], axis=-1)
+        both = turned(both[np.isfinite(both).all(axis=1)], -m.turn_rad)
+        excess += both.mean(axis=0) / k
+        covariance += np.cov(both.T) / k**2
+        slope += float(np.nanmean(calibration.width_slope(m.log_amplitude, m.log_width))) / k
+    balls = calibration.round_lumps
+    covariance += (balls.body_sd**2 + balls.exam_sd**2 / k + 1e-12) * np.eye(2)
+    return elongation(excess, covariance, slope=slope, prior=prior), slope
+
+
+def _shares(parts: dict[str, float]) -> dict[str, float]:
+    total = float(sum(parts.values()))
+    return {name: float(100.0 * value / total) if total > 0 else 0.0 for name, value in parts.items()}

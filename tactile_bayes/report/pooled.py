@@ -1,0 +1,105 @@
+"""The size of a mass from several maps, as plain data and as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.pooling import PooledEstimate
+from tactile_bayes.posterior.quantity import summarise
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.quadratic_text import unknowns_text
+from tactile_bayes.report.size_text import shape_text, variance_text
+
+SCHEMA = "tactile-bayes/pooled/1"
+
+
+def pooled_document(
+    pooled: PooledEstimate,
+    names: Sequence[str],
+    documents: Sequence[Mapping[str, Any]],
+    calibration: LogQuadratic,
+    *,
+    probability: float,
+    provenance: Provenance,
+) -> dict[str, Any]:
+    """The JSON object of a mass, see data_schema/pooled.schema.json.
+
+    Parameters
+    ----------
+    names, documents
+        Of the maps, with what `estimate` says of each.
+    """
+    size = pooled.size
+    sizes: dict[str, Any] = {"max_size_mm": None, "min_size_mm": None}
+    if size is not None:
+        draws = {"max_size_mm": size.max_size_mm, "min_size_mm": size.min_size_mm}
+        sizes = {
+            name: summarise(values, probability=probability, effective_draws=values.size).as_dict()
+            for name, values in draws.items()
+        }
+    return {
+        "schema": SCHEMA,
+        "status": pooled.status,
+        "reason": pooled.reason,
+        **sizes,
+        "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
+        "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
+        "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
+        "unknowns": {name: _round(share) for name, share in calibration.unknowns.items()},
+        "outside_calibration": list(pooled.outside),
+        "research_use": RESEARCH_USE,
+        "provenance": provenance.as_dict(),
+    }
+
+
+def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstimate) -> dict[str, Any]:
+    return {
+        "map": name,
+        "status": document["status"],
+        "reason": document["reason"],
+        "detected_probability": document["detected_probability"],
+        "log_size": _round(pooled.centres[index]) if index in pooled.centres else None,
+        "outlying": index in pooled.outlying,
+    }
+
+
+def pooled_text(document: Mapping[str, Any]) -> str:
+    """The report of a mass for people."""
+    lines = [_map_line(one) for one in document["maps"]]
+    if document["status"] == "no_estimate":
+        return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
+    largest = document["max_size_mm"]
+    lines += ["", f"{'':28}{'median':>9}   {100 * largest['probability']:g} % interval (equal-tailed)"]
+    for name, label in (("max_size_mm", "largest size"), ("min_size_mm", "smallest size")):
+        q = document[name]
+        lines.append(f"{label:28}{q['median']:>9.1f}   {q['low']:.1f} to {q['high']:.1f} mm")
+    figures = document["figures"]
+    lines += ["", variance_text(document["variance_share"])]
+    lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} % (median).")
+    lines.append(shape_text(figures))
+    lines.append(_unknowns(document["unknowns"]))
+    lines += [f"Outside the calibration's range: {text}." for text in document["outside_calibration"]]
+    if document["reason"]:
+        lines.append(f"{document['reason']}.")
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _map_line(one: Mapping[str, Any]) -> str:
+    if one["log_size"] is None:
+        return f"{one['map']}: no estimate ({one['reason']})"
+    apart = "  lies apart from the others: look at this map" if one["outlying"] else ""
+    return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{apart}"
+
+
+def _unknowns(shares: Mapping[str, float]) -> str:
+    text = unknowns_text(shares)
+    return text[0].upper() + text[1:] + "."
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.9g}")

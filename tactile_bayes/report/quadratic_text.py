@@ -1,0 +1,53 @@
+"""A log-quadratic size calibration as text for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from tactile_bayes.posterior.log_quadratic import QUADRATIC, LogQuadratic
+from tactile_bayes.presets import RESEARCH_USE
+
+UNKNOWN_NAMES = {
+    "depth_mm": "the depth",
+    "stiffness_ratio": "the lump's stiffness",
+    "seat": "the seat",
+    "fat_kpa": "the modulus of fat",
+    "gland_ratio": "that of gland",
+    "thickness_mm": "the thickness",
+}
+
+
+def log_quadratic_text(calibration: LogQuadratic) -> str:
+    """Coefficients, spreads, what the unknowns cost, and the errors on masses left out."""
+    fit, (alpha, p) = calibration.fit, calibration.centre
+    sd = np.sqrt(np.diag(calibration.covariance))
+    terms = ("", "u", "v", "u^2", "u v", "v^2")
+    lines = [
+        f"ln d in mm, posterior mean +- SD, with u = ln a {-alpha:+.3f}, v = ln sigma {-p:+.3f} (geometric mean width)",
+        *(f"{term or 'constant':>10} {calibration.mean[i]:8.3f} +- {sd[i]:.3f}" for i, term in enumerate(terms)),
+        f"between bodies, SD of ln d {np.exp(calibration.mean[6]):.3f} (times e^({calibration.mean[7]:+.2f} u)), "
+        f"between exams of a body {np.exp(calibration.mean[8]):.3f}",
+        unknowns_text(calibration.unknowns),
+        f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; each body left out in turn: "
+        f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
+        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %",
+    ]
+    for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
+        low, high = calibration.domain[name]
+        lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
+    recipe = calibration.recipe
+    lines.append(
+        f"recipe: normalise {recipe.normalise}, background {recipe.background}, "
+        f"fit radius {recipe.radius_mm:g} mm, noise {recipe.noise}"
+    )
+    assert len(terms) == len(QUADRATIC)
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def unknowns_text(unknowns: Mapping[str, float]) -> str:
+    """What of the spread between bodies would go if an unknown were known, largest first."""
+    ranked = sorted(unknowns.items(), key=lambda pair: -pair[1])
+    parts = [f"{UNKNOWN_NAMES.get(name, name)} {100 * share:.0f} %" for name, share in ranked if share >= 0.005]
+    return "of the variance between bodies, knowing this alone would take away: " + (", ".join(parts) or "nothing")

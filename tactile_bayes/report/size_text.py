@@ -1,0 +1,30 @@
+"""Sentences about a size that reports of one map and of several share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+SOURCES = {
+    "map": "the map",
+    "between_maps": "spread between maps of a mass",
+    "calibration": "the calibration's coefficients",
+    "residual": "the scatter about Eq 6",
+    "body": "what no map shows of a body",
+    "shape": "round or oval",
+}
+
+
+def variance_text(share: Mapping[str, float]) -> str:
+    """Where the variance of the largest size comes from."""
+    parts = [f"{value:.0f} % {SOURCES.get(name, name)}" for name, value in share.items() if value >= 0.5]
+    return f"Variance of the largest size: {', '.join(parts)}."
+
+
+def shape_text(figures: Mapping[str, float]) -> str:
+    """Whether an oval lump was called for, and what it would make of the largest size."""
+    probability = figures["oval_probability"]
+    longer = 100 * math.expm1(figures["oval_half_log_ratio"])
+    if probability < 0.5:
+        return f"Taken as round; an oval lump (probability {probability:.2f}) would be {longer:.0f} % longer."
+    return f"An oval lump (probability {probability:.2f}): {longer:.0f} % longer than a round one of its mean size."
