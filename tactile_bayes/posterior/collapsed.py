@@ -236,6 +236,12 @@ class CollapsedTarget:
         prior = -np.log(2.0 * np.pi * (self.prior.tilt_sd * self.amplitude_scale) ** 2)
         return float(prior - np.logaddexp.reduce(weight + at_zero))
 
+    def amplitude_at(self, theta: FloatArray) -> float:
+        """Mean amplitude of the bump at one shape."""
+        evidence, solution = self._solve(theta[None])
+        weight = np.exp(evidence[0] - np.logaddexp.reduce(evidence[0]))
+        return float(weight @ solution.amplitude[0, :, 0])
+
     def gains(self, templates: Profiles, theta: FloatArray) -> FloatArray:
         """(m,) log evidence of the scene at `theta` with each template added, over that without; -inf for a dent.
 

@@ -17,6 +17,7 @@ from tactile_bayes.posterior.field_posterior import FieldFit, draw_field, field_
 from tactile_bayes.posterior.fit import BumpFit
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.scene_choice import SceneChoice, add_beside, choose_shape
+from tactile_bayes.posterior.surroundings import Surroundings
 
 Progress = Callable[[int, int], None]
 
@@ -97,7 +98,7 @@ def draw(
     progress: Progress | None = None,
 ) -> FieldAnswer:
     """The same with a second structure where the map asks for one, and draws."""
-    choice = add_beside(answer.choice, scene=scene)
+    choice = add_beside(answer.choice, Surroundings.of(tactile_map), scene=scene)
     draws = draw_field(choice.fit, method, rng=rng, accuracy_sd=accuracy_sd, max_steps=max_steps, progress=progress)
     detection = answer.detection
     if choice.fit is choice.plain and "log_evidence" in draws.diagnostics:

@@ -145,29 +145,38 @@ def fit_scene(
 
 
 def gaussian_mixture(target: CollapsedTarget, mode: FloatArray, covariance: FloatArray) -> Mixture:
-    """One Gaussian a field, each by one Newton step from the common mode; the one common Gaussian if that fails.
+    """One Gaussian a field about a common mode; the one common Gaussian where a field has none of its own.
 
     The common curvature is sharper than the mixture is wide where fields with modes of their own share the evidence.
     """
+    found = newton_mixture(target, mode, covariance)
+    if found is not None:
+        return found
+    volume = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+    return Mixture(np.ones(1), mode[None], covariance[None], float(target(mode[None])[0]) + volume)
+
+
+def newton_mixture(target: CollapsedTarget, start: FloatArray, covariance: FloatArray) -> Mixture | None:
+    """One Gaussian a field, each by one Newton step from a common start; None where one of them is no maximum."""
     scale = np.sqrt(np.diag(covariance))
-    points = stencil(mode, step=0.3 * scale)
+    points = stencil(start, step=0.3 * scale)
     by_field = target.by_field(points) + target.log_prior(points)[:, None]
     whole = float(np.logaddexp.reduce(by_field[0]))
-    if not np.isfinite(whole):
-        return _common(mode, covariance, whole)
-    share = np.exp(by_field[0] - whole)
+    share = np.exp(by_field[0] - whole) if np.isfinite(whole) else np.zeros(by_field.shape[1])
     means, covariances, masses = [], [], []
     for h in np.flatnonzero(share > LEAST_SHARE):
         if not np.isfinite(by_field[:, h]).all():
-            return _common(mode, covariance, whole)
+            return None
         gradient, hessian = finite_differences(by_field[:, h], step=0.3 * scale)
         found = _newton_gaussian(gradient, hessian, scale, limit=covariance)
         if found is None:
-            return _common(mode, covariance, whole)
+            return None
         step, one, gained = found
-        means.append(mode + step)
+        means.append(start + step)
         covariances.append(one)
         masses.append(by_field[0, h] + gained + 0.5 * float(np.linalg.slogdet(2.0 * np.pi * one)[1]))
+    if not masses:
+        return None
     mass = np.array(masses)
     total = float(np.logaddexp.reduce(mass))
     left_out = float(np.log(share[share > LEAST_SHARE].sum()))
@@ -186,11 +195,6 @@ def _newton_gaussian(
     if np.sqrt(step @ np.linalg.solve(limit, step)) > 3.0:
         return None
     return step, covariance, 0.5 * float(gradient @ step)
-
-
-def _common(mode: FloatArray, covariance: FloatArray, log_density: float) -> Mixture:
-    volume = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
-    return Mixture(np.ones(1), mode[None], covariance[None], log_density + volume)
 
 
 def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDEPENDENT_DRAWS) -> ParameterDraws:

@@ -77,7 +77,7 @@ class FieldColumns:
         weighted = low * weight[:, None, :]
         gram = plain_gram - weighted @ low.T
         c = len(plain_gram) - 1
-        inverse = np.linalg.inv(gram[:, :c, :c])
+        inverse: FloatArray = np.asarray(np.linalg.inv(gram[:, :c, :c]), dtype=np.float64)
         volume: FloatArray = np.asarray(np.linalg.slogdet(gram[:, :c, :c])[1], dtype=np.float64)
         plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
         log_det = field.log_determinant(shares) + volume

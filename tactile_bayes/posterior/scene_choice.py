@@ -10,14 +10,20 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.collapsed import BLOCK
-from tactile_bayes.posterior.field_posterior import FieldFit, Mixture, fit_scene, gaussian_mixture
-from tactile_bayes.posterior.scene import APART, REACH_IN_RADII, Extra, Scene, Shape
+from tactile_bayes.posterior.field_posterior import FieldFit, Mixture, fit_scene, newton_mixture
+from tactile_bayes.posterior.scene import APART, REACH_IN_RADII, BoolArray, Extra, Scene, Shape
+from tactile_bayes.posterior.surroundings import Surroundings
 from tactile_bayes.posterior.window import Profiles, Window
 
 LEAST_ODDS = 3.0
 """A structure is used when the map favours the scene with it by this factor."""
 SECOND_ODDS = 10.0
 """For a second lump or a rib: a bump that is not quite a Gaussian must not bring one."""
+LEAST_RISE = 0.05
+"""Of the bump's amplitude: beside 15 single simulated lumps the most was 0.01, beside a second one 0.08 and more."""
+MOST_LOOKED_AT = 48
+LONG = 1.5
+"""A bump with a larger axis ratio is also tried as two round lumps side by side."""
 GRID_MM = 4.0
 GRID_WIDTHS_MM = (3.0, 5.0, 8.0)
 GRID_ANGLES = 12
@@ -116,13 +122,16 @@ def choose_shape(
     return SceneChoice(chosen, chosen, _supported_shape(chosen, found), (*found, _tilt_question(fitter, chosen)))
 
 
-def add_beside(choice: SceneChoice, *, scene: str = "auto") -> SceneChoice:
-    """Ask for a second lump or a rib beside the bump; the draws have it where the map asks for it, or `scene` does."""
+def add_beside(choice: SceneChoice, surroundings: Surroundings, *, scene: str = "auto") -> SceneChoice:
+    """Ask for a second lump or a rib beside the bump; the draws have it where the map asks for it, or `scene` does.
+
+    It must stand out on the map by `LEAST_RISE` of the bump's amplitude, see `Surroundings.rise`.
+    """
     if scene not in ASKING:
         return choice
     target = choice.plain.target
     fitter = _Fitter(target.window, target.prior, target.radius_mm, target.amplitude_scale)
-    fit, beside = _beside_questions(fitter, choice.plain, scene)
+    fit, beside = _beside_questions(fitter, choice.plain, surroundings, scene)
     return replace(choice, fit=fit, structures=(*choice.structures, *beside))
 
 
@@ -143,8 +152,8 @@ class _Fitter:
             amplitude_scale=self.amplitude_scale,
         )
 
-    def near(self, fit: FieldFit, scene: Scene) -> Mixture:
-        """Another scene's Gaussians by one step from a fit's mode: enough where they lie close together."""
+    def near(self, fit: FieldFit, scene: Scene) -> Mixture | None:
+        """Another scene's Gaussians by one step from a fit's mode; None where they do not lie close together."""
         target = fit.target.of_scene(scene)
         start = fit.scene.carried(fit.mode, scene)
         target.settle_fields(start)
@@ -152,7 +161,7 @@ class _Fitter:
         shared = [name for name in scene.names if name in fit.scene.names]
         here, there = ([s.names.index(n) for n in shared] for s in (fit.scene, scene))
         scale[np.ix_(there, there)] = fit.covariance[np.ix_(here, here)]
-        return gaussian_mixture(target, start, scale)
+        return newton_mixture(target, start, scale)
 
 
 def _supported_shape(chosen: FieldFit, found: list[Structure]) -> str:
@@ -180,15 +189,17 @@ def _rotation_question(
     scene = replace(straight.scene, shape="rotated")
     mixture = fitter.near(straight, scene)
     axis = np.eye(5)[4]
-    log_odds = savage_dickey(mixture, axis, prior_sd=fitter.prior.log_ratio_sd)
+    log_odds = np.inf if mixture is None else savage_dickey(mixture, axis, prior_sd=fitter.prior.log_ratio_sd)
     turned = None
-    if log_odds > -1.5 or len(mixture.weight) == 0:
+    if log_odds > -1.5:
         begin = straight.scene.carried(straight.mode, scene)
-        begin[4] = start[4] if start[4] else mixture.moments()[0][4]
+        begin[4] = start[4] if mixture is None else mixture.moments()[0][4]
         turned = _fit_or_none(fitter, scene, begin)
         if turned is not None:
             mixture = turned.mixture
             log_odds = savage_dickey(mixture, axis, prior_sd=fitter.prior.log_ratio_sd)
+    if mixture is None:
+        return straight, Structure("rotated", 0.0, False, False)
     used = turned is not None and log_odds > np.log(least_odds)
     x, y = _change(straight, mixture.moments()[0])
     if used and turned is not None:
@@ -199,15 +210,19 @@ def _rotation_question(
 def _tilt_question(fitter: _Fitter, fit: FieldFit) -> Structure:
     log_odds = fit.target.tilt_log_odds(fit.mode)
     level_only = fitter.near(fit, replace(fit.scene, tilt=False))
-    x, y = _change(fit, level_only.moments()[0])
+    x, y = (None, None) if level_only is None else _change(fit, level_only.moments()[0])
     return Structure("tilt", _odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), True, False, x, y)
 
 
-def _beside_questions(fitter: _Fitter, plain: FieldFit, scene: str) -> tuple[FieldFit, list[Structure]]:
+def _beside_questions(
+    fitter: _Fitter, plain: FieldFit, surroundings: Surroundings, scene: str
+) -> tuple[FieldFit, list[Structure]]:
     """A second lump and a rib, each against the scene without; the likelier of those that the map asks for."""
     wanted: dict[str, Extra] = {"second-lump": "second lump", "rib": "rib"}
     extras: tuple[Extra, ...] = ("second lump", "rib")
-    fits = {extra: _fit_beside(fitter, plain, extra, forced=wanted.get(scene) == extra) for extra in extras}
+    fits = {
+        extra: _fit_beside(fitter, plain, surroundings, extra, forced=wanted.get(scene) == extra) for extra in extras
+    }
     asked = [extra for extra, (fit, log_odds, _) in fits.items() if fit is not None and log_odds > np.log(SECOND_ODDS)]
     likeliest: Extra = max(asked, key=lambda extra: fits[extra][1]) if asked else ""
     used = wanted.get(scene, likeliest)
@@ -225,20 +240,67 @@ def _beside_questions(fitter: _Fitter, plain: FieldFit, scene: str) -> tuple[Fie
     return chosen, answers
 
 
-def _fit_beside(fitter: _Fitter, plain: FieldFit, extra: Extra, *, forced: bool) -> tuple[FieldFit | None, float, bool]:
+def _fit_beside(
+    fitter: _Fitter, plain: FieldFit, surroundings: Surroundings, extra: Extra, *, forced: bool
+) -> tuple[FieldFit | None, float, bool]:
     """The fit with a second structure, its log odds, and whether these are only a bound (then there is no fit)."""
+    scene = replace(plain.scene, extra=extra)
+    starts, bound = _starts(fitter, plain, surroundings, extra)
+    if not starts or (bound < np.log(LEAST_ODDS) and not forced):
+        return None, min(bound, 0.0), True
+    fits = [fit for start in starts if (fit := _fit_or_none(fitter, scene, start)) is not None]
+    standing = [fit for fit in fits if _rises(fit, surroundings, extra, fit.mode[None, -3:])[0]]
+    if not standing:
+        return None, -np.inf, True
+    best = max(standing, key=lambda fit: fit.log_evidence)
+    return best, best.log_evidence - plain.log_evidence, False
+
+
+def _starts(
+    fitter: _Fitter, plain: FieldFit, surroundings: Surroundings, extra: Extra
+) -> tuple[list[FloatArray], float]:
+    """Where to look for the mode with a second structure, and a bound on the log evidence gained there."""
     grid = second_lumps(plain, fitter) if extra == "second lump" else ribs(fitter)
     gains = _gains(plain, grid, extra)
-    best = int(np.argmax(gains))
-    bound = float(gains[best])
-    if not np.isfinite(bound) or (bound < np.log(LEAST_ODDS) and not forced):
-        return None, min(bound, 0.0) if np.isfinite(bound) else -np.inf, True
-    scene = replace(plain.scene, extra=extra)
-    start = np.concatenate([plain.mode, grid[best]])
-    fit = _fit_or_none(fitter, scene, start)
-    if fit is None:
-        return None, -np.inf, False
-    return fit, fit.log_evidence - plain.log_evidence, False
+    order = np.argsort(-gains)[:MOST_LOOKED_AT]
+    rising = order[_rises(plain, surroundings, extra, grid[order])]
+    starts = [np.concatenate([plain.mode, grid[i]]) for i in rising[:1]]
+    bound = float(gains[rising[0]]) if len(rising) else -np.inf
+    if extra == "second lump" and (halves := _split(plain)) is not None:
+        # two lumps that one long bump was laid over: no template beside that bump would find them
+        return [*starts, halves], np.inf
+    return starts, bound
+
+
+def _split(plain: FieldFit) -> FloatArray | None:
+    """Two round lumps in the place of one long one; None where it is not long."""
+    scene, mode = plain.scene, plain.mode
+    p, q, r = (float(v) for v in scene.widths(mode))
+    ratio = float(np.hypot(q, r))
+    if ratio < np.log(LONG) / 2.0 or scene.shape == "round":
+        return None
+    along = 0.5 * np.arctan2(r, q)
+    step = 0.9 * np.exp(p + ratio) * np.array([np.cos(along), np.sin(along)])
+    halves = dict(zip(scene.names, mode, strict=True))
+    halves |= {"u": p - ratio, "v": p - ratio, "r": 0.0}
+    halves |= {"x": halves["x"] - step[0], "y": halves["y"] - step[1]}
+    beside = [halves["x"] + 2.0 * step[0], halves["y"] + 2.0 * step[1], p - ratio]
+    return np.array([*(halves[name] for name in scene.names), *beside])
+
+
+def _rises(fit: FieldFit, surroundings: Surroundings, extra: Extra, places: FloatArray) -> BoolArray:
+    """(g,) whether the map rises there by a share of the bump's amplitude."""
+    scene, target = fit.scene, fit.target
+    amplitude = target.amplitude_at(fit.mode)
+    rise = surroundings.rise(
+        extra,
+        places,
+        bump_mm=(float(scene.column(fit.mode, "x")), float(scene.column(fit.mode, "y"))),
+        bump_width_mm=float(np.exp(scene.widths(fit.mode)[0])),
+        amplitude=amplitude,
+        middle=target.window.middle,
+    )
+    return np.asarray(rise > LEAST_RISE * amplitude)
 
 
 def _fit_or_none(fitter: _Fitter, scene: Scene, start: FloatArray) -> FieldFit | None:
@@ -258,7 +320,7 @@ def second_lumps(plain: FieldFit, fitter: _Fitter) -> FloatArray:
     centre = [float(plain.scene.column(plain.mode, name)) for name in "xy"]
     apart = np.hypot(x + middle[0] - centre[0], y + middle[1] - centre[1]) > (APART + 0.5) * np.exp(np.maximum(p, w))
     keep = apart & (np.hypot(x, y) < reach)
-    return np.stack([x + middle[0], y + middle[1], w], axis=1)[keep]
+    return np.asarray(np.stack([x + middle[0], y + middle[1], w], axis=1)[keep])
 
 
 def ribs(fitter: _Fitter) -> FloatArray:
