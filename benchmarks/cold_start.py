@@ -71,6 +71,7 @@ CASES: tuple[Case, ...] = (
 MEASURED_ELSEWHERE = {
     "study": "benchmarks.forward: minutes of work",
     "tables": "benchmarks.forward: minutes of work",
+    "tradeoff": "it measures itself: a minute of work",
     "record": "benchmarks.record: runs until it is stopped",
     "repair": "benchmarks.record: needs a recording that was cut off",
     "replay": "benchmarks.record: runs in real time",
