@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: bench-record demo test check slow bench bench-map bench-trial docs clean
+.PHONY: bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -36,6 +36,10 @@ bench-map: $(VENV)/.installed
 
 bench-record: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.record throughput
+
+bench-forward: $(VENV)/.installed
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.forward
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.solid
 
 bench-trial: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check statsmodels pingouin
