@@ -1,11 +1,13 @@
 r"""Learn the log-quadratic calibration from maps of a population of bodies, each examined one or more times.
 
-For map i of body j, with what the map itself leaves open (:math:`m_{ij}`, from its posterior) known,
+For the means over the exams of body j, with what the maps themselves leave open (m, from their posteriors) known,
 
-.. math:: \ln d_j = x_{ij}^T\beta + B_j + E_{ij}, \quad B_j \sim N(0, s_j^2),\; E_{ij} \sim N(0, t^2 + m_{ij}).
+.. math:: \ln d_j = \bar x_j^T\beta + B_j + \bar E_j, \quad B_j \sim N(0, s_j^2),\;
+          \bar E_j \sim N(0, (t^2 + \bar m_j) / n_j).
 
-So the coefficients, the spread between bodies and the spread between exams are told apart, and a patient's map adds
-its own :math:`m` and nothing twice.
+t comes from how the exams of one body differ in :math:`x^T\beta`. That difference says nothing of beta: a body has one
+diameter, so within it a regression of d on the map has slope 0 (errors in variables). Coefficients, spread between
+bodies and spread between exams are so told apart, and a patient's map adds its own m and nothing twice.
 """
 
 from __future__ import annotations
@@ -85,8 +87,12 @@ def learn_log_quadratic(table: PopulationTable, *, recipe: Recipe, source: str =
     centre = (round(float(table.log_amplitude.mean()), 3), round(float(table.log_width.mean()), 3))
     data = _Regression.of(table, centre)
     start = np.concatenate([data.least_squares(), _PRIOR[:, 0]])
-    scale = np.concatenate([np.full(6, 0.02), [0.1, 0.05, 0.2]])
-    mode, covariance, _ = mode_and_covariance(data.log_density, start, scale=scale)
+    scale = np.concatenate([np.full(6, 0.02), [0.1, 0.05]])
+    mode, covariance, _ = mode_and_covariance(data.log_density, start[:-1], scale=scale)
+    log_exam_sd, its_variance = data.log_exam_sd(mode)
+    mode = np.append(mode, log_exam_sd)
+    covariance = np.pad(covariance, (0, 1))
+    covariance[-1, -1] = its_variance
     inverse = np.asarray(np.linalg.inv(data.terms.T @ data.terms), dtype=np.float64)
     leverage = np.einsum("ni,ij,nj->n", data.terms, inverse, data.terms)
     return LogQuadratic(
@@ -106,55 +112,68 @@ def learn_log_quadratic(table: PopulationTable, *, recipe: Recipe, source: str =
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Regression:
-    """The table as the likelihood needs it."""
+    """The table as the likelihood needs it: rows for maps, and their means over the exams of each body."""
 
     terms: FloatArray
     log_d: FloatArray
-    u: FloatArray
     map_variance: FloatArray
     group: np.ndarray[tuple[int], np.dtype[np.intp]]
-    groups: int
+    exams: FloatArray
+    mean_terms: FloatArray
+    mean_log_d: FloatArray
 
     @classmethod
     def of(cls, table: PopulationTable, centre: tuple[float, float]) -> _Regression:
         u, v = table.log_amplitude - centre[0], table.log_width - centre[1]
-        names, group = np.unique(table.body, return_inverse=True)
         terms, log_d = quadratic_terms(u, v), np.log(table.d_mm)
-        plain = cls(terms, log_d, u, np.zeros(len(u)), np.asarray(group), len(names))
-        b = plain.least_squares()
+        group = np.asarray(np.unique(table.body, return_inverse=True)[1])
+        exams = np.bincount(group).astype(np.float64)
+        mean_terms = np.stack([np.bincount(group, column) / exams for column in terms.T], axis=1)
+        b = np.linalg.lstsq(mean_terms, np.bincount(group, log_d) / exams, rcond=None)[0]
         slope = np.stack([b[1] + 2 * b[3] * u + b[4] * v, b[2] + b[4] * u + 2 * b[5] * v], axis=-1)
         variance = np.einsum("ni,nij,nj->n", slope, table.covariance[:, :2, :2], slope)
-        return cls(terms, log_d, u, variance, np.asarray(group), len(names))
+        return cls(terms, log_d, variance, group, exams, mean_terms, np.bincount(group, log_d) / exams)
+
+    @property
+    def groups(self) -> int:
+        """Number of bodies."""
+        return len(self.exams)
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """(groups,) means of (n,) values over the exams of each body."""
+        return np.asarray(np.bincount(self.group, values) / self.exams)
 
     def least_squares(self) -> FloatArray:
-        """(6,) coefficients by ordinary least squares."""
-        return np.asarray(np.linalg.lstsq(self.terms, self.log_d, rcond=None)[0])
+        """(6,) coefficients by ordinary least squares of the bodies' means."""
+        return np.asarray(np.linalg.lstsq(self.mean_terms, self.mean_log_d, rcond=None)[0])
 
-    def sums(self, values: FloatArray) -> FloatArray:
-        """(m, groups) sums of (m, n) values over the exams of each body."""
-        out = np.zeros((len(values), self.groups))
-        np.add.at(out.T, self.group, values.T)
-        return out
+    def log_exam_sd(self, coefficients: FloatArray) -> tuple[float, float]:
+        """ln t and its variance: how sizes by the quadratic differ within a body beyond their maps' own noise.
+
+        Without bodies examined twice, the prior.
+        """
+        freedom = len(self.group) - self.groups
+        if freedom < 1:
+            return float(_PRIOR[2, 0]), float(_PRIOR[2, 1] ** 2)
+        size = self.terms @ coefficients[:6]
+        within = float(np.sum((size - self.mean(size)[self.group]) ** 2) / freedom)
+        repeated = self.exams[self.group] > 1
+        beyond = max(within - float(self.map_variance[repeated].mean()), (0.1 * np.exp(_PRIOR[2, 0])) ** 2)
+        return float(0.5 * np.log(beyond)), float(0.5 * (within / beyond) ** 2 / freedom)
 
     def log_density(self, theta: FloatArray) -> FloatArray:
-        """(m,) log posterior of (m, 9) `PARAMETERS`."""
-        residual = self.log_d - theta[:, :6] @ self.terms.T
-        exam = np.exp(2 * theta[:, 8:9]) + self.map_variance
-        weight = 1.0 / exam
-        s0, s1 = self.sums(weight), self.sums(weight * residual)
-        exams = np.bincount(self.group, minlength=self.groups)
-        mean_u = np.bincount(self.group, self.u, minlength=self.groups) / exams
-        body = np.exp(2 * (theta[:, 6:7] + theta[:, 7:8] * mean_u))
-        total = -0.5 * np.sum(np.log(exam) + weight * residual**2, axis=1)
-        total += -0.5 * np.sum(np.log1p(body * s0) - body * s1**2 / (1.0 + body * s0), axis=1)
-        prior = -0.5 * np.sum(((theta[:, 6:] - _PRIOR[:, 0]) / _PRIOR[:, 1]) ** 2, axis=1)
+        """(m,) log posterior of (m, 8) `PARAMETERS` but the last."""
+        exam = np.exp(2 * self.log_exam_sd(self.least_squares())[0])
+        residual = self.mean_log_d - theta[:, :6] @ self.mean_terms.T
+        variance = np.exp(2 * (theta[:, 6:7] + theta[:, 7:8] * self.mean_terms[:, 1]))
+        variance = variance + (exam + self.mean(self.map_variance)) / self.exams
+        total = -0.5 * np.sum(np.log(variance) + residual**2 / variance, axis=1)
+        prior = -0.5 * np.sum(((theta[:, 6:8] - _PRIOR[:2, 0]) / _PRIOR[:2, 1]) ** 2, axis=1)
         return np.asarray(total + prior)
 
     def body_residuals(self, mode: FloatArray) -> FloatArray:
-        """(groups,) mean residual of each body, its exams weighed by what they tell."""
-        weight = 1.0 / (np.exp(2 * mode[8]) + self.map_variance)
-        residual = self.log_d - self.terms @ mode[:6]
-        return np.asarray(self.sums((weight * residual)[None])[0] / self.sums(weight[None])[0])
+        """(groups,) residual of each body's mean."""
+        return np.asarray(self.mean_log_d - self.mean_terms @ mode[:6])
 
 
 def _check(table: PopulationTable) -> None:
@@ -174,12 +193,11 @@ def _round_lumps(table: PopulationTable, data: _Regression) -> RoundLumps:
     design = data.terms[:, :3]
     coefficients = np.linalg.lstsq(design, table.half_log_ratio, rcond=None)[0]
     excess = table.half_log_ratio - design @ coefficients
-    exams = np.bincount(data.group, minlength=data.groups)
-    mean = np.bincount(data.group, excess, minlength=data.groups) / exams
+    mean = data.mean(excess)
     freedom = len(excess) - data.groups
     map_variance = float(np.median(table.covariance[:, 2, 2]))
     within = float(np.sum((excess - mean[data.group]) ** 2) / freedom) if freedom > 0 else map_variance
-    between = float(np.var(mean) - within / exams.mean())
+    between = float(np.var(mean) - within * np.mean(1.0 / data.exams))
     return RoundLumps(
         np.asarray(coefficients), float(np.sqrt(max(between, 0.0))), float(np.sqrt(max(within - map_variance, 0.0)))
     )
@@ -189,13 +207,8 @@ def _hidden(table: PopulationTable, data: _Regression, mode: FloatArray) -> Hidd
     """Joint second moments of B and of what was varied, each about what the map leads one to expect of it."""
     if not table.unknowns:
         return None
-    exams = np.bincount(data.group, minlength=data.groups)
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(data.group, values, minlength=data.groups) / exams)
-
-    design = np.stack([mean(column) for column in data.terms.T], axis=1)
-    varied = np.stack([mean(values) for values in table.unknowns.values()], axis=1)
+    design = data.mean_terms
+    varied = np.stack([data.mean(values) for values in table.unknowns.values()], axis=1)
     both = np.concatenate([varied, data.body_residuals(mode)[:, None]], axis=1)
     coefficients = np.linalg.lstsq(design, both, rcond=None)[0]
     rest = both - design @ coefficients
@@ -211,29 +224,23 @@ def _hidden(table: PopulationTable, data: _Regression, mode: FloatArray) -> Hidd
 
 def _figures(table: PopulationTable, data: _Regression, mode: FloatArray) -> dict[str, float]:
     """Rows, spreads, and the errors of masses when each body is left out of the fit in turn."""
-    error = left_out_errors(table, data.terms, data.group)
-    per_body = np.array([error[data.group == g].mean() for g in range(data.groups)])
+    error = left_out_errors(data.mean_terms, data.mean_log_d)
     return {
         "maps": float(len(table)),
         "bodies": float(data.groups),
         "body_sd": float(np.exp(mode[6])),
         "exam_sd": float(np.exp(mode[8])),
-        "left_out_sd": float(per_body.std()),
-        "left_out_mae_percent": float(100 * np.mean(np.abs(np.expm1(per_body)))),
-        "left_out_bias_percent": float(100 * np.mean(np.expm1(per_body))),
+        "left_out_sd": float(error.std()),
+        "left_out_mae_percent": float(100 * np.mean(np.abs(np.expm1(error)))),
+        "left_out_bias_percent": float(100 * np.mean(np.expm1(error))),
     }
 
 
-def left_out_errors(
-    table: PopulationTable, terms: FloatArray, group: np.ndarray[tuple[int], np.dtype[np.intp]]
-) -> FloatArray:
-    """(n,) ln(predicted / true size) when the map's own body is left out of a least-squares fit of `terms`."""
-    log_d, error = np.log(table.d_mm), np.empty(len(table))
-    for g in range(int(group.max()) + 1):
-        out = group == g
-        coefficients = np.linalg.lstsq(terms[~out], log_d[~out], rcond=None)[0]
-        error[out] = terms[out] @ coefficients - log_d[out]
-    return error
+def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
+    """(n,) ln(predicted / true size) of each row when it is left out of the least-squares fit, in closed form."""
+    inverse = np.linalg.inv(terms.T @ terms)
+    residual = log_d - terms @ (inverse @ (terms.T @ log_d))
+    return np.asarray(-residual / (1.0 - np.einsum("ni,ij,nj->n", terms, inverse, terms)))
 
 
 def _domain(table: PopulationTable) -> dict[str, tuple[float, float]]:

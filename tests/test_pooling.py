@@ -1,0 +1,201 @@
+"""Sizes from one map or several: what is learned about their spread, what averages out and what does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.posterior.log_quadratic import HiddenTerms, LogQuadratic, RoundLumps
+from tactile_bayes.posterior.pooling import (
+    BetweenMaps,
+    ShapeDraws,
+    SizePriors,
+    outlying_maps,
+    pool_maps,
+    pooled_size,
+)
+from tactile_bayes.posterior.roundness import ShapePrior, elongation, turned
+from tactile_bayes.posterior.size_calibration import Recipe
+
+BODY_SD = 0.08
+
+
+def calibration(*, body_sd: float = BODY_SD, hidden: HiddenTerms | None = None) -> LogQuadratic:
+    """ln d = 2.5 + 0.3 u + v, with coefficients known to 1e-3."""
+    mean = np.array([2.5, 0.3, 1.0, 0.0, 0.0, 0.0, np.log(body_sd), 0.0, np.log(0.02)])
+    return LogQuadratic(
+        centre=(-1.0, 1.5),
+        mean=mean,
+        covariance=np.eye(9) * 1e-6,
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), 0.02, 0.01),
+        information_inverse=np.eye(6) * 1e-2,
+        most_leverage=1.0,
+        domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
+        recipe=Recipe("mean", "free", 20.0, False, "field"),
+        hidden=hidden,
+    )
+
+
+def shape(log_size: float, *, noise: float = 0.01, q: float = 0.05, r: float = 0.0, seed: int = 0, turn: float = 0.0):
+    """Draws of a map whose size by the calibration is as given."""
+    rng = np.random.default_rng(seed)
+    n = 2000
+    v = log_size - 2.5 + noise * rng.standard_normal(n)
+    q_draws, r_draws = (value + 0.01 * rng.standard_normal(n) for value in (q, r))
+    return ShapeDraws(np.full(n, -1.0), v + 1.5, q_draws, r_draws, turn)
+
+
+def pooled(maps, *, priors: SizePriors | None = None, use: LogQuadratic | None = None, seed: int = 3):
+    return pooled_size(
+        maps, calibration=use or calibration(), priors=priors or SizePriors(), rng=np.random.default_rng(seed),
+        number=20_000,
+    )  # fmt: skip
+
+
+KNOWN_0 = SizePriors(between_maps=BetweenMaps(0.0, 0.0))
+
+
+def test_one_map_with_nothing_between_has_the_bodys_spread_alone():
+    found = np.log(pooled([shape(2.7)], priors=KNOWN_0).max_size_mm)
+    assert found.mean() == pytest.approx(2.7, abs=0.004)
+    assert found.std() == pytest.approx(np.hypot(BODY_SD, 0.01), rel=0.03)
+
+
+def test_three_maps_average_what_differs_between_them_and_not_what_they_share():
+    priors = SizePriors(between_maps=BetweenMaps(0.12, 0.0))
+    one = np.log(pooled([shape(2.7)], priors=priors).max_size_mm).std()
+    three = np.log(pooled([shape(2.7, seed=i) for i in range(3)], priors=priors).max_size_mm).std()
+    assert one == pytest.approx(np.sqrt(BODY_SD**2 + 0.12**2 + 0.01**2), rel=0.03)
+    assert three == pytest.approx(np.sqrt(BODY_SD**2 + (0.12**2 + 0.01**2) / 3), rel=0.03)
+
+
+def test_the_spread_between_maps_is_learned_from_them():
+    prior = BetweenMaps()
+    alike = pooled([shape(2.7 + 0.005 * i, seed=i) for i in range(5)])
+    apart = pooled([shape(2.7 + 0.3 * (i - 2), seed=i) for i in range(5)])
+    alone = pooled([shape(2.7)])
+    assert alike.figures["between_map_sd"] < 0.6 * prior.median
+    assert apart.figures["between_map_sd"] > 2 * prior.median
+    assert alone.figures["between_map_sd"] == pytest.approx(prior.median, rel=0.1)
+
+
+@pytest.mark.parametrize(("tau", "maps"), [(0.05, 3), (0.15, 3), (0.3, 5)])
+def test_intervals_of_pooled_masses_cover(tau, maps):
+    """Masses drawn with a spread between maps from about the prior, and less: nominal 90 %."""
+    rng = np.random.default_rng(7)
+    inside = {"learned": 0, "left out": 0}
+    trials = 300
+    for _ in range(trials):
+        true, body = 2.7, rng.normal(0, BODY_SD)
+        centres = true - body + rng.normal(0, tau, maps)
+        draws = [shape(float(c), seed=int(rng.integers(1 << 30))) for c in centres]
+        for name, priors in (("learned", SizePriors()), ("left out", KNOWN_0)):
+            size = pooled_size(draws, calibration=calibration(), priors=priors, rng=rng, number=1500)
+            low, high = np.quantile(np.log(size.max_size_mm), [0.05, 0.95])
+            inside[name] += low <= true <= high
+    share = {name: count / trials for name, count in inside.items()}
+    assert share["learned"] > 0.86
+    # the negative control: maps taken to agree
+    assert tau < 0.1 or share["left out"] < 0.86
+
+
+def test_the_order_of_the_maps_does_not_matter():
+    maps = [shape(2.6, seed=1), shape(2.8, seed=2, noise=0.05), shape(2.75, seed=3)]
+    one, other = (np.log(pooled(order).max_size_mm) for order in (maps, maps[::-1]))
+    assert one.mean() == pytest.approx(other.mean(), abs=0.005)
+    assert one.std() == pytest.approx(other.std(), rel=0.03)
+
+
+def test_a_map_apart_is_named_and_none_where_all_agree():
+    prior = BetweenMaps()
+    noise = np.full(4, 1e-4)
+    assert outlying_maps(np.array([2.70, 2.72, 2.68, 4.0]), noise, prior) == (3,)
+    assert outlying_maps(np.array([2.70, 2.72, 2.68, 2.8]), noise, prior) == ()
+    assert outlying_maps(np.array([2.0, 3.0]), noise[:2], prior) == ()
+
+
+def test_a_round_lump_stays_round_and_its_largest_size_is_not_biased():
+    """Two axes with errors of their own would put the larger of them 0.56 standard deviations too high."""
+    found = pooled([shape(2.7, q=0.05 + 0.01)], priors=KNOWN_0)
+    assert found.figures["oval_probability"] < 0.2
+    assert np.log(np.median(found.max_size_mm)) == pytest.approx(2.7, abs=0.01)
+
+
+def test_an_oval_lump_is_found_along_either_axis_and_between_them():
+    for q, r in ((0.05 + 0.2, 0.0), (0.05 - 0.2, 0.0), (0.05, 0.2)):
+        found = pooled([shape(2.7, q=q, r=r)], priors=KNOWN_0)
+        assert found.figures["oval_probability"] > 0.95
+        ratio = np.median(found.max_size_mm / found.min_size_mm)
+        assert np.log(ratio) == pytest.approx(0.4, rel=0.12)
+    assert np.median(pooled([shape(2.7, q=0.25)]).d_x_mm) > np.median(pooled([shape(2.7, q=0.25)]).d_y_mm)
+    assert np.median(pooled([shape(2.7, q=-0.15)]).d_x_mm) < np.median(pooled([shape(2.7, q=-0.15)]).d_y_mm)
+
+
+def test_an_oval_seen_by_a_turned_head_is_one_oval():
+    """Head turned by 60 degrees between two maps: pooled in the patient's axes they agree, in their own they cancel."""
+    turn = np.radians(60.0)
+    lump = np.array([0.2, 0.0])
+    seen = turned(lump, turn)  # in the axes of a head turned by that much
+    maps = [shape(2.7, q=0.05 + 0.2, r=0.0), shape(2.7, q=0.05 + seen[0], r=seen[1], turn=turn, seed=1)]
+    assert pooled(maps, priors=KNOWN_0).figures["oval_half_log_ratio"] == pytest.approx(0.2, rel=0.1)
+    blind = [maps[0], shape(2.7, q=0.05 + seen[0], r=seen[1], seed=1)]
+    assert pooled(blind, priors=KNOWN_0).figures["oval_half_log_ratio"] < 0.14
+
+
+def test_elongation_is_the_conjugate_posterior():
+    """Against a sum over a grid of the same model."""
+    prior = ShapePrior(0.4, 0.15)
+    measured, noise = np.array([0.06, -0.03]), np.diag([0.03**2, 0.05**2])
+    found = elongation(measured, noise, slope=1.1, prior=prior)
+    e = np.linspace(-0.9, 0.9, 901)
+    x, y = np.meshgrid(e, e, indexing="ij")
+    like = np.exp(-0.5 * (((1.1 * 0.06 - x) / (1.1 * 0.03)) ** 2 + ((-1.1 * 0.03 - y) / (1.1 * 0.05)) ** 2))
+    slab = np.exp(-0.5 * (x**2 + y**2) / 0.15**2) / (2 * np.pi * 0.15**2)
+    oval = 0.4 * np.sum(like * slab) * (e[1] - e[0]) ** 2
+    round_ = 0.6 * like[450, 450]
+    assert found.probability == pytest.approx(oval / (oval + round_), rel=1e-6)
+    assert found.mean[0] == pytest.approx(np.sum(like * slab * x) / np.sum(like * slab), rel=1e-6)
+
+
+def test_what_is_known_of_the_body_is_used_and_what_the_calibration_does_not_know_is_refused():
+    hidden = HiddenTerms(
+        ("seat",), np.array([[0.6, 0, 0, 0, 0, 0]]), np.array([[0.12]]), np.array([-0.024]), BODY_SD**2
+    )
+    use = calibration(hidden=hidden)
+    centred = SizePriors(between_maps=BetweenMaps(0.0, 0.0), known={"seat": 0.0})
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=use).max_size_mm) for p in (centred, KNOWN_0))
+    assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.004)
+    left = 1 - 0.024**2 / 0.12 / BODY_SD**2
+    assert known.std() == pytest.approx(np.hypot(BODY_SD * np.sqrt(left), 0.01), rel=0.04)
+    with pytest.raises(UsageError, match="nothing of weather"):
+        pooled([shape(2.7)], priors=SizePriors(known={"weather": 1.0}), use=use)
+
+
+def test_fewer_than_half_of_the_maps_give_no_size():
+    few = pool_maps([shape(2.7), None, None], calibration=calibration(), priors=SizePriors(),
+                    rng=np.random.default_rng(1))  # fmt: skip
+    assert few.status == "no_estimate"
+    assert "1 of 3" in few.reason
+    enough = pool_maps([shape(2.7), None, shape(2.75, seed=1)], calibration=calibration(), priors=SizePriors(),
+                       rng=np.random.default_rng(1))  # fmt: skip
+    assert enough.status == "estimate"
+    assert set(enough.centres) == {0, 2}
+    assert pool_maps([], calibration=calibration(), priors=SizePriors(), rng=np.random.default_rng(1)).size is None
+
+
+def test_draws_without_a_rise_are_counted():
+    broken = shape(2.7)
+    log_a = broken.log_amplitude.copy()
+    log_a[::4] = np.nan
+    maps = [ShapeDraws(log_a, broken.log_width, broken.q, broken.r)]
+    assert pooled(maps).invalid == pytest.approx(5000, rel=0.1)
+    none = pool_maps(maps, calibration=calibration(), priors=SizePriors(), rng=np.random.default_rng(1))
+    assert none.status == "no_estimate"
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9])
+def test_a_map_without_noise_is_no_special_case(noise):
+    found = pooled([shape(2.7, noise=noise)] * 3, priors=KNOWN_0)
+    assert np.isfinite(found.max_size_mm).all()
+    assert sum(found.variance_share.values()) == pytest.approx(100.0)
