@@ -106,6 +106,17 @@ def test_twice_the_fineness_is_half_the_element() -> None:
     assert four.grade**2 == pytest.approx(two.grade)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("d", "depth_ratio", "seat"), [(15.0, 1.0, 0.0), (10.0, 0.8, 1.2), (20.0, 1.2, 0.5)])
+def test_half_the_cell_gives_the_same_map(d: float, depth_ratio: float, seat: float) -> None:
+    geometry = Geometry(seat, d, depth_ratio, (100.0,))
+    (usual,) = run_solid_geometry(geometry, settings=SolidSettings(), fit=fit_raster)
+    (fine,) = run_solid_geometry(geometry, settings=SolidSettings(fineness=4), fit=fit_raster)
+    assert usual.amplitude == pytest.approx(fine.amplitude, rel=1e-2)
+    assert usual.sigma_x_mm == pytest.approx(fine.sigma_x_mm, rel=5e-3)
+    assert usual.sigma_y_mm == pytest.approx(fine.sigma_y_mm, rel=5e-3)
+
+
 QUICK = [("centred", 15.0, 1.0), ("resting", 20.0, 0.8)]
 WHERE_TAXELS_RESOLVE = [(d, q) for d in (10.0, 15.0, 20.0, 25.0) for q in (0.8, 1.0, 1.2, 1.5)]
 
