@@ -7,6 +7,7 @@ import os
 import re
 import urllib.error
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from emulated_devices import head_and_tracker, short_scan
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from tactile_bayes.commands.live_view import Turn, estimate_text
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.feed import Feed, FeedReader, SeenFrame, SeenPose
 from tactile_bayes.hardware.live import LiveMap, LiveState, grey_levels
@@ -216,3 +218,33 @@ def test_only_this_computer_can_be_served(text):
 )
 def test_an_address_of_this_computer(text, address):
     assert address_of(text) == address
+
+
+def test_the_estimate_looks_at_one_rise_a_time_and_stays_where_a_lump_was():
+    turn, seen, shown = Turn(), [], []
+    for _ in range(20):
+        seen.append(turn.of(4))
+        shown.append(turn.tell(lump=seen[-1] == 2))
+    assert seen == [0, 1, 2, 2, 2, 2, 2, 0, 2, 2, 2, 2, 2, 2, 2, 0, 2, 2, 2, 2]
+    assert [place for place, told in enumerate(shown) if not told] == [7, 15]  # a glance at the highest: nothing new
+    turn = Turn()
+    assert [(turn.of(2), turn.tell(lump=False))[0] for _ in range(5)] == [0, 1, 0, 1, 0]
+    higher = Turn()
+    assert [(at := higher.of(3), higher.tell(lump=at == 1))[0] for _ in range(4)] == [0, 1, 1, 1]
+    for _ in range(4):
+        at = higher.of(3)
+        higher.tell(lump=True)
+    assert at == 0  # a new highest one is taken when it is looked at
+
+
+def test_the_live_estimate_is_the_estimate(state):
+    from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+    from tactile_bayes.posterior.fit import FitOptions
+
+    text = estimate_text(state.tactile_map, None, Turn())
+    options = EstimateOptions(method="laplace", fit=FitOptions(rotation="off"))
+    found = estimate_map(state.tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
+    widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
+    assert text.startswith(f"map width sigma {np.median(widths):.1f} mm (")
+    flat = replace(state.tactile_map, mean=np.where(state.tactile_map.covered, 1.0, np.nan))
+    assert estimate_text(flat, None, Turn()).startswith("no estimate: ")

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.hardware.live import LiveMap, LiveState
     from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.posterior.size_calibration import SizeCalibration
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 DRAWINGS_PER_S = 10.0
@@ -93,8 +96,8 @@ class Estimator:
         """Take the answer that has come, and ask anew."""
         if self._running is not None and self._running.done():
             with contextlib.suppress(Exception):  # the estimate's process died: the view goes on without
-                self.text = self._running.result()
-                self.done += bool(self.text)
+                answer = self._running.result()
+                self.text, self.done = answer or self.text, self.done + 1
             self.seconds, self._running = time.monotonic() - self._begun, None
         if self._running is None and tactile_map is not None:
             self._ask(tactile_map)
@@ -117,29 +120,73 @@ def _prepare() -> None:
     import tactile_bayes.posterior.estimate  # noqa: F401
 
 
-def estimate_text(tactile_map: TactileMap, calibration_path: str | None) -> str:
-    """The size in a line, by the quick method; the reason when there is none."""
+class Turn:
+    """Which of the map's rises is looked at next: one a time, because most of them are no lump and cost as much.
+
+    The one that was a lump last time, or else the next lower one; now and then the highest, which may be new.
+    """
+
+    AGAIN = 8
+
+    def __init__(self) -> None:
+        self._home = self._now = self._asked = 0
+
+    def of(self, number: int) -> int:
+        """Which of `number`, 0 being the highest."""
+        self._asked += 1
+        self._home %= number
+        self._now = 0 if self._asked % self.AGAIN == 0 else self._home
+        return self._now
+
+    def tell(self, *, lump: bool) -> bool:
+        """What came of it; whether that is worth showing: not that the highest is still none."""
+        glance = self._now != self._home
+        if lump:
+            self._home = self._now
+        elif not glance:
+            self._home += 1
+        return lump or not glance
+
+
+_TURN = Turn()
+
+
+@cache
+def _calibration_of(path: str) -> SizeCalibration | LogQuadratic:
+    from tactile_bayes.files.size_json import read_size_calibration
+
+    return read_size_calibration(Path(path))
+
+
+def estimate_text(tactile_map: TactileMap, calibration_path: str | None, turn: Turn = _TURN) -> str:
+    """The size in a line, by the quick method; the reason when there is none, nothing when the line before stands."""
     import numpy as np
 
     from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.cells import candidate_centres
     from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
     from tactile_bayes.posterior.fit import FitOptions
     from tactile_bayes.presets import INTERVAL
 
     try:
-        calibration = read_size_calibration(Path(calibration_path)) if calibration_path else None
+        centres = candidate_centres(tactile_map)
+        if not centres:
+            return "no estimate: nothing rises above the background"
+        centre = centres[turn.of(len(centres))]
+        calibration = _calibration_of(calibration_path) if calibration_path else None
         # whether an ellipse is turned is a question for afterwards, and takes a third of the time
-        fit = FitOptions(rotation="off")
+        fit = FitOptions(rotation="off", centre_mm=centre)
         if calibration is not None:
             recipe = calibration.recipe
-            fit = FitOptions(recipe.background, recipe.radius_mm, "off", None, recipe.noise)
+            fit = FitOptions(recipe.background, recipe.radius_mm, "off", centre, recipe.noise)
         options = EstimateOptions(method="laplace", fit=fit)
         found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
     except TactileBayesError as error:
-        return f"no estimate: {error}"
+        return f"no estimate: {error}" if turn.tell(lump=False) else ""
+    if not turn.tell(lump=found.status == "estimate"):
+        return ""
     if found.status != "estimate" or found.map_posterior is None:
-        return f"no estimate: {found.reason}"
+        return f"no estimate: the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
     if found.size is not None:
         return _interval("largest size", found.size.max_size_mm, INTERVAL)
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
