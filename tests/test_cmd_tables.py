@@ -6,18 +6,20 @@ import json
 from collections.abc import Callable
 from subprocess import CompletedProcess
 
+import numpy as np
 import pytest
 
 from tactile_bayes.commands.tables import tables_text
 from tactile_bayes.errors import EXIT_BAD_DATA
 from tactile_bayes.forward.study import LineFit
-from tactile_bayes.forward.tables import Agreement, phantom_scenes, table_scenes
+from tactile_bayes.forward.tables import OTHER_DEFINITIONS, Agreement, phantom_scenes, table_scenes
 
 Run = Callable[..., "CompletedProcess[str]"]
 
 
 def agreement(scene) -> Agreement:
-    return Agreement(scene, 0.05, 0.06, 0.01, 0.4, LineFit(0.3, 3.0, 0.01), LineFit(0.4, 3.5, 0.02))
+    others = ((0.2, 0.15, 0.1),) * len(OTHER_DEFINITIONS)
+    return Agreement(scene, 0.05, 0.06, 0.01, 0.4, LineFit(0.3, 3.0, 0.01), LineFit(0.4, 3.5, 0.02), 0.03, others)
 
 
 def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> None:
@@ -28,6 +30,7 @@ def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> No
     assert "mean 5.0 (of the printed cells 4.1)" in text
     assert "40.0" in text  # the strict norm
     assert "phantom 18.75 mm" in text
+    assert "root mean square over the largest      20.0 (20.0 to 20.0)  15.0 (15.0 to 15.0)" in text
     assert max(map(len, text.splitlines()[1:])) <= 100
 
 
@@ -45,7 +48,14 @@ def test_the_command_prints_both_forms(run_cli: Run) -> None:
     assert 0 < first["map"] < first["map_strict"]
 
 
+def test_the_other_definitions_are_what_they_say() -> None:
+    u, v = np.array([1.0, 2.0, 5.0]), np.array([1.0, 3.0, 4.0])
+    found = [by(u, v) for by in OTHER_DEFINITIONS.values()]
+    expected = [np.sqrt(2 / 26), 2 / 3 / 16, np.sqrt(2 / 3) / 4, 2 / 8, 2 / (26 - 64 / 3)]
+    np.testing.assert_allclose(found, expected)
+
+
 def test_an_unknown_seat_is_named(run_cli: Run) -> None:
-    done = run_cli("tables", "--seat", "2")
+    done = run_cli("tables", "--seat", "3")
     assert done.returncode == EXIT_BAD_DATA
-    assert "seat is '2'" in done.stderr
+    assert "seat is '3'" in done.stderr

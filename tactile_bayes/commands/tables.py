@@ -72,9 +72,11 @@ def tables_text(found: Sequence[Agreement], phantoms: Sequence[Agreement]) -> st
 
     lines = [DEFINITION, ""]
     lines += _table("Table 1: frame centred on the lump, MSD %", found, "centred_frame", PRINTED_FRAMES)
+    lines += _table("The same of frames divided by their means, MSD %", found, "normalised_frame", None)
     lines += _table("All frames of the map, MSD % (printed average 4.3)", found, "all_frames", None)
     lines += _table("Table 2: map, MSD %", found, "map", PRINTED_MAPS)
     lines += _table("Map, strict MSD %", found, "map_strict", None)
+    lines += _others(found)
     lines += ["Eq 5 fitted to both maps (background 1); the elastic model first:"]
     lines += [f"{'lump':<24}{'a':>16}{'sigma, mm':>18}{'frame %':>10}{'map %':>8}{'strict %':>10}"]
     for one in [*found, *phantoms]:
@@ -83,6 +85,23 @@ def tables_text(found: Sequence[Agreement], phantoms: Sequence[Agreement]) -> st
         shares = f"{100 * one.centred_frame:>10.1f}{100 * one.map:>8.1f}{100 * one.map_strict:>10.1f}"
         lines.append(f"{one.scene.name:<24}{amplitudes:>16}{widths:>18}{shares}")
     return "\n".join(lines)
+
+
+def _others(found: Sequence[Agreement]) -> list[str]:
+    """What other definitions would give: means over the cases with the least and the largest."""
+    from tactile_bayes.forward.tables import OTHER_DEFINITIONS
+
+    lines = [
+        "Other definitions, %: mean over the cases (least to largest); printed 4.0 to 4.3 and 2.2 to 2.7",
+        f"{'':<37}{'frame':>21}{'frame over its mean':>21}{'map':>21}",
+    ]
+    for i, name in enumerate(OTHER_DEFINITIONS):
+        cells = []
+        for of in range(3):
+            shares = [100 * one.others[i][of] for one in found]
+            cells.append(f"{sum(shares) / len(shares):.1f} ({min(shares):.1f} to {max(shares):.1f})")
+        lines.append(f"{name:<37}" + "".join(f"{cell:>21}" for cell in cells))
+    return [*lines, ""]
 
 
 def _table(
@@ -107,11 +126,12 @@ def tables_document(found: Sequence[Agreement], phantoms: Sequence[Agreement], *
     """The same as plain data, shares instead of percent."""
     from dataclasses import asdict
 
-    from tactile_bayes.forward.tables import DEFINITION, PRINTED_FRAMES, PRINTED_MAPS
+    from tactile_bayes.forward.tables import DEFINITION, OTHER_DEFINITIONS, PRINTED_FRAMES, PRINTED_MAPS
 
     return {
         "schema": "tactile-bayes/tables/1",
         "definition": DEFINITION,
+        "other_definitions": list(OTHER_DEFINITIONS),
         "seat": seat,
         "printed_percent": {
             "frames": {f"{h:g}": list(row) for h, row in PRINTED_FRAMES.items()},

@@ -10,6 +10,7 @@ The first hides a bump under the background of 1 (decision record 0007); the sec
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,14 @@ DEFINITION = (
     "MSD = sum of squared differences over the sum of squares of the elastic model; the paper does not define its own. "
     "Strict: the same over the sum of squares of (map - 1), what the lump adds."
 )
+OTHER_DEFINITIONS: dict[str, Callable[[FloatArray, FloatArray], float]] = {
+    "root of the same": lambda u, v: float(np.sqrt(np.sum((u - v) ** 2) / np.sum(v**2))),
+    "mean square over the largest's": lambda u, v: float(np.mean((u - v) ** 2) / v.max() ** 2),
+    "root mean square over the largest": lambda u, v: float(np.sqrt(np.mean((u - v) ** 2)) / v.max()),
+    "mean absolute over the mean": lambda u, v: float(np.mean(np.abs(u - v)) / np.mean(v)),
+    "over the squares about the mean": lambda u, v: float(np.sum((u - v) ** 2) / np.sum((v - v.mean()) ** 2)),
+}
+"""What else a paper could mean by a mean squared difference: tried because the printed tables are not met."""
 PHANTOMS = {
     "phantom 12.5 mm": (12.5, 0.825),
     "phantom 15.5 mm": (15.5, 1.0),
@@ -94,6 +103,10 @@ class Agreement:
         within the fit's radius (Table 2), and of the map relative to map - 1.
     elastic, empirical
         Eq 5 fitted to both maps.
+    normalised_frame
+        As `centred_frame`, of frames divided by their means.
+    others
+        By each of `OTHER_DEFINITIONS`: of the frame centred on the lump, of the same divided by its mean, of the map.
     """
 
     scene: Scene
@@ -103,6 +116,8 @@ class Agreement:
     map_strict: float
     elastic: LineFit
     empirical: LineFit
+    normalised_frame: float
+    others: tuple[tuple[float, float, float], ...]
 
 
 def table_scenes(seat: float) -> list[Scene]:
@@ -138,6 +153,8 @@ def compare(scene: Scene, *, settings: StudySettings, fit: Fit) -> Agreement:
     inside = np.abs(curves.elastic_map.x_mm) <= settings.fit_radius_mm
     ours, theirs = curves.empirical_map.mean[inside], curves.elastic_map.mean[inside]
     fitted, seen = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
+    frames = fitted.at(0.0), seen.at(0.0)
+    shares = frames[0] / frames[0].mean(), frames[1] / frames[1].mean()
     return Agreement(
         scene,
         mean_squared_difference(fitted.at(0.0), seen.at(0.0)),
@@ -146,6 +163,8 @@ def compare(scene: Scene, *, settings: StudySettings, fit: Fit) -> Agreement:
         float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
         fit(curves.elastic_map, settings.fit_radius_mm),
         fit(curves.empirical_map, settings.fit_radius_mm),
+        mean_squared_difference(*shares),
+        tuple((by(*frames), by(*shares), by(ours, theirs)) for by in OTHER_DEFINITIONS.values()),
     )
 
 
