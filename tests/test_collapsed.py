@@ -12,7 +12,8 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import FitCells, window_cells
 from tactile_bayes.posterior.collapsed import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.field import cosine_profiles, gram_of_cosines, spectrum
-from tactile_bayes.posterior.field_posterior import FieldFit, draw_field, fit_scene, shape_draws
+from tactile_bayes.posterior.field_posterior import FieldFit, fit_scene, shape_draws
+from tactile_bayes.posterior.methods import draw_scene
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.window import Window
 from tests.posterior_maps import TRUTH, bump_map, correlated_field
@@ -175,7 +176,7 @@ def test_amplitude_and_noise_come_back() -> None:
 )
 def test_the_methods_agree(methods: tuple[str, ...]) -> None:
     fit = fitted(cells_of(noise(5, field=0.01)))
-    drawn = {method: draw_field(fit, method, rng=np.random.default_rng(1)).flat for method in methods}
+    drawn = {method: draw_scene(fit, method, rng=np.random.default_rng(1))[0].flat for method in methods}
     sd = drawn["importance"].std(axis=0)
     for name, draws in drawn.items():
         assert (np.abs(draws.mean(axis=0) - drawn["importance"].mean(axis=0)) < 0.2 * sd).all(), name

@@ -9,6 +9,8 @@ import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 
+END_ERROR = 2.67
+"""Monte-Carlo error of an end of a 95 % interval, in SDs, times the root of the independent draws (normal tails)."""
 INDEPENDENT_DRAWS = 4000
 """Draws of the methods that draw independently: end-point Monte-Carlo error of a 95 % interval about 0.04 SD."""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import emcee
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.chain_state import ChainState, ChainStore
 from tactile_bayes.posterior.draws import ParameterDraws, student_draws
 from tactile_bayes.posterior.inference_data import chain_diagnostics
 from tactile_bayes.posterior.laplace import LogDensity
@@ -45,6 +46,11 @@ class EnsembleOptions:
     most_rhat: float = 1.01
     keep: int = 8000
 
+    def identity(self) -> str:
+        """What a checkpoint is bound to: everything but how long to go on."""
+        said = asdict(self)
+        return str({name: said[name] for name in ("ensembles", "walkers_per_parameter", "block")})
+
 
 def ensemble(
     log_density: LogDensity,
@@ -54,8 +60,11 @@ def ensemble(
     rng: np.random.Generator,
     options: EnsembleOptions | None = None,
     progress: Progress | None = None,
+    start: FloatArray | None = None,
+    store: ChainStore | None = None,
+    key: str = "",
 ) -> ParameterDraws:
-    """Draw from a log density, starting from overdispersed normal draws about its mode.
+    """Draw from a log density, starting from draws of it, or from overdispersed normal draws about its mode.
 
     Parameters
     ----------
@@ -65,6 +74,11 @@ def ensemble(
         Mode and approximate covariance.
     progress
         Called with the effective draws so far and those wanted.
+    start : (n, p) array
+        Draws of about this density; walkers begin at some of them.
+    store, key
+        Where the state is kept after each block, and what it is bound to. A run goes on from a state that it finds,
+        and ends in the same draws as a run that was never stopped.
 
     Raises
     ------
@@ -77,11 +91,22 @@ def ensemble(
     ensemble's steps is dropped. Diagnostics are rank-normalised (Vehtari et al. 2021).
     """
     options = options or EnsembleOptions()
-    samplers = [_Ensemble(log_density, centre, covariance, rng=rng, options=options) for _ in range(options.ensembles)]
+    samplers = [
+        _Ensemble(log_density, centre, covariance, rng=rng, options=options, start=start)
+        for _ in range(options.ensembles)
+    ]
+    kept = None if store is None else store.load(key)
+    if kept is not None:
+        for index, sampler in enumerate(samplers):
+            sampler.restore(kept, index)
     figures: dict[str, float] = {}
-    for steps in range(options.block, options.max_steps + 1, options.block):
-        for sampler in samplers:
-            sampler.advance(options.block)
+    # a state that had converged is looked at again before it is run further
+    for steps in range(max(options.block, samplers[0].steps), options.max_steps + 1, options.block):
+        if steps > samplers[0].steps:
+            for sampler in samplers:
+                sampler.advance(options.block)
+            if store is not None:
+                store.save(key, _state(samplers))
         chains = np.stack([sampler.chain() for sampler in samplers])
         figures = chain_diagnostics(chains)
         least = min(figures["ess_bulk"], figures["ess_tail"])
@@ -92,6 +117,8 @@ def ensemble(
             figures |= {"evaluations": float(steps * samplers[0].walkers * len(samplers))}
             figures |= {"acceptance": float(np.mean([sampler.acceptance() for sampler in samplers]))}
             return ParameterDraws(_thin(chains, options.keep), "ensemble", figures)
+    if not figures:
+        raise NotConvergedError(f"the checkpoint has {samplers[0].steps} steps, more than --max-steps allows")
     raise NotConvergedError(_advice(figures, options), diagnostics=figures)
 
 
@@ -106,6 +133,7 @@ class _Ensemble:
         *,
         rng: np.random.Generator,
         options: EnsembleOptions,
+        start: FloatArray | None,
     ) -> None:
         p = len(centre)
         self._centre, self._scale = centre, np.sqrt(np.diag(covariance))
@@ -115,26 +143,60 @@ class _Ensemble:
         )
         # emcee's wrapper prints parameters and a traceback at any exception, Ctrl-C among them
         self._sampler.log_prob_fn = self._standardised(log_density)
-        start = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
+        if start is None or len(start) < self.walkers:
+            begin = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
+        else:
+            unique = np.unique(start, axis=0)
+            begin = unique[rng.choice(len(unique), size=self.walkers, replace=len(unique) < self.walkers)]
         # emcee takes neither an integer nor a Generator: it must be handed the state of a RandomState
         random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
-        self._state = emcee.State((start - self._centre) / self._scale, random_state=random_state)
+        self._state = emcee.State((begin - self._centre) / self._scale, random_state=random_state)
+        self._chain = np.empty((0, self.walkers, p))
+        self._accepted = 0.0
 
     def _standardised(self, log_density: LogDensity) -> LogDensity:
         """The density of ``(theta - centre) / scale``: emcee judges the walkers' independence by their numbers."""
         return lambda z: log_density(self._centre + self._scale * z)
 
+    @property
+    def steps(self) -> int:
+        """Steps taken."""
+        return len(self._chain)
+
     def advance(self, steps: int) -> None:
+        """Take more steps."""
+        self._sampler.reset()
         self._state = self._sampler.run_mcmc(self._state, steps)
+        self._chain = np.concatenate([self._chain, self._sampler.get_chain()])
+        self._accepted += float(np.mean(self._sampler.backend.accepted))
 
     def chain(self) -> FloatArray:
         """(draw, p): the last two thirds, walker after walker: neighbours in the array are neighbours in time."""
-        steps = self._centre + self._scale * self._sampler.get_chain()
-        kept = steps[len(steps) // 3 :]
+        kept = self._centre + self._scale * self._chain[self.steps // 3 :]
         return np.asarray(np.swapaxes(kept, 0, 1).reshape(-1, kept.shape[-1]))
 
     def acceptance(self) -> float:
-        return float(np.mean(self._sampler.acceptance_fraction))
+        """Share of the proposals that were taken."""
+        return self._accepted / self.steps
+
+    def kept(self) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
+        """Chain, last log densities, accepted proposals, generator's key and its cursor."""
+        _, key, position, has_normal, normal = self._state.random_state
+        cursor = np.array([position, has_normal, normal], dtype=np.float64)
+        return self._chain, np.asarray(self._state.log_prob), self._accepted, key, cursor
+
+    def restore(self, state: ChainState, index: int) -> None:
+        """Go on from a kept state."""
+        self._chain, self._accepted = state.chain[index], float(state.accepted[index])
+        position, has_normal, normal = state.cursor[index]
+        random_state = ("MT19937", state.twister[index], int(position), int(has_normal), float(normal))
+        self._state = emcee.State(
+            self._chain[-1].copy(), log_prob=state.log_density[index].copy(), random_state=random_state
+        )
+
+
+def _state(samplers: list[_Ensemble]) -> ChainState:
+    return ChainState(*(np.stack(values) for values in zip(*(one.kept() for one in samplers), strict=True)))
 
 
 def _finite_start(

@@ -11,7 +11,9 @@ import numpy as np
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.abstention import Abstention, no_bump, shape_fault, undetected
 from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.chain_state import ChainStore
 from tactile_bayes.posterior.detection import Detection, detect
 from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, find_bump, rotation_odds
@@ -20,12 +22,14 @@ from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.noise import level_offset
 from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
 from tactile_bayes.posterior.size_calibration import SizeCalibration
 from tactile_bayes.presets import CELL_PER_SIGMA
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.field_estimate import FieldAnswer
+    from tactile_bayes.posterior.scene_choice import SceneChoice
 
 Status = Literal["estimate", "no_estimate"]
 ROTATION_ODDS = 3.0
@@ -56,6 +60,10 @@ class EstimateOptions:
         Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
     scene
         One of `scene_choice.SCENES`, under a noise field.
+    accuracy_mm
+        As `accuracy_sd`, of the widths in mm; the finer of the two holds. Under a noise field.
+    store
+        Where an ensemble keeps its state between runs, under a noise field.
     """
 
     method: str = "ensemble"
@@ -66,6 +74,8 @@ class EstimateOptions:
     accuracy_sd: float | None = None
     size_priors: SizePriors = field(default_factory=SizePriors)
     scene: str = "auto"
+    accuracy_mm: float | None = None
+    store: ChainStore | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +111,12 @@ class Estimate:
         Figures and flags for the report.
     left_out
         What the estimate does not contain, in words.
+    code, advice
+        Without an estimate: one of `abstention.CODES`, and what would fix it.
+    scene
+        Under a noise field: what the window holds, and what was asked about it.
+    sensitivity
+        How far the answer leans on the prior of the widths.
     """
 
     status: Status
@@ -113,6 +129,10 @@ class Estimate:
     candidates: tuple[Candidate, ...] = ()
     diagnostics: Mapping[str, object] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
+    code: str = ""
+    advice: str = ""
+    scene: SceneChoice | None = None
+    sensitivity: Sensitivity | None = None
 
 
 def estimate_map(
@@ -141,22 +161,28 @@ def estimate_map(
     if calibration is not None:
         check_recipe(tactile_map, calibration, options.fit)
     if not tactile_map.covered.any():
-        return Estimate("no_estimate", "the map has no covered cell")
+        return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place"))
     candidates = tuple(find_bump(tactile_map, _search_options(tactile_map, options.fit)))
     if not candidates:
-        return Estimate("no_estimate", "nothing rises above the background")
+        return _none(Abstention("empty", "nothing rises above the background"))
     chosen = candidates[-1]
     if chosen.fault or chosen.fit is None:
-        return Estimate("no_estimate", _fault_reason(candidates), candidates=candidates)
+        return _none(no_bump(tactile_map, candidates), candidates)
     fit = chosen.fit
     seen = _look(tactile_map, fit, options)
     detection = seen if isinstance(seen, Detection) else seen.detection
     if detection.probability < options.least_probability:
-        reason = f"no lump detected (probability {detection.probability:.2g}, needed {options.least_probability:g})"
-        return Estimate("no_estimate", reason, detection=detection, candidates=candidates)
+        return _none(undetected(detection.probability, options.least_probability), candidates, detection)
+    scene: SceneChoice | None = None
     if not isinstance(seen, Detection):
-        seen = _draw_under_field(seen, tactile_map, options, rng=rng, progress=progress)
-        detection, draws, noise = seen.detection, seen.draws, dict(seen.diagnostics)
+        try:
+            seen = _draw_under_field(seen, tactile_map, options, rng=rng, progress=progress)
+        except NotConvergedError as error:
+            if options.method == "ensemble":
+                raise
+            advice = "give --method ensemble with more --max-steps"
+            return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection)
+        detection, draws, noise, scene = seen.detection, seen.draws, dict(seen.diagnostics), seen.choice
         assert draws is not None
         posterior = MapPosterior(**seen.posterior)
     else:
@@ -164,12 +190,18 @@ def estimate_map(
         draws = _draw(fit, options, rng=rng, progress=progress)
         posterior = _map_posterior(fit, draws, options, rng=rng)
         noise = _judged_noise(fit, odds)
+    fault = shape_fault(
+        posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
+    )
+    if fault is not None:
+        return _none(fault, candidates, detection)
     size = _size(posterior, calibration, options.size_priors, rng=rng)
     diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | noise
     diagnostics["method"] = draws.method
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
-        return Estimate("no_estimate", reason, detection=detection, candidates=candidates, diagnostics=diagnostics)
+        outside = Abstention("extrapolated", reason, "learn a calibration whose table holds such lumps")
+        return _none(outside, candidates, detection, diagnostics)
     reason = "" if calibration is not None else "no size calibration was given: widths only"
     return Estimate(
         "estimate",
@@ -182,7 +214,33 @@ def estimate_map(
         candidates=candidates,
         diagnostics=diagnostics,
         left_out=_left_out(options, calibration, diagnostics),
+        scene=scene,
+        sensitivity=_sensitivity(posterior, size, options),
     )
+
+
+def _none(
+    why: Abstention,
+    candidates: tuple[Candidate, ...] = (),
+    detection: Detection | None = None,
+    diagnostics: Mapping[str, object] | None = None,
+) -> Estimate:
+    return Estimate(
+        "no_estimate",
+        why.reason,
+        detection=detection,
+        candidates=candidates,
+        diagnostics=diagnostics or {},
+        code=why.code,
+        advice=why.advice,
+    )
+
+
+def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: EstimateOptions) -> Sensitivity:
+    quantities = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
+    if size is not None:
+        quantities["max_size_mm"] = size.max_size_mm
+    return prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior)
 
 
 def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic, fit: FitOptions) -> None:
@@ -217,12 +275,6 @@ def _check_options(options: EstimateOptions) -> None:
         raise UsageError("optimise is the paper's least squares and has no noise field; choose another --method")
     if options.fit.background != "free":
         raise UsageError("a noise field takes level and tilt with it; give --background free")
-
-
-def _fault_reason(candidates: tuple[Candidate, ...]) -> str:
-    first = candidates[0]
-    where = f"near ({first.centre_mm[0]:.1f}, {first.centre_mm[1]:.1f}) mm"
-    return f"no bump can be measured ({len(candidates)} looked at); the highest, {where}: {first.fault}"
 
 
 def _choose_rotation(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tuple[BumpFit, float | None]:
@@ -337,6 +389,7 @@ def _draw_under_field(
     progress: Callable[[int, int], None] | None,
 ) -> FieldAnswer:
     from tactile_bayes.posterior.field_estimate import draw
+    from tactile_bayes.posterior.methods import MethodOptions
 
     return draw(
         seen,
@@ -344,8 +397,7 @@ def _draw_under_field(
         options.method,
         rng=rng,
         scene=_scene(options),
-        accuracy_sd=options.accuracy_sd,
-        max_steps=options.max_steps,
+        options=MethodOptions(options.accuracy_sd, options.accuracy_mm, options.max_steps, options.store),
         progress=progress,
     )
 
@@ -388,7 +440,7 @@ def _left_out(
 ) -> tuple[str, ...]:
     notes = []
     odds = diagnostics["rotation_odds"]
-    if odds is not None and not diagnostics["rotated"]:
+    if odds is not None and not diagnostics["rotated"] and options.fit.noise != "field":
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
     if options.fit.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")

@@ -13,8 +13,9 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.field_posterior import FieldFit, draw_field, field_window, shape_draws, start_vector
+from tactile_bayes.posterior.field_posterior import FieldFit, field_window, shape_draws, start_vector
 from tactile_bayes.posterior.fit import BumpFit
+from tactile_bayes.posterior.methods import MethodOptions, draw_scene
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.scene_choice import SceneChoice, add_beside, choose_shape
 from tactile_bayes.posterior.surroundings import Surroundings
@@ -93,17 +94,17 @@ def draw(
     *,
     rng: np.random.Generator,
     scene: str = "auto",
-    accuracy_sd: float | None = None,
-    max_steps: int | None = None,
+    options: MethodOptions | None = None,
     progress: Progress | None = None,
 ) -> FieldAnswer:
     """The same with a second structure where the map asks for one, and draws."""
     choice = add_beside(answer.choice, Surroundings.of(tactile_map), scene=scene)
-    draws = draw_field(choice.fit, method, rng=rng, accuracy_sd=accuracy_sd, max_steps=max_steps, progress=progress)
+    draws, passed_over = draw_scene(choice.fit, method, rng=rng, options=options, progress=progress)
     detection = answer.detection
     if choice.fit is choice.plain and "log_evidence" in draws.diagnostics:
         detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
-    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng), _diagnostics(choice))
+    figures = _diagnostics(choice) | ({"passed_over": list(passed_over)} if passed_over else {})
+    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng), figures)
 
 
 def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator) -> dict[str, FloatArray]:

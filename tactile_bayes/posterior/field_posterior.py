@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.collapsed import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
 from tactile_bayes.posterior.fit import WIDEST_IN_RADII, BumpFit
-from tactile_bayes.posterior.importance import importance, importance_options
 from tactile_bayes.posterior.laplace import mode_and_covariance
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.target import finite_differences, stencil
@@ -42,6 +40,15 @@ class Mixture:
     mean: FloatArray
     covariance: FloatArray
     log_evidence: float
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """(m,) log density of the Gaussians, normalised."""
+        parts = []
+        for weight, mean, covariance in zip(self.weight, self.mean, self.covariance, strict=True):
+            z = np.linalg.solve(np.linalg.cholesky(covariance), (theta - mean).T)
+            volume = float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+            parts.append(np.log(weight) - 0.5 * np.sum(z**2, axis=0) - 0.5 * volume)
+        return np.asarray(np.logaddexp.reduce(parts, axis=0))
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """(p,) mean and (p, p) covariance of the whole."""
@@ -211,27 +218,6 @@ def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = IND
     ]
     flat = rng.permutation(np.concatenate(parts))
     return ParameterDraws(flat[None], "laplace", {"draws": float(draws), "fields": float(len(number))})
-
-
-def draw_field(
-    fit: FieldFit,
-    method: str,
-    *,
-    rng: np.random.Generator,
-    accuracy_sd: float | None = None,
-    max_steps: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> ParameterDraws:
-    """Draws of the shape by ``"laplace"``, ``"importance"`` or ``"ensemble"``."""
-    if method == "laplace":
-        return laplace_mixture(fit, rng=rng)
-    if method == "importance":
-        mean, covariance = fit.mixture.moments()
-        return importance(fit.target, mean, covariance, rng=rng, options=importance_options(accuracy_sd))
-    from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
-
-    settings = EnsembleOptions() if max_steps is None else replace(EnsembleOptions(), max_steps=max_steps)
-    return ensemble(fit.target, fit.mode, fit.covariance, rng=rng, options=settings, progress=progress)
 
 
 def shape_draws(fit: FieldFit, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

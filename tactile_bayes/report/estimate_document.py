@@ -14,6 +14,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.quantity import Quantity, summarise
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.scene_text import scene_document
 
 SCHEMA = "tactile-bayes/estimate/1"
 SIZES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
@@ -62,12 +63,16 @@ def estimate_document(
         "schema": SCHEMA,
         "status": estimate.status,
         "reason": estimate.reason,
+        "reason_code": estimate.code,
+        "advice": estimate.advice,
         **{name: one(name) for name in (*SIZES, *WIDTHS)},
         "centre_mm": point("centre_mm"),
         "centre_patient_mm": point("centre_patient_mm"),
         "angle_deg": one("angle_deg"),
         "detected_probability": None if detection is None else _round(detection.probability),
         "variance_share": None if share is None else {k: _round(v) for k, v in share.items()},
+        "scene": None if estimate.scene is None else scene_document(estimate.scene),
+        "prior_sensitivity": None if estimate.sensitivity is None else _rounded(estimate.sensitivity.as_dict()),
         "diagnostics": _diagnostics(estimate),
         "candidates": [
             {"x_mm": _round(c.centre_mm[0]), "y_mm": _round(c.centre_mm[1]), "fault": c.fault}
@@ -82,6 +87,12 @@ def estimate_document(
 
 def _round(value: float) -> float:
     return float(f"{value:.9g}")
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _rounded(one) for name, one in value.items()}
+    return _round(value) if isinstance(value, float) else value
 
 
 def _diagnostics(estimate: Estimate) -> dict[str, Any]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.quantity import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_quantities
+from tactile_bayes.report.scene_text import scene_lines, sensitivity_line
 from tactile_bayes.report.size_text import shape_text, variance_text
 
 ROWS = (
@@ -40,12 +42,13 @@ def decimals(mc_error: float, *, most: int = 3) -> int:
 def estimate_text(estimate: Estimate, tactile_map: TactileMap, *, probability: float) -> str:
     """The report of one map: what was found with its interval, where the uncertainty comes from, what was left out."""
     if estimate.status == "no_estimate":
-        return "\n".join([f"No estimate: {estimate.reason}.", *_looked_at(estimate), RESEARCH_USE]) + "\n"
+        advice = [f"What would help: {estimate.advice}."] if estimate.advice else []
+        return "\n".join([f"No estimate: {estimate.reason}.", *advice, *_looked_at(estimate), RESEARCH_USE]) + "\n"
     quantities = estimate_quantities(estimate, tactile_map, probability=probability)
     lines = [_table(quantities, probability), ""]
     if estimate.reason:
         lines.append(f"No size: {estimate.reason}.")
-    lines += [*_findings(estimate), *_warnings(estimate), *_left_out(estimate), RESEARCH_USE]
+    lines += [*_findings(estimate), *_scene(estimate), *_warnings(estimate), *_left_out(estimate), RESEARCH_USE]
     return "\n".join(lines) + "\n"
 
 
@@ -69,20 +72,32 @@ def _findings(estimate: Estimate) -> list[str]:
         lines.append(variance_text(estimate.size.variance_share))
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
+        if words := estimate.diagnostics.get("size_calibration"):
+            lines.append(f"{words}.")
         if estimate.size.invalid:
             lines.append(f"{estimate.size.invalid} draws gave no size and were left out.")
-    if estimate.draws is not None and "rhat" in estimate.draws.diagnostics:
-        found = estimate.draws.diagnostics
+    lines += [f"Passed over: {text}." for text in _texts(estimate.diagnostics.get("passed_over"))]
+    return [*lines, method_line(estimate.draws)] if estimate.draws is not None else lines
+
+
+def method_line(draws: ParameterDraws) -> str:
+    """The method, how well the interval's ends are known, and what says so."""
+    found = draws.diagnostics
+    millimetres = f" ({found['end_error_mm']:.2g} mm of the widths)" if "end_error_mm" in found else ""
+    ends = f"interval ends to {found['end_error_sd']:.3f} SD{millimetres}, " if "end_error_sd" in found else ""
+    if draws.method == "ensemble":
         ess = min(found["ess_bulk"], found["ess_tail"])
-        lines.append(f"Method ensemble: R-hat {found['rhat']:.3f}, {ess:.0f} effective draws.")
-    elif estimate.draws is not None and "pareto_k" in estimate.draws.diagnostics:
-        found = estimate.draws.diagnostics
-        lines.append(
-            f"Method importance: interval ends to {found['end_error_sd']:.3f} SD, Pareto shape {found['pareto_k']:.2f}."
-        )
-    elif estimate.draws is not None:
-        lines.append(f"Method {estimate.draws.method}: {len(estimate.draws.flat)} independent draws.")
-    return lines
+        return f"Method ensemble: {ends}R-hat {found['rhat']:.3f}, {ess:.0f} effective draws."
+    if draws.method == "importance":
+        return f"Method importance: {ends}Pareto shape {found['pareto_k']:.2f}."
+    return f"Method {draws.method}: {len(draws.flat)} independent draws."
+
+
+def _scene(estimate: Estimate) -> list[str]:
+    """What the window holds, and how far the prior matters."""
+    lines = [] if estimate.scene is None else scene_lines(estimate.scene)
+    prior = "" if estimate.sensitivity is None else sensitivity_line(estimate.sensitivity)
+    return [*lines, prior] if prior else lines
 
 
 def _warnings(estimate: Estimate) -> list[str]:

@@ -1,0 +1,97 @@
+"""What a window holds and what was asked about it, in sentences and as plain data."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from tactile_bayes.posterior.scene_choice import SceneChoice, Structure
+from tactile_bayes.posterior.sensitivity import Sensitivity
+
+ASKED = {
+    "ellipse": "an ellipse, not a circle",
+    "rotated": "a turned ellipse",
+    "tilt": "a sloping level",
+    "second lump": "a second lump",
+    "rib": "a rib",
+}
+BUMP = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a turned ellipse"}
+LEAST_SHIFT_SD = 0.005
+
+
+def scene_lines(choice: SceneChoice) -> list[str]:
+    """The scene with its odds, what was kept in it all the same, and what was left out."""
+    beside = [one for one in choice.structures if one.used and one.place]
+    names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}" for one in beside)]
+    lines = [f"Scene: {' and '.join(names)}, the simplest that the map supports."]
+    for one in beside:
+        lines.append(
+            f"{ASKED[one.name].capitalize()} is in the model (odds {odds_text(one)}){_change(one, 'without')}."
+        )
+    kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
+    lines += [f"Kept open: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]
+    out = [
+        f"{ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'with')}" for one in choice.structures if not one.used
+    ]
+    return [*lines, f"Not in the model: {'; '.join(out)}."] if out else lines
+
+
+def odds_text(one: Structure) -> str:
+    """A Bayes factor as far as it means anything."""
+    if one.odds < 0.01:
+        return "below 0.01 to 1"
+    if one.odds > 1000:
+        return "above 1000 to 1"
+    return f"{'at most ' if one.bound else ''}{one.odds:.2g} to 1"
+
+
+def _change(one: Structure, word: str) -> str:
+    if one.change_x_sd is None or one.change_y_sd is None:
+        return ""
+    return f": {word} it sigma_x would change by {one.change_x_sd:+.1f} SD and sigma_y by {one.change_y_sd:+.1f} SD"
+
+
+def sensitivity_line(found: Sensitivity) -> str:
+    """How far the prior of the widths matters."""
+    names = {"max_size_mm": "the largest size", "sigma_x_mm": "sigma_x", "sigma_y_mm": "sigma_y"}
+    name = next((name for name in names if name in found.median), None)
+    if name is None:
+        return ""
+    median, ends = found.median[name], found.ends[name]
+    if max(abs(median), abs(ends)) < LEAST_SHIFT_SD:
+        return (
+            f"With a width prior twice as wide {names[name]} would stay where it is, to {LEAST_SHIFT_SD:g} of its SD."
+        )
+    return (
+        f"With a width prior twice as wide the median of {names[name]} would move by {median:+.2f} "
+        f"and an interval's end by up to {ends:+.2f} of its SD."
+    )
+
+
+def scene_document(choice: SceneChoice) -> dict[str, Any]:
+    """The scene as JSON holds it."""
+    scene = choice.fit.scene
+    return {
+        "supported": choice.supported,
+        "shape": scene.shape,
+        "tilt": scene.tilt,
+        "beside": scene.extra or None,
+        "structures": [_structure(one) for one in choice.structures],
+    }
+
+
+def _structure(one: Structure) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "odds": _finite(one.odds),
+        "odds_are_a_bound": one.bound,
+        "supported": one.supported,
+        "used": one.used,
+        "change_sigma_x_sd": _finite(one.change_x_sd),
+        "change_sigma_y_sd": _finite(one.change_y_sd),
+        "place": one.place,
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(f"{value:.6g}")
