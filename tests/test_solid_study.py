@@ -118,28 +118,30 @@ def test_half_the_cell_gives_the_same_map(d: float, depth_ratio: float, seat: fl
 
 
 QUICK = [("centred", 15.0, 1.0), ("resting", 20.0, 0.8)]
-WHERE_TAXELS_RESOLVE = [(d, q) for d in (10.0, 15.0, 20.0, 25.0) for q in (0.8, 1.0, 1.2, 1.5)]
+# The centred balls of 20 and 25 mm at h/d 1.5 do not show and are not in the table.
+WHERE_TAXELS_RESOLVE = [
+    (seat, d, q)
+    for seat in ("centred", "resting")
+    for d in (10.0, 15.0, 20.0, 25.0)
+    for q in (0.8, 1.0, 1.2, 1.5)
+    if (seat, q) != ("centred", 1.5) or d <= 15.0
+]
 
 
 @pytest.mark.parametrize(
     ("name", "d", "depth_ratio"),
-    [
-        *QUICK,
-        *[pytest.param(s, *c, marks=pytest.mark.slow) for s in ("centred", "resting") for c in WHERE_TAXELS_RESOLVE],
-    ],
+    [*QUICK, *[pytest.param(*case, marks=pytest.mark.slow) for case in WHERE_TAXELS_RESOLVE if case not in QUICK]],
 )
 def test_an_independent_models_phantoms_are_met(shared_data: Path, name: str, d: float, depth_ratio: float) -> None:
     """Its "resting" balls lie a tenth of their diameter above the gland: seat 1.2. Faint ones a little further off."""
     with (shared_data / "phantoms.csv").open(newline="") as file:
         table = [row for row in csv.DictReader(file) if row["seat"] == name]
-    known = [row for row in table if (float(row["d_mm"]), float(row["depth_ratio"])) == (d, depth_ratio)]
-    if not known:
-        pytest.skip("the table leaves out balls that do not show")
+    (known,) = (row for row in table if (float(row["d_mm"]), float(row["depth_ratio"])) == (d, depth_ratio))
     seat = 1.2 if name == "resting" else 0.0
     (row,) = run_solid_geometry(Geometry(seat, d, depth_ratio, (100.0,)), settings=SolidSettings(), fit=fit_raster)
-    assert row.amplitude == pytest.approx(float(known[0]["amplitude"]), rel=0.0125)
-    assert row.sigma_x_mm == pytest.approx(float(known[0]["sigma_x_mm"]), rel=0.01 if row.amplitude > 0.03 else 0.02)
-    assert row.sigma_y_mm == pytest.approx(float(known[0]["sigma_y_mm"]), rel=0.01)
+    assert row.amplitude == pytest.approx(float(known["amplitude"]), rel=0.0125)
+    assert row.sigma_x_mm == pytest.approx(float(known["sigma_x_mm"]), rel=0.01 if row.amplitude > 0.03 else 0.02)
+    assert row.sigma_y_mm == pytest.approx(float(known["sigma_y_mm"]), rel=0.01)
 
 
 GRID = "d_mm,depth_ratio,stiffness_ratio\n" + "".join(f"{d},{h},100\n" for d in (10, 15, 20) for h in (0.8, 1, 1.2))

@@ -80,8 +80,8 @@ class PlaneSection:
         What is below the skin; None for nothing.
     x_mm
         Place of the lump's axis.
-    mean_kpa, cell_mm, taxel_cells
-        The nominal pressure; width of the contact's cells, and how many a taxel has.
+    mean_kpa, cell_mm
+        The nominal pressure; width of the contact's cells, of which a taxel has six.
     reach_mm
         How far from the lump's axis the head's edges get.
     """
