@@ -243,6 +243,11 @@ class _SocketLine:
         self._line.close()
 
 
+def _say(words: str) -> None:
+    """One line to who started this process."""
+    os.write(sys.stdout.fileno(), f"{words}\n".encode())
+
+
 def main(words: list[str]) -> int:
     """``python -m tactile_bayes.hardware.ndi FD URL [ROM]``: one line on stdout says ``ready``, or what is wrong."""
     import importlib
@@ -251,10 +256,10 @@ def main(words: list[str]) -> int:
     try:
         tracker = NdiTracker(importlib.import_module(MODULE), words[1], rom=Path(words[2]) if len(words) > 2 else None)
     except DeviceError as error:
-        print(str(error), flush=True)
+        _say(str(error))
         return error.exit_code
-    print("ready", flush=True)
-    os.close(1)
+    _say("ready")
+    os.close(sys.stdout.fileno())
     try:
         serve(tracker, line)
     except (DeviceError, OSError):
