@@ -41,8 +41,9 @@ def alone(folder: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def ensemble_run(run_cli: Run, folder: Path) -> CompletedProcess[str]:
-    """One run of the default method, with its draws."""
-    return run_cli("estimate", "a.nc", "--size-calibration", "size.json", "-o", "post.nc", cwd=folder)
+    """One run of MCMC, with its draws."""
+    words = ("a.nc", "--size-calibration", "size.json", "--method", "ensemble", "-o", "post.nc")
+    return run_cli("estimate", *words, cwd=folder)
 
 
 def test_json_has_every_documented_key_and_passes_its_schema(alone: dict[str, str]) -> None:
@@ -167,7 +168,7 @@ def test_another_recipe_is_refused_with_the_difference(folder: Path) -> None:
 
 
 def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
-    done = run_here("estimate", "a.nc", "--max-steps", 150, cwd=folder)
+    done = run_here("estimate", "a.nc", "--method", "ensemble", "--max-steps", 150, cwd=folder)
     assert (done.returncode, done.stdout) == (5, "")
     assert done.stderr.count("\n") == 1
     assert "--max-steps" in done.stderr

@@ -27,7 +27,7 @@ EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.tom
 @click.option(
     "--method",
     type=click.Choice(METHODS),
-    default="ensemble",
+    default="importance",
     show_default=True,
     help="Of the estimate.",
 )

@@ -32,9 +32,9 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--method",
     type=click.Choice(METHODS),
-    default="ensemble",
+    default="importance",
     show_default=True,
-    help="ensemble: MCMC; importance: weighted draws; laplace: mode, curvature; optimise: the paper's least squares.",
+    help="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
 @click.option(
@@ -60,6 +60,19 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--centre-mm", type=(float, float), metavar="X Y", help="Where on the map to look; else the highest bump."
 )
+@click.option(
+    "--scene",
+    type=click.Choice(["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]),
+    default="auto",
+    show_default=True,
+    help="What the window holds; auto: the simplest scene that the map supports.",
+)
+@click.option(
+    "--prior", metavar="PRIOR.toml", type=_FILE, help="Other priors; the report prints those used (prior.schema.json)."
+)
+@click.option(
+    "--checkpoint", metavar="CHAIN.npz", type=_FILE, help="Of the ensemble: keep its state here, go on from it."
+)
 @click.option("--max-steps", type=click.IntRange(min=150), help="Of the ensemble, before it gives up.")
 @click.option(
     "--noise",
@@ -70,7 +83,13 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--accuracy-sd",
     type=click.FloatRange(min=0.001, max=0.5),
-    help="Of importance: error of interval ends, in posterior SDs; 0.02 if not given.",
+    help="Monte-Carlo error of interval ends, in posterior SDs; if not given, 0.02 for importance, 0.1 for the "
+    "ensemble.",
+)
+@click.option(
+    "--accuracy-mm",
+    type=click.FloatRange(min=0.0001, max=10.0),
+    help="The same of the map's widths, in mm; the finer of the two holds.",
 )
 @click.option(
     "--between-map-sd",
@@ -113,6 +132,10 @@ def command(
     max_steps: int | None,
     noise: str | None,
     accuracy_sd: float | None,
+    accuracy_mm: float | None,
+    scene: str,
+    prior: Path | None,
+    checkpoint: Path | None,
     between_map_sd: float | None,
     known: tuple[tuple[str, float], ...],
     pool: bool,
@@ -143,7 +166,13 @@ def command(
         accuracy_sd,
         between_map_sd,
         known,
+        scene,
+        accuracy_mm,
+        prior,
+        checkpoint,
     )
+    if checkpoint is not None and len(maps) > 1:
+        raise UsageError("--checkpoint takes one map at a time")
     outputs = {"output": output, "figure": figure, "map figure": map_figure}
     _check_outputs([path for path in outputs.values() if path], maps, _named(size_calibration), pool, force=force)
     begun = time.perf_counter()

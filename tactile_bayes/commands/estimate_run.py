@@ -38,6 +38,10 @@ class Settings:
     accuracy_sd: float | None
     between_map_sd: float | None = None
     known: tuple[tuple[str, float], ...] = ()
+    scene: str = "auto"
+    accuracy_mm: float | None = None
+    prior: Path | None = None
+    checkpoint: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +79,13 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     source, calibration, why_none = choose_calibration(settings, tactile_map)
     options = _options(settings, calibration)
     inputs = {"map": path} | ({"size_calibration": source} if source else {})
+    inputs |= {"prior": settings.prior} if settings.prior else {}
     digests = hash_inputs(**inputs)
+    if settings.checkpoint is not None:
+        from tactile_bayes.files.checkpoint_npz import CheckpointFile
+
+        context = digests.get("size_calibration", "no calibration")
+        options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
     # the map's own digest is part of the seed: a map's answer does not depend on its place in a list
     rng = np.random.default_rng([settings.seed, int(digests["map"][:16], 16)])
     try:
@@ -94,6 +104,8 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
         "noise": options.fit.noise,
         "accuracy_sd": settings.accuracy_sd,
+        "accuracy_mm": settings.accuracy_mm,
+        "scene": settings.scene,
         "between_map_sd": settings.between_map_sd,
         "known": dict(settings.known),
     }
@@ -133,6 +145,7 @@ def choose_calibration(
 
 def _options(settings: Settings, calibration: SizeCalibration | LogQuadratic | None) -> EstimateOptions:
     """What is not given is as the calibration's maps were fitted, else as the paper printed it."""
+    from tactile_bayes.files.prior_toml import read_prior
     from tactile_bayes.posterior.estimate import EstimateOptions
     from tactile_bayes.posterior.fit import FitOptions
 
@@ -147,6 +160,9 @@ def _options(settings: Settings, calibration: SizeCalibration | LogQuadratic | N
         max_steps=settings.max_steps,
         accuracy_sd=settings.accuracy_sd,
         size_priors=size_priors(settings),
+        prior=read_prior(settings.prior),
+        scene=settings.scene,
+        accuracy_mm=settings.accuracy_mm,
     )
 
 
@@ -164,14 +180,15 @@ def size_priors(settings: Settings) -> SizePriors:
 
 def answer_of(tactile_map: TactileMap, estimate: Estimate, provenance: Provenance, settings: Settings) -> Answer:
     """The report of one map."""
-    from tactile_bayes.posterior.bump import BumpPrior
+    from tactile_bayes.files.prior_toml import read_prior
     from tactile_bayes.report.estimate_document import estimate_document
     from tactile_bayes.report.estimate_text import estimate_text
 
+    prior = read_prior(settings.prior)
     document = estimate_document(
-        estimate, tactile_map, probability=settings.interval, prior=BumpPrior(), provenance=provenance
+        estimate, tactile_map, probability=settings.interval, prior=prior, provenance=provenance
     )
-    text = estimate_text(estimate, tactile_map, probability=settings.interval)
+    text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     return Answer(document, text, exit_code, _shape(tactile_map, estimate))
 

@@ -66,7 +66,7 @@ class EstimateOptions:
         Where an ensemble keeps its state between runs, under a noise field.
     """
 
-    method: str = "ensemble"
+    method: str = "importance"
     fit: FitOptions = field(default_factory=FitOptions)
     prior: BumpPrior = field(default_factory=BumpPrior)
     least_probability: float = DETECTED
@@ -173,6 +173,9 @@ def estimate_map(
     detection = seen if isinstance(seen, Detection) else seen.detection
     if detection.probability < options.least_probability:
         return _none(undetected(detection.probability, options.least_probability), candidates, detection)
+    if options.scene == "none":
+        chance = f"the map gives one a probability of {detection.probability:.2g}"
+        return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)
     scene: SceneChoice | None = None
     if not isinstance(seen, Detection):
         try:
@@ -270,7 +273,14 @@ def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:
 
 def _check_options(options: EstimateOptions) -> None:
     if options.fit.noise != "field":
+        asked = {"scene": options.scene not in ("auto", "none"), "accuracy in mm": options.accuracy_mm is not None}
+        asked |= {"checkpoint": options.store is not None}
+        for name, given in asked.items():
+            if given:
+                raise UsageError(f"a {name} goes with correlated errors; give --noise field")
         return
+    if options.store is not None and options.method != "ensemble":
+        raise UsageError("only the ensemble has checkpoints; give --method ensemble")
     if options.method == "optimise":
         raise UsageError("optimise is the paper's least squares and has no noise field; choose another --method")
     if options.fit.background != "free":
@@ -297,8 +307,11 @@ def _draw(
     if options.method == "importance":
         from tactile_bayes.posterior.importance import importance, importance_options
 
-        return importance(target, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
-    if options.method == "ensemble":
+        try:
+            return importance(target, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
+        except NotConvergedError:
+            pass  # its weights cannot be trusted here; chains need none
+    if options.method in ("importance", "ensemble"):
         from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
 
         settings = EnsembleOptions()

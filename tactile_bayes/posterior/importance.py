@@ -13,8 +13,12 @@ from tactile_bayes.posterior.laplace import LogDensity
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.sobol import BITS, shifted_sobol
 
-STRETCH = 0.3
-"""Bend of the proposal's tails: normal coordinates z become sinh(b z) / b, normal in the middle, log-normal outside."""
+STRETCH, WIDE_STRETCH = 0.3, 1.0
+"""Bend of the proposal's tails: normal coordinates z become sinh(b z) / b, normal in the middle, log-normal outside.
+
+The wide one is for densities with tails like a t: from a few thousand points it needs a quarter of the narrow one's."""
+HEAVY_TAIL = 0.3
+"""Pareto shape of the first points' weights above which the wide proposal is taken."""
 POOR = 0.5
 """Below this share of effective draws the proposal is moved to the weighted moments of the points so far."""
 MOST_MOVES = 4
@@ -120,16 +124,21 @@ def _settled(
     options: ImportanceOptions,
 ) -> _Sampler:
     """The first points, from a proposal that was moved while it was poor."""
-    spent = 0
+    spent, stretch = 0, STRETCH
     for _ in range(MOST_MOVES):
-        sampler = _Sampler(log_density, mode, covariance, replicates=options.replicates, rng=rng, spent=spent)
+        sampler = _Sampler(
+            log_density, mode, covariance, stretch=stretch, replicates=options.replicates, rng=rng, spent=spent
+        )
         sampler.extend(options.first)
-        weights, _ = sampler.weights()
+        weights, shape = sampler.weights()
         if not np.isfinite(weights).all():
             raise NotConvergedError(
                 "importance sampling found no density about the mode; use --method ensemble",
                 diagnostics={"pareto_k": float("nan")},
             )
+        if shape > HEAVY_TAIL and stretch < WIDE_STRETCH:
+            stretch, spent = WIDE_STRETCH, sampler.evaluations
+            continue
         if 1.0 / np.sum(weights**2) > POOR * sampler.number:
             break
         moved = sampler.theta - weights @ sampler.theta
@@ -149,12 +158,13 @@ class _Sampler:
         mode: FloatArray,
         covariance: FloatArray,
         *,
+        stretch: float,
         replicates: int,
         rng: np.random.Generator,
         spent: int,
     ) -> None:
         p = len(mode)
-        self._log_density, self._mode = log_density, mode
+        self._log_density, self._mode, self._stretch = log_density, mode, stretch
         self._root = np.linalg.cholesky(covariance)
         self._shifts = rng.integers(2**BITS, size=(replicates, p), dtype=np.uint32)
         self._spent = spent
@@ -184,14 +194,14 @@ class _Sampler:
     def extend(self, points: int) -> None:
         """Add `points` to every replicate."""
         z = normal_quantile(shifted_sobol(self.points, points, shifts=self._shifts))
-        theta = self._mode + np.sinh(STRETCH * z) / STRETCH @ self._root.T
+        theta = self._mode + np.sinh(self._stretch * z) / self._stretch @ self._root.T
         log_target = self._log_density(theta.reshape(-1, len(self._mode))).reshape(theta.shape[:2])
         self._theta = np.concatenate([self._theta, theta], axis=1)
         self._log_weights = np.concatenate([self._log_weights, log_target - self._log_proposal(z)], axis=1)
 
     def _log_proposal(self, z: FloatArray) -> FloatArray:
         log_det = float(np.log(np.diag(self._root)).sum())
-        parts = -0.5 * z**2 - np.log(np.cosh(STRETCH * z)) - 0.5 * np.log(2 * np.pi)
+        parts = -0.5 * z**2 - np.log(np.cosh(self._stretch * z)) - 0.5 * np.log(2 * np.pi)
         return np.asarray(parts.sum(axis=-1) - log_det)
 
     def weights(self) -> tuple[FloatArray, float]:

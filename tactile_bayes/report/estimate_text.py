@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.quantity import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_quantities
-from tactile_bayes.report.scene_text import scene_lines, sensitivity_line
+from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
 from tactile_bayes.report.size_text import shape_text, variance_text
 
 ROWS = (
@@ -39,7 +40,9 @@ def decimals(mc_error: float, *, most: int = 3) -> int:
     return min(most, max(0, -math.floor(math.log10(2.0 * mc_error))))
 
 
-def estimate_text(estimate: Estimate, tactile_map: TactileMap, *, probability: float) -> str:
+def estimate_text(
+    estimate: Estimate, tactile_map: TactileMap, *, probability: float, prior: BumpPrior | None = None
+) -> str:
     """The report of one map: what was found with its interval, where the uncertainty comes from, what was left out."""
     if estimate.status == "no_estimate":
         advice = [f"What would help: {estimate.advice}."] if estimate.advice else []
@@ -48,8 +51,9 @@ def estimate_text(estimate: Estimate, tactile_map: TactileMap, *, probability: f
     lines = [_table(quantities, probability), ""]
     if estimate.reason:
         lines.append(f"No size: {estimate.reason}.")
-    lines += [*_findings(estimate), *_scene(estimate), *_warnings(estimate), *_left_out(estimate), RESEARCH_USE]
-    return "\n".join(lines) + "\n"
+    lines += [*_findings(estimate), *_scene(estimate), *_warnings(estimate), *_left_out(estimate)]
+    lines += [] if prior is None else [prior_line(prior, field=estimate.diagnostics.get("noise") == "field")]
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
 def _table(quantities: dict[str, Quantity], probability: float) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.field import LENGTHS_MM, SHARES
 from tactile_bayes.posterior.scene_choice import SceneChoice, Structure
 from tactile_bayes.posterior.sensitivity import Sensitivity
 
@@ -66,6 +68,25 @@ def sensitivity_line(found: Sensitivity) -> str:
         f"With a width prior twice as wide the median of {names[name]} would move by {median:+.2f} "
         f"and an interval's end by up to {ends:+.2f} of its SD."
     )
+
+
+def prior_line(prior: BumpPrior, *, field: bool) -> str:
+    """Every prior of the map's posterior."""
+    parts = [
+        f"amplitude normal about 0 with SD {prior.amplitude_sd:g} of the map's scale",
+        f"mean width log-normal about {prior.width_median_mm:g} mm with SD {prior.log_width_sd:g} of its log",
+        f"half the log axis ratio normal with SD {prior.log_ratio_sd:g}",
+        "centre uniform in the window",
+        "noise scale 1/tau",
+    ]
+    if field:
+        parts += [
+            "level and tilt flat",
+            f"the odds of a tilt with SD {prior.tilt_sd:g} of the map's scale over half a window",
+            f"correlation length {', '.join(f'{length:g}' for length in LENGTHS_MM)} mm equally likely",
+            f"share of the field {len(SHARES)} values from 0 to {SHARES[-1]:g} equally likely",
+        ]
+    return f"Priors: {'; '.join(parts)}."
 
 
 def scene_document(choice: SceneChoice) -> dict[str, Any]:

@@ -1,0 +1,119 @@
+"""No number, why, and what would help: each reason from the map that brings it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tactile_bayes.errors import NotConvergedError, UsageError
+from tactile_bayes.posterior import methods
+from tactile_bayes.posterior.abstention import CODES, extend_advice, fault_code, missing_strokes, shape_fault
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.fit import Candidate, FitOptions, fit_bump
+from tactile_bayes.report.estimate_text import estimate_text
+from tests.posterior_maps import bump_map, bump_values, grid_map
+
+FIELD = FitOptions(background="free", noise="field")
+WHITE = 0.01 * np.random.default_rng(4).standard_normal((51, 51))
+
+
+def run(values: np.ndarray, **options: object) -> Estimate:
+    settings = EstimateOptions(fit=FIELD, **options)  # type: ignore[arg-type]
+    return estimate_map(grid_map(values), calibration=None, options=settings, rng=np.random.default_rng(1))
+
+
+def cut(*, right: int) -> np.ndarray:
+    values = bump_values(x=0.0, y=0.0, sigma_x=6.0, sigma_y=6.0) + WHITE
+    values[:, 25 + right :] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("values", "code", "advice"),
+    [
+        (np.full((9, 9), np.nan), "empty", "map a scan"),
+        (np.ones((51, 51)), "empty", ""),
+        (1 + WHITE, "undetected", "go over the place again"),
+        (cut(right=1), "window", "mm to the right (+x)"),
+    ],
+)
+def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advice: str) -> None:
+    found = run(values)
+    assert found.status == "no_estimate"
+    assert (found.code, found.code in CODES) == (code, True), found.reason
+    assert advice in found.advice
+    text = estimate_text(found, grid_map(values), probability=0.95)
+    assert ("What would help" in text) == bool(found.advice)
+
+
+@pytest.mark.parametrize(
+    ("bump", "fault", "code", "advice"),
+    [
+        ({"sigma_x": 16.0, "sigma_y": 16.0}, "wider than the window", "window", "fit a larger window"),
+        ({"sigma_x": 0.3, "sigma_y": 0.3, "x": 0.0, "y": 0.0}, "narrower than a cell", "unresolved", "--cell-mm"),
+        ({"sigma_x": 12.0, "sigma_y": 1.5, "x": 0.0, "y": 0.0}, "a ridge", "unresolved", "rib"),
+        ({"amplitude": -0.3}, "a depression", "undetected", ""),
+    ],
+)
+def test_a_bump_that_cannot_be_measured_has_its_code(
+    bump: dict[str, float], fault: str, code: str, advice: str
+) -> None:
+    tactile_map = grid_map(bump_values(half_mm=45.0, **bump))
+    fit, found = fit_bump(tactile_map, (bump.get("x", 1.3), bump.get("y", -0.8)), options=FitOptions())
+    assert fault in found
+    answer = fault_code(tactile_map, Candidate((0.0, 0.0), fit, found))
+    assert answer[0] == code
+    assert advice in answer[1]
+
+
+def test_a_measurable_lump_has_neither() -> None:
+    found = run(bump_values() + WHITE)
+    assert (found.status, found.code, found.advice) == ("estimate", "", "")
+
+
+@pytest.mark.parametrize("reached", [3, 6, 9])
+def test_missing_strokes_are_counted_from_the_centre(reached: int) -> None:
+    short = missing_strokes(grid_map(cut(right=reached)), (0.0, 0.0), reach_mm=12.0)
+    assert list(short) == ["the right (+x)"]
+    assert short["the right (+x)"] == pytest.approx(12.0 - (reached - 0.5), abs=1.0)
+    assert extend_advice(short).startswith("extend the strokes ")
+    assert missing_strokes(grid_map(bump_values()), (0.0, 0.0), reach_mm=12.0) == {}
+
+
+def test_a_posterior_as_wide_as_its_prior_is_no_answer() -> None:
+    rng = np.random.default_rng(2)
+    vague = np.exp(np.log(5.0) + 0.8 * rng.standard_normal(4000))
+    fault = shape_fault(vague, vague, cell_mm=1.0, prior=BumpPrior())
+    assert fault is not None
+    assert fault.code == "prior"
+    sharp = np.exp(np.log(5.0) + 0.2 * rng.standard_normal(4000))
+    assert shape_fault(sharp, sharp, cell_mm=1.0, prior=BumpPrior()) is None
+
+
+def test_when_every_method_fails_there_is_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise NotConvergedError("too heavy", diagnostics={})
+
+    for name in ("importance_draws", "ensemble_draws"):
+        monkeypatch.setattr(methods, name, fails)
+    found = run(bump_values() + WHITE)
+    assert found.code == "method"
+    assert "importance: too heavy; ensemble: too heavy" in found.reason
+
+
+def test_assuming_no_lump_gives_its_probability_only() -> None:
+    found = run(bump_values() + WHITE, scene="none")
+    assert found.status == "no_estimate"
+    assert "probability of 1" in found.reason
+
+
+@pytest.mark.parametrize("options", [{"scene": "round"}, {"accuracy_mm": 0.1}])
+def test_what_needs_a_field_is_refused_without(options: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="give --noise field"):
+        estimate_map(
+            bump_map(noise=WHITE),
+            calibration=None,
+            options=EstimateOptions(fit=FitOptions(), **options),  # type: ignore[arg-type]
+            rng=np.random.default_rng(1),
+        )
