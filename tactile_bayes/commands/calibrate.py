@@ -61,6 +61,13 @@ def command() -> None:
     show_default=True,
     help="The errors they were fitted under (declared); least squares is independent.",
 )
+@click.option(
+    "--least-stiffness-ratio",
+    type=click.FloatRange(min=0.0),
+    default=0.0,
+    show_default=True,
+    help="Leave out softer lumps: above 8 the paper's widths change by less than 5 %.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
 @click.pass_context
@@ -74,6 +81,7 @@ def size(
     background: str,
     fit_radius_mm: float,
     noise: str,
+    least_stiffness_ratio: float,
     seed: int,
     force: bool,
 ) -> None:
@@ -110,10 +118,18 @@ def size(
     rng = np.random.default_rng(seed)
     try:
         with progress_bar("effective draws") as progress:
-            calibration = learn_size_calibration(size_table(rows), recipe=recipe, rng=rng, progress=progress)
+            calibration = learn_size_calibration(
+                size_table(rows, least_stiffness_ratio=least_stiffness_ratio), recipe=recipe, rng=rng, progress=progress
+            )
     except BadDataError as error:
         raise error.at(table) from None
-    settings = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
+    settings = {
+        "normalise": normalise,
+        "background": background,
+        "fit_radius_mm": fit_radius_mm,
+        "noise": noise,
+        "least_stiffness_ratio": least_stiffness_ratio,
+    }
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, calibration, provenance=provenance, force=force)
     click.echo(calibration_text(calibration), nl=False)
@@ -122,7 +138,7 @@ def size(
 def _refuse_declared(ctx: click.Context) -> None:
     from tactile_bayes.errors import UsageError
 
-    for name in ("normalise", "background", "fit_radius_mm", "noise", "seed"):
+    for name in ("normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "seed"):
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
             raise UsageError(f"--{option} is for --form eq6: a table of `population` fixes how its maps were made")
@@ -189,15 +205,18 @@ def array(
     click.echo(calibrate_array(steps, output, head_id=head_id, day=measured, force=force), nl=False)
 
 
-def size_table(table: Table) -> SizeTable:
-    """The columns of a table as arrays, with Delta sigma where the table has depths."""
+def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:
+    """The columns of a table as arrays, with Delta sigma where the table has depths; softer lumps are left out."""
     import numpy as np
 
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.posterior.learn_size import SizeTable, width_changes
 
     # a study says which of its lumps show; the others' fits are fits to a trough
-    shown = [flag is not False for flag in table.columns.get("detectable", [None] * len(table))]
+    shown = [
+        flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
+        for flag, ratio in zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
+    ]
     columns = {
         name: [v for v, keep in zip(values, shown, strict=True) if keep] for name, values in table.columns.items()
     }

@@ -94,6 +94,9 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         raise error.at(path) from None
     if why_none and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none)
+    if calibration is not None and estimate.size is not None:
+        words = _calibration_words(settings, calibration)
+        estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
     recorded = {
         "size_calibration": settings.calibration or ("solid (shipped)" if calibration is not None else "none"),
         "method": settings.method,
@@ -110,6 +113,19 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         "known": dict(settings.known),
     }
     return tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed)
+
+
+def _calibration_words(settings: Settings, calibration: SizeCalibration | LogQuadratic) -> str:
+    """Which calibration gave the size, and what it cannot know."""
+    from tactile_bayes.files.shipped import DEFAULT, SHIPPED
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.report.quadratic_text import unknowns_text
+
+    name = settings.calibration or DEFAULT
+    words = f"Sizes by the {'shipped calibration ' if name in SHIPPED else 'calibration '}{name}"
+    if isinstance(calibration, LogQuadratic):
+        words += f" ({calibration.source}); {unknowns_text(calibration.unknowns)}"
+    return words
 
 
 def choose_calibration(

@@ -33,7 +33,7 @@ def read_stated_size(path: Path) -> StatedSize:
     Raises
     ------
     BadDataError
-        When the file is neither `estimate --json` of one map nor a posterior, or holds no size.
+        When the file is neither `estimate --json` of one map or one mass nor a posterior, or holds no size.
     """
     try:
         with path.open("rb") as file:
@@ -106,7 +106,8 @@ def _from_json(path: Path) -> StatedSize:
             what = f"holds {len(document)} estimates"
             raise BadDataError(what, way_out="write each map's estimate to a file of its own", path=str(path))
         document = document[0]
-    check_document(document, "estimate.schema.json", path=path)
+    pooled = isinstance(document, dict) and str(document.get("schema", "")).startswith("tactile-bayes/pooled/")
+    check_document(document, "pooled.schema.json" if pooled else "estimate.schema.json", path=path)
     size = document["max_size_mm"]
     if size is None:
         return StatedSize()

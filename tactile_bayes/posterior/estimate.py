@@ -14,14 +14,15 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import Abstention, no_bump, shape_fault, undetected
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.chain_state import ChainStore
-from tactile_bayes.posterior.detection import Detection, detect
+from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, find_bump, rotation_odds
+from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, rotation_odds
 from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.noise import level_offset
 from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.search import ROTATION_ODDS, scene_asked, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
 from tactile_bayes.posterior.size_calibration import SizeCalibration
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.scene_choice import SceneChoice
 
 Status = Literal["estimate", "no_estimate"]
-ROTATION_ODDS = 3.0
-"""A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
 DETECTED = 0.95
 MOST_INVALID = 0.05
 
@@ -162,14 +161,12 @@ def estimate_map(
         check_recipe(tactile_map, calibration, options.fit)
     if not tactile_map.covered.any():
         return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place"))
-    candidates = tuple(find_bump(tactile_map, _search_options(tactile_map, options.fit)))
+    candidates, seen = search(tactile_map, options)
     if not candidates:
         return _none(Abstention("empty", "nothing rises above the background"))
-    chosen = candidates[-1]
-    if chosen.fault or chosen.fit is None:
+    fit = candidates[-1].fit
+    if seen is None or fit is None:
         return _none(no_bump(tactile_map, candidates), candidates)
-    fit = chosen.fit
-    seen = _look(tactile_map, fit, options)
     detection = seen if isinstance(seen, Detection) else seen.detection
     if detection.probability < options.least_probability:
         return _none(undetected(detection.probability, options.least_probability), candidates, detection)
@@ -259,16 +256,6 @@ def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuad
             f"the size calibration was learned by another recipe: {'; '.join(differs)}",
             way_out="build and fit the map as the calibration's maps were, or learn a calibration for this recipe",
         )
-
-
-def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:
-    """Options of the least squares that looks for a lump.
-
-    Under a noise field it only has to find the place: there the known level holds it better than a free one, which a
-    rib at the window's rim can lift.
-    """
-    known = fit.noise == "field" and tactile_map.background is not None
-    return replace(fit, background="fixed") if known else fit
 
 
 def _check_options(options: EstimateOptions) -> None:
@@ -367,32 +354,6 @@ def _size(
     )
 
 
-def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Detection | FieldAnswer:
-    """Whether there is a lump; under a noise field with the fit that says so."""
-    if options.fit.noise != "field":
-        return detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
-    from tactile_bayes.posterior.field_estimate import look
-
-    try:
-        return look(
-            tactile_map,
-            fit,
-            prior=options.prior,
-            radius_mm=options.fit.radius_mm,
-            scene=_scene(options),
-            least_odds=ROTATION_ODDS,
-        )
-    except NotConvergedError:
-        # no mode: under these errors nothing stands out that could be weighed
-        return Detection(0.0, -np.inf)
-
-
-def _scene(options: EstimateOptions) -> str:
-    """The scene asked for; the option that turns the ellipse decides where none was named."""
-    turned = {"on": "rotated", "off": "ellipse"}.get(options.fit.rotation, "auto")
-    return turned if options.scene == "auto" else options.scene
-
-
 def _draw_under_field(
     seen: FieldAnswer,
     tactile_map: TactileMap,
@@ -409,7 +370,7 @@ def _draw_under_field(
         tactile_map,
         options.method,
         rng=rng,
-        scene=_scene(options),
+        scene=scene_asked(options),
         options=MethodOptions(options.accuracy_sd, options.accuracy_mm, options.max_steps, options.store),
         progress=progress,
     )

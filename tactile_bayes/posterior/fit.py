@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -141,14 +142,19 @@ def find_bump(tactile_map: TactileMap, options: FitOptions) -> list[Candidate]:
         All that were tried. The last has no fault when a bump was found. Empty when nothing rises above the
         background.
     """
-    centres = [options.centre_mm] if options.centre_mm is not None else candidate_centres(tactile_map)
     tried: list[Candidate] = []
-    for centre in centres:
-        fit, fault = fit_bump(tactile_map, centre, options=options)
-        tried.append(Candidate(centre, fit, fault))
-        if not fault:
+    for candidate in fitted_candidates(tactile_map, options):
+        tried.append(candidate)
+        if not candidate.fault:
             break
     return tried
+
+
+def fitted_candidates(tactile_map: TactileMap, options: FitOptions) -> Iterator[Candidate]:
+    """The places where a lump could be, highest first, each fitted when it is asked for."""
+    centres = [options.centre_mm] if options.centre_mm is not None else candidate_centres(tactile_map)
+    for centre in centres:
+        yield Candidate(centre, *fit_bump(tactile_map, centre, options=options))
 
 
 def fit_bump(

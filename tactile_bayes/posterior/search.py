@@ -1,0 +1,118 @@
+"""Where the lump is: the places a map offers, highest first, each fitted, weighed and doubted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.cells import covered_share
+from tactile_bayes.posterior.detection import Detection, detect
+from tactile_bayes.posterior.fit import (
+    LEAST_COVERED_SHARE,
+    LEAST_WIDTH_IN_CELLS,
+    BumpFit,
+    Candidate,
+    FitOptions,
+    fitted_candidates,
+)
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.estimate import EstimateOptions
+    from tactile_bayes.posterior.field_estimate import FieldAnswer
+
+MOST_LOOKS = 3
+"""Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
+ROTATION_ODDS = 3.0
+"""A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
+
+
+def search(
+    tactile_map: TactileMap, options: EstimateOptions
+) -> tuple[tuple[Candidate, ...], Detection | FieldAnswer | None]:
+    """The highest bump that can be a lump, still can once correlated errors are weighed, and is one by the evidence.
+
+    Returns
+    -------
+    candidates
+        All that were looked at; the answer is the last one's.
+    answer
+        None where no candidate can be a lump. Where none is one by the evidence, that of the first.
+    """
+    tried: list[Candidate] = []
+    first: tuple[Candidate, Detection | FieldAnswer] | None = None
+    looks = 0
+    for candidate in fitted_candidates(tactile_map, _search_options(tactile_map, options.fit)):
+        tried.append(candidate)
+        if candidate.fault or candidate.fit is None:
+            continue
+        seen = _look(tactile_map, candidate.fit, options)
+        fault = "" if isinstance(seen, Detection) else _field_fault(tactile_map, seen)
+        if fault:
+            tried[-1] = replace(candidate, fault=fault)
+            continue
+        probability = (seen if isinstance(seen, Detection) else seen.detection).probability
+        if probability >= options.least_probability:
+            return tuple(tried), seen
+        first, looks = first or (candidate, seen), looks + 1
+        if looks == MOST_LOOKS:
+            break
+        tried[-1] = replace(candidate, fault=f"no lump by the evidence (probability {probability:.2g})")
+    if first is None:
+        return tuple(tried), None
+    return (*(one for one in tried if one.centre_mm != first[0].centre_mm), first[0]), first[1]
+
+
+def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
+    """Under correlated errors a rise at the map's edge can grow to lie mostly beyond it, or shrink to a single cell."""
+    from tactile_bayes.posterior.field_posterior import shape_draws
+
+    plain, cell = seen.choice.plain, tactile_map.recipe.cell_mm
+    sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
+    centre = tuple(float(plain.scene.column(plain.mode[None], name)[0]) for name in ("x", "y"))
+    wide, narrow = max(sigma_x, sigma_y), min(sigma_x, sigma_y)
+    share = covered_share(tactile_map, (centre[0], centre[1]), radius_mm=1.5 * wide)
+    if share < LEAST_COVERED_SHARE:
+        return f"at the rim of the map ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
+    if narrow < LEAST_WIDTH_IN_CELLS * cell:
+        return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
+    return ""
+
+
+def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:
+    """Options of the least squares that looks for a lump.
+
+    Under a noise field it only has to find the place: there the known level holds it better than a free one, which a
+    rib at the window's rim can lift.
+    """
+    known = fit.noise == "field" and tactile_map.background is not None
+    return replace(fit, background="fixed") if known else fit
+
+
+def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Detection | FieldAnswer:
+    """Whether there is a lump; under a noise field with the fit that says so."""
+    if options.fit.noise != "field":
+        return detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
+    from tactile_bayes.posterior.field_estimate import look
+
+    try:
+        return look(
+            tactile_map,
+            fit,
+            prior=options.prior,
+            radius_mm=options.fit.radius_mm,
+            scene=scene_asked(options),
+            least_odds=ROTATION_ODDS,
+        )
+    except NotConvergedError:
+        # no mode: under these errors nothing stands out that could be weighed
+        return Detection(0.0, -np.inf)
+
+
+def scene_asked(options: EstimateOptions) -> str:
+    """The scene asked for; the option that turns the ellipse decides where none was named."""
+    turned = {"on": "rotated", "off": "ellipse"}.get(options.fit.rotation, "auto")
+    return turned if options.scene == "auto" else options.scene

@@ -1,0 +1,148 @@
+"""`estimate` with the calibration that comes with the program, `--pool` and `--known`, as a user runs them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run_here
+from posterior_files import MADE, write_calibration, write_maps
+from posterior_maps import bump_map, grid_map
+
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.schema import check_document
+from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_posterior import read_stated_size
+
+FAST = ("--method", "laplace")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("pool")
+    write_maps(place)
+    write_calibration(place / "eq6.json")
+    rng = np.random.default_rng(5)
+    for i in range(4):
+        noise = 0.01 * rng.standard_normal((51, 51))
+        # the fourth is of another, far larger mass
+        sigma = (4.0, 4.0) if i < 3 else (9.0, 9.0)
+        tactile_map = bump_map(noise=noise, amplitude=0.3, sigma_x=sigma[0], sigma_y=sigma[1])
+        write_map(place / f"mass{i + 1}.nc", tactile_map, provenance=MADE)
+    flat = grid_map(np.ones((41, 41)) + 0.01 * rng.standard_normal((41, 41)), background=None, normalise="none")
+    write_map(place / "plain.nc", flat, provenance=MADE)
+    return place
+
+
+@pytest.fixture(scope="module")
+def pooled(folder: Path) -> dict:
+    done = run_here(
+        "estimate", "mass1.nc", "mass2.nc", "mass3.nc", "--pool", "--json", "-o", "post.nc", "--figure", "size.png",
+        *FAST, cwd=folder,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_each_shipped_calibration_opens_and_says_what_it_was_made_of(name: str) -> None:
+    path = size_calibration_path(name)
+    assert path is not None
+    document = json.loads(path.read_text())
+    read_size_calibration(path)
+    assert document["provenance"]["command"].startswith("calibrate size")
+    assert document["provenance"]["inputs"]
+
+
+def test_without_a_word_the_shipped_calibration_is_used_and_named(folder: Path) -> None:
+    done = run_here("estimate", "mass1.nc", *FAST, cwd=folder)
+    assert done.returncode == 0
+    assert "largest size" in done.stdout
+    assert "shipped calibration solid" in done.stdout
+    document = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)
+    assert document["provenance"]["settings"]["size_calibration"] == "solid (shipped)"
+    assert document["max_size_mm"]["median"] > 0
+
+
+def test_none_gives_widths_and_a_map_made_otherwise_says_why_it_has_no_size(folder: Path) -> None:
+    done = run_here("estimate", "mass1.nc", *FAST, "--size-calibration", "none", cwd=folder)
+    assert "largest size" not in done.stdout
+    assert "no size calibration was given" in done.stdout
+    other = run_here("estimate", "mass1.nc", *FAST, "--fit-radius-mm", "15", cwd=folder)
+    assert "the shipped calibration does not fit: fit radius 15 mm" in other.stdout
+    asked = run_here("estimate", "mass1.nc", *FAST, "--fit-radius-mm", "15", "--size-calibration", "solid", cwd=folder)
+    assert asked.returncode == 3
+    assert "another recipe" in asked.stderr
+
+
+def test_a_pooled_mass_keeps_its_schema_and_its_maps(pooled: dict, folder: Path) -> None:
+    check_document(pooled, "pooled.schema.json", path=Path("stdout"))
+    assert [one["map"] for one in pooled["maps"]] == ["mass1.nc", "mass2.nc", "mass3.nc"]
+    alone = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)["max_size_mm"]
+    size = pooled["max_size_mm"]
+    assert size["low"] < size["median"] < size["high"]
+    assert size["high"] - size["low"] < 0.8 * (alone["high"] - alone["low"])
+    assert sum(pooled["variance_share"].values()) == pytest.approx(100.0)
+    assert (folder / "size.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_validate_reads_a_pooled_mass_from_json_and_from_draws(pooled: dict, folder: Path) -> None:
+    (folder / "pooled.json").write_text(json.dumps(pooled))
+    from_json, from_draws = (read_stated_size(folder / name) for name in ("pooled.json", "post.nc"))
+    assert from_json.size_mm == pytest.approx(pooled["max_size_mm"]["median"])
+    assert from_draws.size_mm == pytest.approx(from_json.size_mm, rel=1e-6)
+    assert from_draws.low_mm == pytest.approx(from_json.low_mm, rel=1e-6)
+
+
+def test_the_order_of_the_maps_leaves_the_size(pooled: dict, folder: Path) -> None:
+    turned = run_here("estimate", "mass3.nc", "mass1.nc", "mass2.nc", "--pool", "--json", *FAST, cwd=folder)
+    other = json.loads(turned.stdout)["max_size_mm"]
+    sd = pooled["max_size_mm"]["sd"]
+    for end in ("median", "low", "high"):
+        assert other[end] == pytest.approx(pooled["max_size_mm"][end], abs=0.1 * sd)
+
+
+def test_a_map_of_another_mass_is_named(folder: Path) -> None:
+    done = run_here("estimate", "mass1.nc", "mass2.nc", "mass3.nc", "mass4.nc", "--pool", *FAST, cwd=folder)
+    assert done.returncode == 0
+    line = next(line for line in done.stdout.splitlines() if line.startswith("mass4.nc"))
+    assert "lies apart" in line
+    assert done.stdout.count("lies apart") == 1
+
+
+def test_a_mass_seen_on_too_few_maps_gets_no_size(folder: Path) -> None:
+    done = run_here("estimate", "a.nc", "empty.nc", "plain.nc", "--pool", *FAST, cwd=folder)
+    assert done.returncode in (3, 6)
+    some = run_here("estimate", "empty.nc", "--pool", *FAST, cwd=folder)
+    assert some.returncode == 6
+    assert "No estimate: a lump was found on 0 of 1 maps" in some.stdout
+
+
+def test_a_known_seat_moves_the_size(folder: Path) -> None:
+    def median(*more: str) -> float:
+        done = run_here("estimate", "mass1.nc", *FAST, "--between-map-sd", "0", "--json", *more, cwd=folder)
+        return json.loads(done.stdout)["max_size_mm"]["median"]
+
+    assert median("--known", "seat", "0") > 1.03 * median() > 1.06 * median("--known", "seat", "1.2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["mass1.nc", "--known", "weather", "1"], 2, "nothing of weather; it knows depth_mm"),
+        (["mass1.nc", "--known", "depth_mm", "0"], 2, "depth_mm is 0"),
+        (["mass1.nc", "--known", "seat", "-1"], 2, "seat is -1"),
+        (["mass1.nc", "mass2.nc", "--pool", "--size-calibration", "none"], 2, "--pool needs a size calibration"),
+        (["mass1.nc", "mass2.nc", "--pool", "--size-calibration", "eq6.json"], 2, "use solid"),
+        (["mass1.nc", "mass2.nc", "--pool", "--map-figure", "x.png"], 2, "--map-figure"),
+        (["mass1.nc", "broken.nc", "--pool"], 3, "broken.nc"),
+        (["mass1.nc", "--between-map-sd", "-1"], 2, "--between-map-sd"),
+    ],
+)
+def test_mistakes_end_in_one_line(folder: Path, arguments: list[str], code: int, words: str) -> None:
+    done = run_here("estimate", *arguments, *FAST, cwd=folder)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert words in done.stderr

@@ -1,0 +1,140 @@
+"""`population` and the calibration learned from its table, as a user runs them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run_here
+
+from tactile_bayes.commands import population
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.forward.population import BodyPrior, draw_mass
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.measure import MassRow, measure_mass
+
+
+def row(body: int, exam: int, *, seed: int = 0) -> MassRow:
+    """A row whose size follows the map exactly: ln d = 2.6 + 0.3 ln a + ln sigma - 1.4."""
+    rng = np.random.default_rng([seed, body])
+    log_a, log_s, seat = rng.normal(-1, 0.8), rng.normal(1.4, 0.4), rng.uniform(0, 1.2)
+    d = float(np.exp(2.6 + 0.3 * log_a + log_s - 1.4 + rng.normal(0, 0.05)))
+    wobble = float(np.random.default_rng([seed, body, exam]).normal(0, 0.01))
+    shape = (float(np.exp(log_a)), float(np.exp(log_s + wobble)), float(np.exp(log_s + wobble)))
+    return MassRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("population") / "population.csv"
+    rows = [row(body, exam) for body in range(40) for exam in range(2)]
+    unseen = replace(rows[0], body=40, detected=False, amplitude=None, sigma_x_mm=None, sigma_y_mm=None)
+    path.write_text(population.table_text([*rows, unseen]))
+    return path
+
+
+def test_a_mass_is_drawn_alike_wherever_it_is_drawn_and_others_differ() -> None:
+    one, again, other = (draw_mass(i, scans=2, seed=7) for i in (3, 3, 4))
+    assert one == again
+    assert one[0].solid_lumps[0].d_mm == one[1].solid_lumps[0].d_mm
+    assert one[0].strokes != one[1].strokes
+    assert one[0].solid_lumps[0].d_mm != other[0].solid_lumps[0].d_mm
+
+
+def test_every_drawn_body_can_be() -> None:
+    """A scene refuses a lump through the skin or the wall: all of the prior must pass it."""
+    prior = BodyPrior()
+    for i in range(300):
+        (scene,) = draw_mass(i, scans=1, seed=99)
+        lump = scene.solid_lumps[0]
+        assert prior.d_mm[0] <= lump.d_mm <= prior.d_mm[1]
+
+
+def test_the_table_has_the_columns_its_schema_names(table: Path) -> None:
+    read = read_table(table, "population.table.json")
+    assert len(read) == 81
+    assert read.columns["detected"].count(False) == 1
+    assert read.columns["amplitude"][-1] is None
+
+
+def test_a_calibration_is_learned_from_a_table(table: Path, tmp_path: Path) -> None:
+    done = run_here("calibrate", "size", table, "--form", "log-quadratic", "-o", "size.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "40 bodies, 80 maps" in done.stdout
+    found = read_size_calibration(tmp_path / "size.json")
+    assert isinstance(found, LogQuadratic)
+    assert float(found.log_size(np.array(-1.0), np.array(1.4))) == pytest.approx(2.3, abs=0.04)
+    assert run_here("show", "size.json", cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--fit-radius-mm", "10"], 2, "--fit-radius-mm is for --form eq6"),
+        (["--seed", "4"], 2, "--seed is for --form eq6"),
+    ],
+)
+def test_what_the_table_fixes_cannot_be_declared(table: Path, tmp_path: Path, arguments, code, words) -> None:
+    done = run_here("calibrate", "size", table, "--form", "log-quadratic", "-o", "x.json", *arguments, cwd=tmp_path)
+    assert done.returncode == code
+    assert words in done.stderr
+    assert not (tmp_path / "x.json").exists()
+
+
+def test_a_table_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("d_mm,amplitude,sigma_x_mm\n10,0.3,4\n")
+    done = run_here("calibrate", "size", "t.csv", "--form", "log-quadratic", "-o", "x.json", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "t.csv" in done.stderr
+
+
+def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, monkeypatch) -> None:
+    """With the simulation stood in for by rows that come from the mass's number alone."""
+    calls: list[int] = []
+
+    def quick(index: int, *, scans: int, seed: int) -> list[MassRow]:
+        calls.append(index)
+        if index == 3 and calls.count(3) == 1:
+            raise KeyboardInterrupt
+        return [row(index, exam, seed=seed) for exam in range(scans)]
+
+    monkeypatch.setattr(population, "rows_of_mass", quick)
+    words = ("population", "--masses", 6, "-o", "p.csv")
+    assert run_here(*words, cwd=tmp_path).returncode == 130
+    assert not (tmp_path / "p.csv").exists()
+    assert run_here(*words, cwd=tmp_path).returncode == 0
+    assert calls == [0, 1, 2, 3, 3, 4, 5]
+    first = (tmp_path / "p.csv").read_bytes()
+    assert run_here(*words, "--force", cwd=tmp_path).returncode == 0
+    assert calls[7:] == [0, 1, 2, 3, 4, 5]
+    assert (tmp_path / "p.csv").read_bytes() == first
+
+
+def test_a_scan_of_a_plain_lump_is_measured_as_a_patients() -> None:
+    """With a cheap simulator in the solid model's place: bumps of the shape a lump of tissue might have."""
+    from tactile_bayes.forward.scene import Lump
+    from tactile_bayes.forward.simulate import simulate
+
+    scenes = draw_mass(2, scans=2, seed=7)
+
+    def scan(scene):
+        bumps = (Lump(x_mm=1.0, y_mm=-1.0, amplitude=0.5, sigma_x_mm=5.0, sigma_y_mm=4.0),)
+        plain = replace(scene, body=None, solid_lumps=(), lumps=bumps)
+        return simulate(plain, rng=np.random.default_rng(scene.seed)).scan
+
+    rows = measure_mass(scenes, body=2, scan=scan)
+    assert [r.exam for r in rows] == [0, 1]
+    for found in rows:
+        assert found.detected
+        assert found.amplitude == pytest.approx(0.45, abs=0.1)
+        assert found.sigma_x_mm == pytest.approx(4.6, rel=0.15)
+        assert found.var_p is not None
+        assert 0 < found.var_p < 0.05**2
+
+    def nothing(scene):
+        return simulate(replace(scene, body=None, solid_lumps=()), rng=np.random.default_rng(scene.seed)).scan
+
+    assert not any(r.detected for r in measure_mass(scenes, body=2, scan=nothing))
