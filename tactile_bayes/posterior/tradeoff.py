@@ -24,7 +24,7 @@ from tactile_bayes.posterior.surroundings import Surroundings
 ENDS = (0.025, 0.975)
 REFERENCE_POINTS = 16384
 """Points of each of the reference's replicates."""
-ACCURACIES_SD = (0.1, 0.05, 0.02, 0.01)
+ACCURACIES_SD = (0.05, 0.02, 0.01, 0.005)
 STEPS = (150, 600, 2400)
 Clock = Callable[[], float]
 Progress = Callable[[int, int], None]
