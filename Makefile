@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
+.PHONY: calibrations bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -44,6 +44,16 @@ bench-forward: $(VENV)/.installed
 bench-trial: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check statsmodels pingouin
 	$(BIN)/python -m benchmarks.trial
+
+# The size calibrations that come with the program, made again: an hour on two cores for the population's scans.
+calibrations: $(VENV)/.installed
+	mkdir -p build
+	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --seed 7 --workers 2 -o build/population.csv --force
+	$(BIN)/tactile-bayes calibrate size build/population.csv --form log-quadratic \
+		-o tactile_bayes/calibrations/solid.json --force
+	$(BIN)/tactile-bayes study -o build/paper_grid.csv --force
+	$(BIN)/tactile-bayes calibrate size build/paper_grid.csv --fit-radius-mm 48 --least-stiffness-ratio 8 \
+		-o tactile_bayes/calibrations/plane_strain.json --force
 
 docs: $(VENV)/.installed
 	$(BIN)/python docs/make_reference.py

@@ -52,7 +52,7 @@ def command(ctx: click.Context, output: Path, method: str, force: bool) -> None:
         estimate.command,
         "estimate",
         maps=(tactile_map,),
-        size_calibration=size,
+        size_calibration=str(size),
         method=method,
         force=force,
         **results,

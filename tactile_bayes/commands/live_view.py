@@ -38,7 +38,7 @@ def live_view(
     *,
     terminal: bool,
     serve: str | None,
-    size_calibration: Path | None,
+    size_calibration: str,
 ) -> Iterator[Any]:
     """Start the view's process; what comes out is an observer for the recorder."""
     from tactile_bayes.files.scan_parts import calibration_document, head_document
@@ -52,7 +52,7 @@ def live_view(
         "calibration": calibration_document(calibration),
         "terminal": terminal,
         "serve": serve,
-        "size_calibration": str(size_calibration) if size_calibration else None,
+        "size_calibration": _calibration_file(size_calibration),
     }
     theirs, ours = os.pipe()
     command = [sys.executable, "-m", "tactile_bayes.commands.live_view", str(theirs)]
@@ -149,6 +149,13 @@ class Turn:
 
 
 _TURN = Turn()
+
+
+def _calibration_file(name: str) -> str | None:
+    from tactile_bayes.files.shipped import size_calibration_path
+
+    path = size_calibration_path(name)
+    return None if path is None else str(path)
 
 
 @cache

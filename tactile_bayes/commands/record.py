@@ -61,7 +61,13 @@ _CODE = "A code, not a name."
 @click.option(
     "--serve", metavar="HOST:PORT", help="Show it to a browser on this computer, with a tone for the pressure."
 )
-@click.option("--size-calibration", type=_FILE, metavar="SIZE.json", help="For the live view's size estimate.")
+@click.option(
+    "--size-calibration",
+    default="solid",
+    show_default=True,
+    metavar="solid|plane-strain|none|SIZE.json",
+    help="For the live view's size estimate.",
+)
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @click.pass_context
 def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
@@ -120,7 +126,7 @@ class Request:
     subject: str | None
     live: bool
     serve: str | None
-    size_calibration: Path | None
+    size_calibration: str
     force: bool
 
     def session(self, hello: HelloReading) -> dict[str, str]:

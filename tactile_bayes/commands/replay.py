@@ -21,7 +21,13 @@ _FILE = click.Path(path_type=Path)
 @click.option("-o", "--output", metavar="OUT.mcap", type=_FILE, help="Keep what is recorded on the way.")
 @click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
 @click.option("--serve", metavar="HOST:PORT", help="Show it to a browser here, with a tone.")
-@click.option("--size-calibration", type=_FILE, metavar="SIZE.json", help="For the live view's size estimate.")
+@click.option(
+    "--size-calibration",
+    default="solid",
+    show_default=True,
+    metavar="solid|plane-strain|none|SIZE.json",
+    help="For the live view's size estimate.",
+)
 @click.option("--speed", type=click.FloatRange(0.01, 100.0), default=1.0, show_default=True, help="Times the own rate.")
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @click.pass_context
@@ -31,7 +37,7 @@ def command(
     output: Path | None,
     live: bool,
     serve: str | None,
-    size_calibration: Path | None,
+    size_calibration: str,
     speed: float,
     force: bool,
 ) -> None:
