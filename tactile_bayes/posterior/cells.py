@@ -99,7 +99,7 @@ def value_scale(tactile_map: TactileMap) -> float:
     return scale if scale > 0 else 1.0
 
 
-def candidate_centres(tactile_map: TactileMap, *, limit: int = 8) -> list[tuple[float, float]]:
+def candidate_centres(tactile_map: TactileMap, *, limit: int = 16) -> list[tuple[float, float]]:
     """Local maxima of the smoothed map, highest first: where a lump could be.
 
     Parameters

@@ -9,6 +9,7 @@ import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.abstention import missing_strokes
 from tactile_bayes.posterior.cells import covered_share
 from tactile_bayes.posterior.detection import Detection, detect
 from tactile_bayes.posterior.fit import (
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.estimate import EstimateOptions
     from tactile_bayes.posterior.field_estimate import FieldAnswer
 
+ENCLOSED_IN_WIDTHS = 1.2
+"""How far the map must reach beyond the centre on every side: a rise towards its edge looks like half a bump."""
 MOST_LOOKS = 3
 """Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
 ROTATION_ODDS = 3.0
@@ -77,6 +80,12 @@ def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
     share = covered_share(tactile_map, (centre[0], centre[1]), radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:
         return f"at the rim of the map ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
+    short = missing_strokes(tactile_map, (centre[0], centre[1]), reach_mm=ENCLOSED_IN_WIDTHS * wide)
+    if short:
+        side, millimetres = max(short.items(), key=lambda one: one[1])
+        return (
+            f"at the rim of the map (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
+        )
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
     return ""
