@@ -7,6 +7,7 @@ from math import lgamma
 import numpy as np
 import pytest
 
+from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.posterior import collapsed
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import FitCells, window_cells
@@ -74,6 +75,18 @@ def test_products_of_cosines_are_their_dense_products() -> None:
     exact = basis.T @ (basis / window.variance[:, None])
     found = gram_of_cosines(window.x_mm, window.y_mm, weight=window.weight)
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
+
+
+def test_bumps_on_the_grid_are_the_forward_models() -> None:
+    cells = cells_of(noise(0), radius=8.0)
+    window = Window(cells, independent_variance(cells))
+    for log_width, tolerance in ((0.2, 1e-5), (1.5, 4e-5)):
+        p, q, r = np.array([log_width]), np.array([0.15]), np.array([0.1])
+        for turn in (None, r):
+            covariance = covariance_from_log_widths(p, q, r if turn is not None else 0.0 * r)
+            exact = cell_mean_gaussian(cells.x_mm - 1.0, cells.y_mm, covariance_mm2=covariance, cell_mm=1.0)
+            found = window.bumps(np.array([1.0]), np.array([0.0]), p=p, q=q, r=turn).full()
+            np.testing.assert_allclose(found[:, window._row, window._column], exact, atol=tolerance)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.field import Whitening
 from tactile_bayes.posterior.window import Projected
 
-FLOOR = 1e-12
-"""Least share of the data's sum of squares that is noise: a map without any still has the rounding of its numbers."""
+FLOOR = 1e-9
+"""Share of the data's sum of squares that is noise in any case: 3e-5 of the signal, less than any sensor's steps.
+Without it a map free of noise leaves differences of large sums, which are rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +60,8 @@ class FieldColumns:
         Of the columns' part.
     log_det : (h,) array
         Log determinant of the covariance (over that of D) and of the columns' part.
+    floor
+        Sum of squares that is noise in any case.
     """
 
     field: Whitening
@@ -68,6 +71,7 @@ class FieldColumns:
     gram: FloatArray
     inverse: FloatArray
     log_det: FloatArray
+    floor: float
 
     @classmethod
     def of(cls, field: Whitening, shares: FloatArray, *, plain_low: FloatArray, plain_gram: FloatArray) -> FieldColumns:
@@ -81,7 +85,8 @@ class FieldColumns:
         volume: FloatArray = np.asarray(np.linalg.slogdet(gram[:, :c, :c])[1], dtype=np.float64)
         plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
         log_det = field.log_determinant(shares) + volume
-        return cls(field, shares, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det)
+        floor = FLOOR * float(plain_gram[c, c]) + 1e-300
+        return cls(field, shares, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor)
 
     def rest(self) -> FloatArray:
         """(h,) sum of squares that the fixed columns leave."""
@@ -91,7 +96,9 @@ class FieldColumns:
 
     def null_evidence(self, *, dof: int) -> FloatArray:
         """(h,) log evidence of the fixed columns alone."""
-        return -0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * np.maximum(self.rest(), 1e-300))
+        return (
+            -0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * (np.maximum(self.rest(), 0.0) + self.floor))
+        )
 
 
 def solve(
@@ -126,11 +133,11 @@ def solve(
         return np.asarray(product[:, None] - shared - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
 
     diagonal = [np.maximum(power(i, i, one.square), 1e-300) for i, one in enumerate(projected)]
-    rest = columns.rest()
+    rest, floor = columns.rest(), columns.floor
     if cross is None:
-        found = _one(along[0], diagonal[0], rest, dof=dof, amplitude_sd=amplitude_sd)
+        found = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=amplitude_sd)
     else:
-        found = _two(along, diagonal, power(0, 1, cross), rest, dof=dof, amplitude_sd=amplitude_sd)
+        found = _two(along, diagonal, power(0, 1, cross), rest, floor, dof=dof, amplitude_sd=amplitude_sd)
     log_factor, amplitude, matrix, squares = found
     evidence = -0.5 * columns.log_det + log_factor + lgamma(dof / 2) - 0.5 * dof * (log(pi) + np.log(squares))
     # a dent is no lump: only rises have density
@@ -152,11 +159,11 @@ def joined(solutions: list[LinearSolution]) -> LinearSolution:
 
 
 def _one(
-    along: FloatArray, power: FloatArray, rest: FloatArray, *, dof: int, amplitude_sd: float
+    along: FloatArray, power: FloatArray, rest: FloatArray, floor: float, *, dof: int, amplitude_sd: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Log factor, amplitudes, their precision and sum of squares for one structure."""
     amplitude = along / power
-    squares = np.maximum(rest - along * amplitude, FLOOR * rest + 1e-300)
+    squares = np.maximum(rest - along * amplitude, 0.0) + floor
     variance = amplitude_sd**2 + squares / dof / power
     log_factor = -0.5 * (np.log(power) + np.log(2 * pi * variance) + amplitude**2 / variance)
     return log_factor, amplitude[..., None], power[..., None, None], squares
@@ -167,6 +174,7 @@ def _two(
     diagonal: list[FloatArray],
     off: FloatArray,
     rest: FloatArray,
+    floor: float,
     *,
     dof: int,
     amplitude_sd: float,
@@ -175,7 +183,7 @@ def _two(
     one, two = diagonal
     det = np.maximum(one * two - off**2, 1e-12 * one * two)
     first, second = (two * along[0] - off * along[1]) / det, (one * along[1] - off * along[0]) / det
-    squares = np.maximum(rest - along[0] * first - along[1] * second, FLOOR * rest + 1e-300)
+    squares = np.maximum(rest - along[0] * first - along[1] * second, 0.0) + floor
     tau2 = squares / dof
     a, b, between = amplitude_sd**2 + tau2 * two / det, amplitude_sd**2 + tau2 * one / det, -tau2 * off / det
     volume = a * b - between**2

@@ -15,6 +15,9 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.cells import FitCells
 from tactile_bayes.posterior.field import COSINES, Whitening, cosine_profiles, gram_of_cosines, whitening
 
+RESOLVED = 3.0
+"""Widths above as many cells need no more than a cell's variance."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projected:
@@ -134,13 +137,9 @@ class Window:
                 columns = cell_mean_profile(self.x_mm - x_mm[:, None], sigma_mm=np.exp(p + q), cell_mm=cell)
                 rows = cell_mean_profile(self.y_mm - y_mm[:, None], sigma_mm=np.exp(p - q), cell_mm=cell)
                 return Profiles(rows, columns)
-            grid = cell_mean_gaussian(
-                self.x_mm - x_mm[:, None, None],
-                self.y_mm[:, None] - y_mm[:, None, None],
-                covariance_mm2=covariance_from_log_widths(p, q, r)[:, None],
-                cell_mm=cell,
-            )
-        return Profiles(grid=grid)
+            covariance = covariance_from_log_widths(p, q, r)
+            across, along = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
+            return Profiles(grid=turned_gaussians(across, along, covariance_mm2=covariance, cell_mm=cell))
 
     def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> Profiles:
         """Straight ridges of unit height, Gaussian across, `offset_mm` from `middle` in direction `angle_rad`."""
@@ -158,6 +157,28 @@ class Window:
     def middle(self) -> tuple[float, float]:
         """Mean of the cells' centres, mm."""
         return float(np.mean(self.cells.x_mm)), float(np.mean(self.cells.y_mm))
+
+
+def turned_gaussians(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: FloatArray, cell_mm: float) -> FloatArray:
+    """(m, ny, nx) cell means of turned Gaussians from (m, nx) and (m, ny) distances: `cell_mean_gaussian` on a grid.
+
+    Where every width is above `RESOLVED` cells the fourth cumulant of a cell is left out: below 3e-5 of the height.
+    """
+    wide = covariance_mm2 + cell_mm**2 / 12.0 * np.eye(2)
+    narrow = covariance_mm2[:, 0, 0] * covariance_mm2[:, 1, 1] - covariance_mm2[:, 0, 1] ** 2
+    mean = 0.5 * (covariance_mm2[:, 0, 0] + covariance_mm2[:, 1, 1])
+    least = mean - np.sqrt(np.maximum(mean**2 - narrow, 0.0))
+    if not np.nanmin(least) > (RESOLVED * cell_mm) ** 2:
+        x, y = x_mm[:, None, :], y_mm[:, :, None]
+        return cell_mean_gaussian(x, y, covariance_mm2=covariance_mm2[:, None], cell_mm=cell_mm)
+    det = wide[:, 0, 0] * wide[:, 1, 1] - wide[:, 0, 1] ** 2
+    half = -0.5 / det
+    square = (2.0 * half * -wide[:, 0, 1])[:, None, None] * y_mm[:, :, None] * x_mm[:, None, :]
+    square += (half * wide[:, 1, 1])[:, None, None] * np.square(x_mm)[:, None, :]
+    square += ((half * wide[:, 0, 0])[:, None] * np.square(y_mm))[:, :, None]
+    np.exp(square, out=square)
+    square *= np.sqrt(np.clip(narrow, 0.0, None) / det)[:, None, None]
+    return square
 
 
 def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> FloatArray:
