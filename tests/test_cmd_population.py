@@ -12,7 +12,7 @@ from in_process import run_here
 from tactile_bayes.commands import population
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.forward.population import BodyPrior, draw_mass
+from tactile_bayes.forward.population import BodyPrior, centred, draw_mass
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.measure import MassRow, measure_mass
 
@@ -51,6 +51,11 @@ def test_every_drawn_body_can_be() -> None:
         (scene,) = draw_mass(i, scans=1, seed=99)
         lump = scene.solid_lumps[0]
         assert prior.d_mm[0] <= lump.d_mm <= prior.d_mm[1]
+
+
+def test_centred_bodies_are_the_papers() -> None:
+    (scene,) = draw_mass(3, scans=1, seed=7, bodies=centred(BodyPrior()))
+    assert scene.solid_lumps[0].seat == 0.0
 
 
 def test_the_table_has_the_columns_its_schema_names(table: Path) -> None:
@@ -95,7 +100,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
     """With the simulation stood in for by rows that come from the mass's number alone."""
     calls: list[int] = []
 
-    def quick(index: int, *, scans: int, seed: int) -> list[MassRow]:
+    def quick(index: int, *, scans: int, seed: int, **_: int) -> list[MassRow]:
         calls.append(index)
         if index == 3 and calls.count(3) == 1:
             raise KeyboardInterrupt

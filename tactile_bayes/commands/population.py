@@ -16,12 +16,21 @@ _FILE = click.Path(path_type=Path)
 @click.command("population")
 @click.option("-o", "--output", required=True, metavar="TABLE.csv", type=_FILE, help="Where to write the table.")
 @click.option("--masses", type=click.IntRange(min=1), default=400, show_default=True, help="Bodies with a lump each.")
+@click.option(
+    "--centred",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
+)
 @click.option("--scans", type=click.IntRange(min=1), default=2, show_default=True, help="Exams of each.")
 @click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True, help="Of the random numbers.")
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
 @click.option("--scheduler", metavar="ADDR", help="Send the masses to a dask scheduler (extra [cluster]).")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
-def command(output: Path, masses: int, scans: int, seed: int, workers: int, scheduler: str | None, force: bool) -> None:
+def command(
+    output: Path, masses: int, centred: int, scans: int, seed: int, workers: int, scheduler: str | None, force: bool
+) -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from.
 
     Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
@@ -40,7 +49,13 @@ def command(output: Path, masses: int, scans: int, seed: int, workers: int, sche
     from tactile_bayes.presets import RESEARCH_USE
 
     refuse_existing(output, force=force)
-    settings = {"scans": scans, "seed": seed, **as_settings(BodyPrior(), ExamPrior())}
+    # results are kept by number: where the centred ones begin decides what a number is
+    settings = {
+        "scans": scans,
+        "seed": seed,
+        "first_centred": masses if centred else None,
+        **as_settings(BodyPrior(), ExamPrior()),
+    }
     kept = output.with_name(f"{output.name}.unfinished")
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
@@ -48,8 +63,8 @@ def command(output: Path, masses: int, scans: int, seed: int, workers: int, sche
         progress_bar("masses") as progress,
     ):
         outcomes = run_batch(
-            partial(rows_of_mass, scans=scans, seed=seed),
-            range(masses),
+            partial(rows_of_mass, scans=scans, seed=seed, first_centred=masses),
+            range(masses + centred),
             key=str,
             executor=executor,
             store=store,
@@ -63,19 +78,21 @@ def command(output: Path, masses: int, scans: int, seed: int, workers: int, sche
     if not failed:
         kept.unlink(missing_ok=True)
     found = sum(row.detected for row in rows)
-    click.echo(f"{output}: {masses} masses, {len(rows)} exams, a lump found in {found}, seed {seed}")
+    click.echo(f"{output}: {masses + centred} masses, {len(rows)} exams, a lump found in {found}, seed {seed}")
     click.echo(RESEARCH_USE)
 
 
-def rows_of_mass(index: int, *, scans: int, seed: int) -> list[MassRow]:
+def rows_of_mass(index: int, *, scans: int, seed: int, first_centred: int) -> list[MassRow]:
     """The rows of one mass, in whichever process."""
     import numpy as np
 
-    from tactile_bayes.forward.population import draw_mass
+    from tactile_bayes.forward.population import BodyPrior, draw_mass
+    from tactile_bayes.forward.population import centred as on_the_boundary
     from tactile_bayes.forward.simulate import simulate
     from tactile_bayes.posterior.measure import measure_mass
 
-    scenes = draw_mass(index, scans=scans, seed=seed)
+    bodies = on_the_boundary(BodyPrior()) if index >= first_centred else BodyPrior()
+    scenes = draw_mass(index, scans=scans, seed=seed, bodies=bodies)
     return measure_mass(
         scenes, body=index, scan=lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan
     )

@@ -141,6 +141,11 @@ def draw_mass(
     return scenes
 
 
+def centred(bodies: BodyPrior) -> BodyPrior:
+    """The same with every lump's centre on the fat-gland boundary: the paper's own geometry."""
+    return replace(bodies, seat=(0.0, 0.0))
+
+
 def as_settings(bodies: BodyPrior, exams: ExamPrior) -> Mapping[str, object]:
     """Plain data for a table's header and a calibration's provenance."""
     return {"bodies": asdict(bodies), "exams": asdict(exams)}
