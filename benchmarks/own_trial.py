@@ -177,13 +177,14 @@ def _report(rows: list[tuple[str, float, dict[str, float] | None, str, str]], fa
     )
     with (folder / "trial.csv").open("w", newline="") as trial, (folder / "excision.csv").open("w", newline="") as cut:
         readings, excisions = csv.writer(trial), csv.writer(cut)
-        readings.writerow(["patient", "mass", "modality", "status", "posterior"])
-        excisions.writerow(["patient", "mass", "ex_vivo_mm"])
+        readings.writerow(["patient", "mass", "modality", "replicate", "status", "posterior", "size_mm", "synthetic"])
+        excisions.writerow(["patient", "mass", "ex_vivo_mm", "synthetic"])
         for name, true, size, *_ in rows:
-            seen = [name, name, "tactile", *(["not_detected", ""] if size is None else ["detected", f"{name}.json"])]
-            readings.writerow(seen)
-            excisions.writerow([name, name, f"{true:.3f}"])
-    print(_command("validate", str(folder / "trial.csv"), "--excision", str(folder / "excision.csv")).stdout)
+            found = ["not_detected", ""] if size is None else ["detected", f"{name}.json"]
+            readings.writerow([name, name, "tactile", 1, *found, "", "true"])
+            excisions.writerow([name, name, f"{true:.3f}", "true"])
+    done = _command("validate", str(folder / "trial.csv"), "--excision", str(folder / "excision.csv"))
+    print(done.stdout or done.stderr)
 
 
 def _command(*arguments: str) -> subprocess.CompletedProcess[str]:
