@@ -73,6 +73,7 @@ MEASURED_ELSEWHERE = {
     "tables": "benchmarks.forward: minutes of work",
     "tradeoff": "it measures itself: a minute of work",
     "population": "hours of work; see benchmarks.own_trial for a scan's",
+    "sbc": "it measures itself: its report tells maps per second",
     "record": "benchmarks.record: runs until it is stopped",
     "repair": "benchmarks.record: needs a recording that was cut off",
     "replay": "benchmarks.record: runs in real time",

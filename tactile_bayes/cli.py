@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
     "tradeoff": ("tradeoff", "Measure what more accuracy costs, here and now: `tradeoff forward`."),
     "population": ("population", "Simulate and fit exams of varied bodies: what a calibration is learned from."),
+    "sbc": ("sbc", "Check the posterior of a map against itself: ranks and coverage on simulated maps."),
     "simulate": ("simulate", "Make a scan with known truth from a scene."),
     "record": ("record", "Record a scan head and a tracker into a scan file."),
     "repair": ("repair", "Close a scan file that was cut off: what is intact is kept."),

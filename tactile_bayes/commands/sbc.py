@@ -1,0 +1,148 @@
+"""`sbc`: whether the posterior of a map is what it claims to be, on maps from its own prior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from tactile_bayes.batch import BatchStore, Outcome
+    from tactile_bayes.posterior.sbc import MapRanks
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.command("sbc")
+@click.option("--maps", type=click.IntRange(min=1), default=200, show_default=True, help="Maps to simulate.")
+@click.option(
+    "--method",
+    type=click.Choice(["laplace", "importance"]),
+    default="importance",
+    show_default=True,
+    help="How the posterior is drawn from, as in `estimate`.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
+@click.option("--scheduler", metavar="ADDR", help="Send the maps to a dask scheduler (extra [cluster]).")
+@click.option(
+    "-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write truths and ranks; with it a run can be resumed."
+)
+@click.option("--figure", metavar="FIG.png", type=_FILE, help="Draw the ECDFs of the ranks with their bands.")
+@click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
+@click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+def command(
+    maps: int,
+    method: str,
+    seed: int,
+    workers: int,
+    scheduler: str | None,
+    output: Path | None,
+    figure: Path | None,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Check the posterior against itself: simulation-based calibration and coverage.
+
+    Maps are drawn from the model's own prior (bump, level, slope, correlated errors) and estimated as `estimate --noise
+    field --rotation off` does it. Where the posterior is right, the rank of each true value among the draws is uniform
+    and an interval holds it as often as it says. This tests the program, not whether breasts are like its model. Maps
+    without an estimate are counted and left out. With -o an interrupted run goes on where it stopped.
+
+    Example: tactile-bayes sbc --maps 300 --workers 2 -o sbc.csv --figure sbc.png
+    """
+    from time import monotonic
+
+    from tactile_bayes.files.atomic import refuse_existing, write_text
+    from tactile_bayes.files.schema import dump_json
+    from tactile_bayes.report.sbc_text import sbc_document, sbc_figure, sbc_text, table_text
+
+    for path in (output, figure):
+        if path is not None:
+            refuse_existing(path, force=force)
+    begun = monotonic()
+    outcomes, made = _run(maps, method, seed, workers=workers, scheduler=scheduler, output=output)
+    speed = made / (monotonic() - begun) if made else None
+    found = [outcome.value for outcome in outcomes if outcome.value is not None]
+    if output is not None:
+        write_text(output, table_text(found), force=force)
+    if figure is not None:
+        sbc_figure(found, figure, force=force)
+    _finish(outcomes, output)
+    document = sbc_document(found, method=method, seed=seed, maps_per_s=speed)
+    click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
+
+
+def _run(
+    maps: int, method: str, seed: int, *, workers: int, scheduler: str | None, output: Path | None
+) -> tuple[list[Outcome[MapRanks]], int]:
+    """Every map's outcome, and how many of them this run made."""
+    from functools import partial
+
+    from tactile_bayes.batch import open_executor, run_batch
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.posterior.sbc import settings
+
+    with (
+        open_executor(workers=workers, cluster=scheduler) as executor,
+        _open_kept(output, settings(method, seed)) as store,
+        progress_bar("maps") as progress,
+    ):
+        had = 0 if store is None else len(store.values)
+        outcomes = run_batch(
+            partial(ranks_of_map, method=method, seed=seed),
+            range(maps),
+            key=str,
+            executor=executor,
+            store=store,
+            progress=progress,
+        )
+    return outcomes, max(maps - had, 0)
+
+
+def ranks_of_map(index: int, *, method: str, seed: int) -> MapRanks:
+    """The ranks of one map, in whichever process."""
+    from tactile_bayes.posterior import sbc
+
+    return sbc.ranks_of_map(index, method=method, seed=seed)
+
+
+def _kept(output: Path) -> Path:
+    return output.with_name(f"{output.name}.unfinished")
+
+
+@contextmanager
+def _open_kept(output: Path | None, settings: dict[str, Any]) -> Iterator[BatchStore | None]:
+    """Where results are kept beside the output; nowhere without one."""
+    from tactile_bayes.batch import open_store
+
+    if output is None:
+        yield None
+        return
+    with open_store(_kept(output), settings=settings, encode=_encode, decode=_decode) as store:
+        yield store
+
+
+def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> None:
+    """Name the maps that failed; without any, what was kept for resuming is no longer needed."""
+    failed = [outcome for outcome in outcomes if not outcome.ok]
+    for outcome in failed:
+        click.echo(f"map {outcome.key} could not be estimated: {outcome.error}", err=True)
+    if output is not None and not failed:
+        _kept(output).unlink(missing_ok=True)
+
+
+def _encode(one: MapRanks) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(one)
+
+
+def _decode(value: dict[str, Any]) -> MapRanks:
+    from tactile_bayes.posterior.sbc import MapRanks, Truth
+
+    ranks = None if value["ranks"] is None else tuple(value["ranks"])
+    return MapRanks(value["index"], Truth(**value["truth"]), ranks, value["outcome"])

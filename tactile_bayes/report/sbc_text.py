@@ -1,0 +1,162 @@
+"""Simulation-based calibration as text, as data, as a table and as a picture."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, astuple, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.posterior.sbc import (
+    BAND,
+    DRAWS,
+    PARAMETERS,
+    MapRanks,
+    RankTest,
+    Truth,
+    ecdf_band,
+    ecdf_counts,
+    rank_tests,
+)
+from tactile_bayes.presets import RESEARCH_USE
+
+SCHEMA = "tactile-bayes/sbc/1"
+_COLOURS = ("#1f3b73", "#c8641e")
+NARROW = 1.05
+"""A larger spread of the ranks is called too narrow a posterior, and too wide below its inverse."""
+SHIFT = 3.0
+"""Standard errors of the mean rank beyond which a posterior is called too low or too high."""
+
+
+def sbc_document(maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None) -> dict[str, Any]:
+    """Everything found, as data.
+
+    Parameters
+    ----------
+    maps_per_s
+        Of the maps that this run made; None where it made none.
+    """
+    ranked = [one for one in maps if one.ranks is not None]
+    return {
+        "schema": SCHEMA,
+        "method": method,
+        "seed": seed,
+        "maps": len(maps),
+        "ranked": len(ranked),
+        "abstained": dict(sorted(Counter(one.outcome for one in maps if one.ranks is None).items())),
+        "drawn_by": dict(sorted(Counter(one.outcome for one in ranked).items())),
+        "draws": DRAWS,
+        "maps_per_s": maps_per_s,
+        "parameters": [_as_dict(one) for one in rank_tests(list(maps))],
+        "research_use": RESEARCH_USE,
+    }
+
+
+def _as_dict(test: RankTest) -> dict[str, Any]:
+    return asdict(test) | {"inside_band": test.inside, "verdict": verdict(test)}
+
+
+def verdict(test: RankTest) -> str:
+    """``"ok"``, or how the posterior of a parameter fails."""
+    if test.inside:
+        return "ok"
+    off = (test.mean_rank - 0.5) * np.sqrt(12.0 * test.n)
+    found = ["too narrow"] * (test.spread > NARROW) + ["too wide"] * (test.spread < 1.0 / NARROW)
+    if abs(off) > SHIFT:
+        found.append("too low" if off > 0 else "too high")
+    return "FAILS: " + (", ".join(found) or "ranks are not uniform")
+
+
+def sbc_text(document: dict[str, Any]) -> str:
+    """The whole report; the research-use line comes last."""
+    return "\n".join(_lines(document)) + "\n"
+
+
+def _lines(document: dict[str, Any]) -> Iterator[str]:
+    speed = document["maps_per_s"]
+    rate = "" if speed is None else f", {speed:.3g} maps/s"
+    made = f"method {document['method']}, seed {document['seed']}"
+    yield f"{document['maps']} maps from the model's own prior, {made}{rate}"
+    abstained = document["maps"] - document["ranked"]
+    why = ", ".join(f"{code} {number}" for code, number in document["abstained"].items())
+    yield f"no estimate on {abstained}{f' ({why})' if why else ''}: left out, ranks are conditional on detection"
+    drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
+    if not document["parameters"]:
+        yield "No map gave an estimate: there is nothing to rank; give more --maps"
+        yield RESEARCH_USE
+        return
+    yield f"ranks among {DRAWS} draws, drawn by: {drawn}"
+    yield ""
+    yield f"{'parameter':<12}{'chi2 p':>8}{'ECDF p':>8}  {'in band':<8}{'50 % holds':<17}{'90 % holds':<17}verdict"
+    for one in document["parameters"]:
+        yield _row(one)
+    yield ""
+    yield from _conclusion(document["parameters"])
+    yield RESEARCH_USE
+
+
+def _row(one: dict[str, Any]) -> str:
+    held = [f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %" for c in one["coverage"]]
+    inside = "yes" if one["inside_band"] else "NO"
+    return (
+        f"{one['name']:<12}{one['chi2_p']:>8.3f}{one['ecdf_p']:>8.3f}  {inside:<8}"
+        f"{held[0]:<17}{held[1]:<17}{one['verdict']}"
+    )
+
+
+def _conclusion(parameters: list[dict[str, Any]]) -> Iterator[str]:
+    failed = [one["name"] for one in parameters if not one["inside_band"]]
+    chance = 100 * (1 - BAND)
+    if failed:
+        yield f"FAILS for {', '.join(failed)}: the ranks leave their simultaneous {100 * BAND:g} % band."
+    else:
+        yield f"All ranks stay in their simultaneous {100 * BAND:g} % bands."
+    yield f"A calibrated parameter leaves its band in {chance:.0f} % of runs; +- is one binomial standard error."
+
+
+def table_text(maps: Sequence[MapRanks]) -> str:
+    """One row a map: truth, ranks (empty without an estimate) and outcome."""
+    header = ["map", *(one.name for one in fields(Truth)), *(f"rank_{name}" for name in PARAMETERS), "outcome"]
+    return "\n".join([",".join(header), *(_table_row(one) for one in maps)]) + "\n"
+
+
+def _table_row(one: MapRanks) -> str:
+    ranks = [""] * len(PARAMETERS) if one.ranks is None else [str(rank) for rank in one.ranks]
+    return ",".join([str(one.index), *(f"{value:.8g}" for value in astuple(one.truth)), *ranks, one.outcome])
+
+
+def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> None:
+    """Draw the ECDF of each parameter's ranks minus the uniform one, with the simultaneous band, as PNG.
+
+    Raises
+    ------
+    UsageError
+        When `path` exists and `force` is false.
+    """
+    from tactile_bayes.report.figures import _figure as png_figure
+
+    ranks = np.array([one.ranks for one in maps if one.ranks is not None]).reshape(-1, len(PARAMETERS))
+    n, at = len(ranks), np.arange(1, DRAWS + 1) / (DRAWS + 1)
+    inside = {test.name: test.inside for test in rank_tests(list(maps))}
+    with png_figure(path, size_in=(11.0, 2.9), force=force) as figure:
+        all_axes = figure.subplots(1, len(PARAMETERS), sharey=True)
+        for axes, name, column in zip(all_axes, PARAMETERS, ranks.T, strict=True):
+            if n:
+                low, high = ecdf_band(n, DRAWS)
+                share = ecdf_counts(column[None], DRAWS)[0] / n
+                axes.fill_between(at, low - at, high - at, step="mid", color="0.85", linewidth=0)
+                axes.step(at, share - at, where="mid", color=_COLOURS[0 if inside[name] else 1], linewidth=1.2)
+            axes.axhline(0.0, color="0.5", linewidth=0.6)
+            axes.set_title(name, loc="left", fontsize=10)
+            axes.set_xticks([0.0, 0.5, 1.0])
+            axes.set_xlabel("rank / (draws + 1)", fontsize=9)
+            axes.tick_params(labelsize=8)
+            axes.spines[["top", "right"]].set_visible(False)
+        all_axes[0].set_ylabel("ECDF of ranks - uniform", fontsize=9)
+        caption = (
+            f"{n} maps with an estimate of {len(maps)}; grey: {100 * BAND:g} % band of the whole path. {RESEARCH_USE}"
+        )
+        figure.text(0.01, 0.01, caption, fontsize=7.5, color="0.3")

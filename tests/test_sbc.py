@@ -1,0 +1,147 @@
+"""Simulation-based calibration: exact posteriors pass, wrong ones fail, and the posterior of a map passes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from tactile_bayes.posterior import sbc
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.cells import window_cells
+from tactile_bayes.posterior.collapsed import independent_variance
+from tactile_bayes.posterior.field import LENGTHS_MM
+from tactile_bayes.posterior.sbc import DRAWS, RankTest, Truth, rank_test
+from tactile_bayes.posterior.window import Profiles, Window
+from tactile_bayes.report.sbc_text import verdict
+
+TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
+
+
+def conjugate_ranks(n: int, *, sd_factor: float = 1.0, shift_sd: float = 0.0, seed: int = 5) -> np.ndarray:
+    """Ranks of a normal mean with a normal prior, whose posterior is known; narrowed or shifted on request."""
+    rng = np.random.default_rng(seed)
+    truth = rng.standard_normal(n)
+    data = truth + 0.7 * rng.standard_normal(n)
+    variance = 1.0 / (1.0 + 1.0 / 0.7**2)
+    mean = variance * data / 0.7**2 + shift_sd * np.sqrt(variance)
+    draws = mean[:, None] + sd_factor * np.sqrt(variance) * rng.standard_normal((n, DRAWS))
+    return np.sum(draws < truth[:, None], axis=1)
+
+
+def of(ranks: np.ndarray) -> RankTest:
+    return rank_test("mean", ranks, draws=DRAWS)
+
+
+def test_an_exact_posterior_passes() -> None:
+    found = of(conjugate_ranks(300))
+    assert found.inside
+    assert found.chi2_p > 0.01
+    assert verdict(found) == "ok"
+    for one in found.coverage:
+        assert abs(one.covered - one.probability) < 3 * one.error
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"sd_factor": 0.5}, "too narrow"),
+        ({"sd_factor": 2.0}, "too wide"),
+        ({"shift_sd": 0.5}, "too high"),
+        ({"shift_sd": -0.5}, "too low"),
+    ],
+)
+def test_a_wrong_posterior_fails_and_the_verdict_says_how(fault: dict[str, float], words: str) -> None:
+    found = of(conjugate_ranks(300, **fault))
+    assert not found.inside
+    assert found.chi2_p < 0.001
+    assert words in verdict(found)
+    assert "FAILS" in verdict(found)
+
+
+def test_halved_intervals_hold_the_truth_as_seldom_as_theory_says() -> None:
+    """A 90 % interval of half its length is one of +-0.822 SD: 58.9 %."""
+    covered = of(conjugate_ranks(4000, sd_factor=0.5)).coverage[1].covered
+    assert covered == pytest.approx(0.589, abs=0.03)
+
+
+def test_the_band_holds_a_whole_path_as_often_as_it_says() -> None:
+    """Its points alone hold far more often: that is what simultaneous means."""
+    n, rng = 60, np.random.default_rng(8)
+    low, high = sbc.ecdf_band(n, DRAWS)
+    share = sbc.ecdf_counts(rng.integers(0, DRAWS + 1, size=(2000, n)), DRAWS) / n
+    inside = (share >= low) & (share <= high)
+    assert 0.93 <= inside.all(axis=1).mean() <= 0.975
+    assert inside.mean() > 0.99
+
+
+def test_ranks_of_uniform_samples_are_judged_alike_by_band_and_p_value() -> None:
+    rng = np.random.default_rng(9)
+    strays = sbc.uniform_strays(60, DRAWS)
+    found = [rank_test("x", rng.integers(0, DRAWS + 1, size=60), draws=DRAWS, strays=strays).inside for _ in range(200)]
+    assert 0.9 <= np.mean(found) <= 0.99
+
+
+def test_coverage_needs_an_interval_between_draws() -> None:
+    assert sbc.coverage(np.arange(DRAWS + 1), DRAWS, 0.9).covered == 0.9
+    with pytest.raises(ValueError, match="no central interval"):
+        sbc.coverage(np.arange(11), 10, 0.9)
+
+
+def test_few_ranks_have_no_bins_to_compare() -> None:
+    assert sbc.chi2_p(np.array([1, 2, 3]), DRAWS) == 1.0
+
+
+@pytest.mark.parametrize("length", LENGTHS_MM)
+def test_simulated_errors_are_those_that_the_posterior_assumes(length: float) -> None:
+    """Along the directions in which the model's precision is diagonal, squares are as large as its eigenvalues say."""
+    truth = Truth(**asdict(TRUTH) | {"length_mm": length, "x_mm": 0.0, "y_mm": 0.0, "share": 30.0, "amplitude": 0.0})
+    squares = []
+    for i in range(4):
+        tactile_map = sbc.draw_map(truth, np.random.default_rng(i), BumpPrior(tilt_sd=0.0))
+        cells = window_cells(tactile_map, (0.0, 0.0), radius_mm=sbc.RADIUS_MM)
+        window = Window(cells, independent_variance(cells))
+        field = window.field(length)
+        errors = window.on_grid((cells.value[None] - 1.0) / truth.noise_sd)
+        along = window.project(Profiles(grid=errors), errors).low[0] @ field.turn
+        expected = field.eigenvalues * (1.0 + truth.share * field.eigenvalues)
+        squares.append(np.mean(along**2 / expected))
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_map_has_the_errors_it_says() -> None:
+    """Without field, slope and bump, what is left varies as the map's own variance over count says."""
+    truth = Truth(**asdict(TRUTH) | {"share": 0.0, "amplitude": 0.0})
+    tactile_map = sbc.draw_map(truth, np.random.default_rng(1), BumpPrior(tilt_sd=0.0))
+    z = (tactile_map.mean - 1.0) / np.sqrt(tactile_map.variance / tactile_map.count)
+    assert np.std(z) == pytest.approx(1.0, abs=0.05)
+    assert np.std(tactile_map.mean) == pytest.approx(truth.noise_sd, rel=0.05)
+
+
+def test_truths_follow_the_prior_and_fit_the_window() -> None:
+    rng, prior = np.random.default_rng(2), BumpPrior()
+    drawn = [sbc.draw_truth(rng, prior) for _ in range(2000)]
+    half = np.array([np.log(one.sigma_x_mm / one.sigma_y_mm) / 2 for one in drawn])
+    assert max(max(one.sigma_x_mm, one.sigma_y_mm) for one in drawn) <= 15.0
+    assert abs(half.mean()) < 0.05
+    assert 0.4 < half.std() <= prior.log_ratio_sd
+    assert np.mean([one.amplitude for one in drawn]) == pytest.approx(prior.amplitude_sd * np.sqrt(2 / np.pi), rel=0.06)
+
+
+def test_a_map_is_the_same_wherever_it_is_made() -> None:
+    one = sbc.ranks_of_map(2, method="laplace", seed=1)
+    assert one == sbc.ranks_of_map(2, method="laplace", seed=1)
+    assert one.ranks is not None
+    assert one.truth != sbc.ranks_of_map(2, method="laplace", seed=2).truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["importance", "laplace"])
+def test_the_posterior_of_a_map_is_calibrated(method: str) -> None:
+    found = {one.name: one for one in sbc.rank_tests([sbc.ranks_of_map(i, method=method, seed=1) for i in range(300)])}
+    for one in found.values():
+        assert one.inside, one
+        assert one.n > 150
+    for name in ("sigma_x_mm", "sigma_y_mm"):
+        assert 0.85 <= found[name].coverage[1].covered <= 0.95, found[name]
