@@ -18,6 +18,8 @@ from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 
 LADDER = ("laplace", "importance", "ensemble")
+STEPS_UP = 1
+"""Methods that are tried after the one asked for: who asks for a quick one does not wait minutes for chains."""
 DISAGREEMENT = 5.0
 """Ends of intervals by two methods differ by more than this many of their joint Monte-Carlo errors: one is wrong."""
 START_ACCURACY_SD = 0.05
@@ -67,7 +69,7 @@ def draw_scene(
     options: MethodOptions | None = None,
     progress: Progress | None = None,
 ) -> tuple[ParameterDraws, tuple[str, ...]]:
-    """Draws by the first of the methods, from the one asked for upwards, whose diagnostics hold.
+    """Draws by the method asked for, or by the next one where its diagnostics do not hold.
 
     Returns
     -------
@@ -82,7 +84,8 @@ def draw_scene(
     """
     options = options or MethodOptions()
     passed_over: list[str] = []
-    for name in LADDER[LADDER.index(method) :]:
+    first = LADDER.index(method)
+    for name in LADDER[first : first + STEPS_UP + 1]:
         try:
             draws = _draw(fit, name, rng=rng, options=options, progress=progress)
         except NotConvergedError as error:
