@@ -71,6 +71,7 @@ def test_findings_as_data(tmp_path: Path, monkeypatch) -> None:
     assert found["schema"] == "tactile-bayes/sbc/1"
     assert found["abstained"] == {"undetected": 10}
     assert found["drawn_by"] == {"importance": 90}
+    assert found["p_together"] > 0.05
     assert [one["name"] for one in found["parameters"]] == list(PARAMETERS)
     assert all(one["verdict"] == "ok" for one in found["parameters"])
 
@@ -86,6 +87,7 @@ def test_a_posterior_that_fails_is_said_to_fail_and_the_exit_code_stays(tmp_path
     assert done.returncode == 0
     assert "FAILS for sigma_x_mm:" in done.stdout
     assert "too narrow" in done.stdout
+    assert "that is no chance" in done.stdout
 
 
 def test_maps_that_all_abstain_leave_nothing_to_rank(tmp_path: Path, monkeypatch) -> None:

@@ -139,9 +139,10 @@ def test_a_map_is_the_same_wherever_it_is_made() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["importance", "laplace"])
 def test_the_posterior_of_a_map_is_calibrated(method: str) -> None:
+    """Five bands of 95 % would let a calibrated posterior fail in one run of four: together they hold 95 %."""
     found = {one.name: one for one in sbc.rank_tests([sbc.ranks_of_map(i, method=method, seed=1) for i in range(300)])}
     for one in found.values():
-        assert one.inside, one
+        assert one.ecdf_p > (1.0 - sbc.BAND) / len(found), one
         assert one.n > 150
     for name in ("sigma_x_mm", "sigma_y_mm"):
         assert 0.85 <= found[name].coverage[1].covered <= 0.95, found[name]

@@ -40,6 +40,7 @@ def sbc_document(maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s
         Of the maps that this run made; None where it made none.
     """
     ranked = [one for one in maps if one.ranks is not None]
+    tests = rank_tests(list(maps))
     return {
         "schema": SCHEMA,
         "method": method,
@@ -50,7 +51,8 @@ def sbc_document(maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s
         "drawn_by": dict(sorted(Counter(one.outcome for one in ranked).items())),
         "draws": DRAWS,
         "maps_per_s": maps_per_s,
-        "parameters": [_as_dict(one) for one in rank_tests(list(maps))],
+        "parameters": [_as_dict(one) for one in tests],
+        "p_together": min(1.0, len(tests) * min(one.ecdf_p for one in tests)) if tests else None,
         "research_use": RESEARCH_USE,
     }
 
@@ -94,7 +96,7 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     for one in document["parameters"]:
         yield _row(one)
     yield ""
-    yield from _conclusion(document["parameters"])
+    yield from _conclusion(document["parameters"], document["p_together"])
     yield RESEARCH_USE
 
 
@@ -107,14 +109,19 @@ def _row(one: dict[str, Any]) -> str:
     )
 
 
-def _conclusion(parameters: list[dict[str, Any]]) -> Iterator[str]:
+def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[str]:
     failed = [one["name"] for one in parameters if not one["inside_band"]]
-    chance = 100 * (1 - BAND)
+    band, number = f"{100 * BAND:g} % band", len(parameters)
     if failed:
-        yield f"FAILS for {', '.join(failed)}: the ranks leave their simultaneous {100 * BAND:g} % band."
+        yield f"FAILS for {', '.join(failed)}: the ranks leave their simultaneous {band}."
+        seldom = (
+            f"of {number} calibrated parameters one or more leave theirs in {100 * (1 - BAND**number):.0f} % of runs"
+        )
+        advice = "run again with another --seed" if together > 1 - BAND else "that is no chance"
+        yield f"All {number} together: p = {together:.2g} ({seldom}); {advice}."
     else:
-        yield f"All ranks stay in their simultaneous {100 * BAND:g} % bands."
-    yield f"A calibrated parameter leaves its band in {chance:.0f} % of runs; +- is one binomial standard error."
+        yield f"All ranks stay in their simultaneous {band}s."
+    yield "+- is one binomial standard error of a calibrated interval."
 
 
 def table_text(maps: Sequence[MapRanks]) -> str:
