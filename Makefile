@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: calibrations bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
+.PHONY: bench-posterior calibrations bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -34,6 +34,10 @@ bench-map: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'boost-histogram>=1.4' '.[fast]'
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.map_speed
 
+bench-posterior: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check numpyro dynesty bumps
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.posterior
+
 bench-record: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.record throughput
 
@@ -48,7 +52,7 @@ bench-trial: $(VENV)/.installed
 # The size calibrations that come with the program, made again: an hour on two cores for the population's scans.
 calibrations: $(VENV)/.installed
 	mkdir -p build
-	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 120 --seed 7 --workers 2 \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 80 --seed 7 --workers 2 \
 		-o build/population.csv --force
 	$(BIN)/tactile-bayes calibrate size build/population.csv --form log-quadratic \
 		-o tactile_bayes/calibrations/solid.json --force
