@@ -121,8 +121,10 @@ def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
     assert draws.method == "importance"
     assert passed[0].startswith("laplace: Pareto shape nan")
     monkeypatch.setattr(methods, "importance_draws", heavy)
-    with pytest.raises(NotConvergedError, match=r"laplace: .*importance: Pareto shape 0.91; ensemble: .*--max-steps"):
-        draw_scene(strong(), "laplace", rng=np.random.default_rng(1), options=MethodOptions(max_steps=150))
+    with pytest.raises(NotConvergedError, match=r"laplace: .*importance: Pareto shape 0.91$"):
+        draw_scene(strong(), "laplace", rng=np.random.default_rng(1))
+    with pytest.raises(NotConvergedError, match=r"importance: Pareto shape 0.91; ensemble: .*--max-steps"):
+        draw_scene(strong(), "importance", rng=np.random.default_rng(1), options=MethodOptions(max_steps=150))
 
 
 def test_accuracy_in_millimetres_is_accuracy_of_the_widths() -> None:

@@ -15,7 +15,11 @@ _FILE = click.Path(path_type=Path)
 @click.argument("map_file", metavar="MAP.nc", type=_FILE)
 @click.option("--figure", metavar="OUT.png", type=_FILE, help="Draw error against time.")
 @click.option(
-    "--fit-radius-mm", type=click.FloatRange(min=0.0, min_open=True), default=FIT_RADIUS_MM, show_default=True
+    "--fit-radius-mm",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=FIT_RADIUS_MM,
+    show_default=True,
+    help="As of `estimate`.",
 )
 @click.option("--prior", metavar="PRIOR.toml", type=_FILE, help="As of `estimate`.")
 @click.option(

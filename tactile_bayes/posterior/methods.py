@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -84,19 +84,21 @@ def draw_scene(
     """
     options = options or MethodOptions()
     passed_over: list[str] = []
+    figures: Mapping[str, float] = {}
     first = LADDER.index(method)
     for name in LADDER[first : first + STEPS_UP + 1]:
         try:
             draws = _draw(fit, name, rng=rng, options=options, progress=progress)
         except NotConvergedError as error:
             passed_over.append(f"{name}: {error}")
-            last = error
+            figures = error.diagnostics
             continue
-        shape = draws.diagnostics.get("pareto_k", 0.0)
+        figures = draws.diagnostics
+        shape = figures.get("pareto_k", 0.0)
         if shape == -np.inf or shape <= TRUSTED_SHAPE:
             return with_end_error(fit, draws), tuple(passed_over)
         passed_over.append(f"{name}: Pareto shape {shape:.2f} (trusted up to {TRUSTED_SHAPE:g})")
-    raise NotConvergedError("; ".join(passed_over), diagnostics=last.diagnostics)
+    raise NotConvergedError("; ".join(passed_over), diagnostics=dict(figures))
 
 
 def _draw(
