@@ -225,3 +225,62 @@ def test_a_camera_image_can_be_estimated(shared_data: Path, tmp_path: Path) -> N
     assert found["sigma_x_mm"]["median"] == pytest.approx(3.30, abs=0.05)
     assert found["sigma_y_mm"]["median"] == pytest.approx(2.62, abs=0.05)
     assert found["angle_deg"]["median"] == pytest.approx(9.1, abs=2.0)
+
+
+def field(folder: Path, *words: object) -> CompletedProcess[str]:
+    """`estimate a.nc` under correlated errors, without a calibration."""
+    given = ("--noise", "field", "--background", "free", "--size-calibration", "none")
+    return run_here("estimate", "a.nc", *given, *words, cwd=folder)
+
+
+def test_the_scene_is_told_and_can_be_given(folder: Path) -> None:
+    told = json.loads(field(folder, "--json").stdout)
+    assert told["scene"]["supported"] in ("round", "ellipse")
+    assert {one["name"] for one in told["scene"]["structures"]} >= {"ellipse", "rotated", "tilt", "second lump", "rib"}
+    given = json.loads(field(folder, "--json", "--scene", "round").stdout)
+    assert given["scene"]["shape"] == "round"
+    assert given["sigma_x_mm"]["median"] == given["sigma_y_mm"]["median"]
+    assert "Scene: " in field(folder).stdout
+    none = field(folder, "--scene", "none")
+    assert none.returncode == 6
+    assert none.stdout.startswith("No estimate: no lump was assumed")
+
+
+def test_priors_come_from_a_file_and_are_printed(folder: Path) -> None:
+    (folder / "prior.toml").write_text("width_median_mm = 3.5\n", encoding="utf-8")
+    assert "log-normal about 3.5 mm" in field(folder, "--prior", "prior.toml").stdout
+    document = json.loads(field(folder, "--prior", "prior.toml", "--json").stdout)
+    assert document["prior"]["width_median_mm"] == 3.5
+    assert {one["role"] for one in document["provenance"]["inputs"]} == {"map", "prior"}
+    assert document["prior_sensitivity"]["width_prior_times"] == 2.0
+    (folder / "prior.toml").write_text("width = 3.5\n", encoding="utf-8")
+    wrong = field(folder, "--prior", "prior.toml")
+    assert (wrong.returncode, wrong.stderr.count("\n")) == (3, 1)
+    assert "unknown key width" in wrong.stderr
+
+
+def test_a_checkpoint_goes_on_where_it_stopped(folder: Path) -> None:
+    words = ("--method", "ensemble", "--accuracy-sd", 0.15, "--json")
+    stopped = field(folder, *words, "--checkpoint", "chain.npz", "--max-steps", 150)
+    assert stopped.returncode == 5
+    resumed, whole = field(folder, *words, "--checkpoint", "chain.npz"), field(folder, *words)
+    assert resumed.returncode == 0, resumed.stderr
+    found = [json.loads(one.stdout)["sigma_x_mm"] for one in (resumed, whole)]
+    assert found[0] == found[1]
+    other = field(folder, *words, "--checkpoint", "chain.npz", "--seed", 2)
+    assert other.returncode == 3
+    assert "another map, calibration or setting" in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["a.nc", "--scene", "round", "--noise", "independent"], "goes with correlated errors"),
+        (["a.nc", "b.nc", "--checkpoint", "c.npz"], "one map at a time"),
+        (["a.nc", "--noise", "field", "--background", "free", "--checkpoint", "c.npz"], "give --method ensemble"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(folder: Path, words: list[str], message: str) -> None:
+    done = run_here("estimate", *words, "--size-calibration", "none", cwd=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert message in done.stderr
