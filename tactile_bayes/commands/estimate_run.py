@@ -187,8 +187,10 @@ def size_priors(settings: Settings) -> SizePriors:
     from tactile_bayes.posterior.pooling import BetweenMaps, SizePriors
 
     for name, value in settings.known:
-        if not value > 0 and name != "seat":
-            raise UsageError(f"--known {name} is {value:g}; it must be above 0")
+        if value < 0 or (value == 0 and name != "seat"):
+            raise UsageError(
+                f"--known {name} is {value:g}; it must {'not be below' if name == 'seat' else 'be above'} 0"
+            )
     fixed = settings.between_map_sd
     between = BetweenMaps() if fixed is None else BetweenMaps(fixed, 0.0)
     return SizePriors(between_maps=between, known=dict(settings.known))

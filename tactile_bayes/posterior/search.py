@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.estimate import EstimateOptions
     from tactile_bayes.posterior.field_estimate import FieldAnswer
 
+WIDE_IN_RADII = 0.4
 ENCLOSED_IN_WIDTHS = 1.2
-"""How far the map must reach beyond the centre on every side: a rise towards its edge looks like half a bump."""
+"""How far the map must reach on every side of a bump wide for its window: a rise to the edge looks like half."""
 MOST_LOOKS = 3
 """Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
 ROTATION_ODDS = 3.0
@@ -80,8 +81,9 @@ def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
     share = covered_share(tactile_map, (centre[0], centre[1]), radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:
         return f"at the rim of the map ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
+    wide_rise = wide > WIDE_IN_RADII * plain.target.radius_mm
     short = missing_strokes(tactile_map, (centre[0], centre[1]), reach_mm=ENCLOSED_IN_WIDTHS * wide)
-    if short:
+    if wide_rise and short:
         side, millimetres = max(short.items(), key=lambda one: one[1])
         return (
             f"at the rim of the map (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
