@@ -17,6 +17,8 @@ BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 CODES = ("empty", "undetected", "unresolved", "window", "prior", "extrapolated", "method")
 NEEDED_IN_WIDTHS = 2.0
 """Widths of the bump beyond its centre that strokes should reach, so that its flank shows on every side."""
+LEAST_SEEN = 0.25
+"""Share of a side's breadth that must be covered for the side to reach as far."""
 MOST_PRIOR_SHARE = 0.5
 """Above this ratio of the posterior's to the prior's SD of a log width the prior, not the map, gives the interval."""
 SIDES = {
@@ -77,7 +79,8 @@ def fault_code(tactile_map: TactileMap, candidate: Candidate) -> tuple[str, str]
 def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:
     """By how many mm the map falls short of `reach_mm` from a centre, on each side where it does by a cell or more.
 
-    A side is a strip half as wide as the reach; it ends where fewer than half of its cells are covered.
+    A side is a quarter turn about its direction. It ends where less than `LEAST_SEEN` of its breadth is covered: a
+    flank of which a corner is missing is still seen.
     """
     cell = tactile_map.recipe.cell_mm
     mask = trusted(tactile_map)
@@ -86,19 +89,18 @@ def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, 
     short = {}
     for name, (x, y) in SIDES.items():
         along, across = dx * x + dy * y, np.abs(dx * y - dy * x)
-        strip = across <= 0.25 * reach_mm
-        reached = _reached(along[strip], mask[strip], cell, reach_mm, 0.5 * reach_mm)
+        sector = across <= along
+        reached = _reached(along[sector], mask[sector], cell, reach_mm)
         if reach_mm - reached >= cell:
             short[name] = reach_mm - reached
     return short
 
 
-def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float, width: float) -> float:
-    """How far a strip is covered, mm."""
-    expected = max(width / cell, 1.0)
-    for step in range(int(np.ceil(reach / cell))):
+def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float) -> float:
+    """How far a sector of a quarter turn is covered, mm; its innermost two cells have hardly a breadth."""
+    for step in range(1, int(np.ceil(reach / cell))):
         here = (along >= (step - 0.5) * cell) & (along < (step + 0.5) * cell)
-        if covered[here].sum() < 0.5 * expected:
+        if covered[here].sum() < (LEAST_SEEN * 2 * step if step > 1 else 1):
             return max(step - 0.5, 0.0) * cell
     return reach
 
