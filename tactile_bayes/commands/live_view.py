@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 DRAWINGS_PER_S = 10.0
+TAKEN_EVERY_S = 0.045
+"""Frames are added to the map some at a time, twice a drawing."""
 _SHOW, _HIDE = "\x1b[?25h\x1b[?1049l", "\x1b[?1049h\x1b[?25l"
 
 
@@ -123,13 +126,15 @@ def _prepare() -> None:
 class Turn:
     """Which of the map's rises is looked at next: one a time, because most of them are no lump and cost as much.
 
-    The one that was a lump last time, or else the next lower one; now and then the highest, which may be new.
+    The one that was a lump last time, or else the next lower one; now and then the highest, which may be new. How wide
+    the lump was is where the next fit of it begins.
     """
 
     AGAIN = 8
 
     def __init__(self) -> None:
         self._home = self._now = self._asked = 0
+        self._width_mm: float | None = None
 
     def of(self, number: int) -> int:
         """Which of `number`, 0 being the highest."""
@@ -138,9 +143,16 @@ class Turn:
         self._now = 0 if self._asked % self.AGAIN == 0 else self._home
         return self._now
 
-    def tell(self, *, lump: bool) -> bool:
+    @property
+    def width_mm(self) -> float | None:
+        """Of the lump, where this turn is at it again."""
+        return self._width_mm if self._now == self._home else None
+
+    def tell(self, *, lump: bool, width_mm: float | None = None) -> bool:
         """What came of it; whether that is worth showing: not that the highest is still none."""
         glance = self._now != self._home
+        if lump or not glance:
+            self._width_mm = width_mm
         if lump:
             self._home = self._now
         elif not glance:
@@ -149,6 +161,7 @@ class Turn:
 
 
 _TURN = Turn()
+LIVE_DRAWS = 400
 
 
 def _calibration_file(name: str) -> str | None:
@@ -182,15 +195,16 @@ def estimate_text(tactile_map: TactileMap, calibration_path: str | None, turn: T
         centre = centres[turn.of(len(centres))]
         calibration = _calibration_of(calibration_path) if calibration_path else None
         # whether an ellipse is turned is a question for afterwards, and takes a third of the time
-        fit = FitOptions(rotation="off", centre_mm=centre)
+        fit = FitOptions(rotation="off", centre_mm=centre, start_width_mm=turn.width_mm)
         if calibration is not None:
             recipe = calibration.recipe
-            fit = FitOptions(recipe.background, recipe.radius_mm, "off", centre, recipe.noise)
-        options = EstimateOptions(method="laplace", fit=fit)
+            fit = replace(fit, background=recipe.background, radius_mm=recipe.radius_mm, noise=recipe.noise)
+        options = EstimateOptions(method="laplace", fit=fit, draws=LIVE_DRAWS)
         found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
     except TactileBayesError as error:
         return f"no estimate: {error}" if turn.tell(lump=False) else ""
-    if not turn.tell(lump=found.status == "estimate"):
+    width = None if found.fit is None else float(np.sqrt(np.prod(found.fit.widths()[:2])))
+    if not turn.tell(lump=found.status == "estimate", width_mm=width):
         return ""
     if found.status != "estimate" or found.map_posterior is None:
         return f"no estimate: the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
@@ -241,7 +255,7 @@ def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callab
     """Draw until the recording ends; how often that was."""
     drawn, drawings, newest = 0.0, 0, None
     while not reader.ended:
-        live.take(reader.read(1 / DRAWINGS_PER_S / 2))
+        live.take(reader.read(TAKEN_EVERY_S))
         estimator.look(newest)
         now = time.monotonic()
         if now - drawn < 1 / DRAWINGS_PER_S:

@@ -111,13 +111,17 @@ class FeedReader:
         self._rest = b""
         os.set_blocking(pipe, False)
 
-    def read(self, timeout_s: float) -> list[Seen]:
-        """What has come within the time; sets `ended` when the recorder has gone."""
-        ready, _, _ = select.select([self.pipe], [], [], timeout_s)
-        if not ready:
-            return []
-        data = os.read(self.pipe, PIPE_BYTES)
-        self.ended = not data
+    def read(self, wait_s: float) -> list[Seen]:
+        """What has come after so long; sets `ended` when the recorder has gone.
+
+        It does not return with the first message: taken one by one, frames cost eight times as much.
+        """
+        time.sleep(wait_s)
+        data = b""
+        with suppress(BlockingIOError):
+            while piece := os.read(self.pipe, PIPE_BYTES):
+                data += piece
+            self.ended = True
         return list(self._messages(data))
 
     def _messages(self, data: bytes) -> Iterator[Seen]:

@@ -48,6 +48,8 @@ class FitOptions:
     noise
         ``"independent"``: least squares, the likelihood divided by the inflation of correlated errors.
         ``"field"``: correlated errors in the model; level and tilt are integrated out with them.
+    start_width_mm
+        About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`.
     """
 
     background: str = "fixed"
@@ -55,6 +57,7 @@ class FitOptions:
     rotation: str = "auto"
     centre_mm: tuple[float, float] | None = None
     noise: str = "independent"
+    start_width_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,16 +174,13 @@ def fit_bump(
     """
     bump = _bump(tactile_map, options, rotated=options.rotation == "on")
     centre, start, weight_variance = centre_mm, None, None
+    widths = START_WIDTHS_MM if options.start_width_mm is None else (options.start_width_mm,)
     for _ in range(6):
         cells = window_cells(tactile_map, centre, radius_mm=options.radius_mm)
         if len(cells) < len(bump.names) + 2:
             return None, f"{len(cells)} covered cells for {len(bump.names)} parameters"
         weight = np.ones(len(cells)) if weight_variance is None else count_weights(cells, weight_variance)
-        starts = (
-            [start]
-            if start is not None
-            else [_start(tactile_map, bump, cells, centre, width) for width in START_WIDTHS_MM]
-        )
+        starts = [start] if start is not None else [_start(tactile_map, bump, cells, centre, width) for width in widths]
         fit = _best_fit(bump, cells, starts, weight=weight, centre=centre, radius_mm=options.radius_mm)
         moved = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
         if not fit.converged or moved > options.radius_mm / 2:

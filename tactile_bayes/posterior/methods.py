@@ -12,7 +12,7 @@ import numpy as np
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.chain_state import ChainStore
-from tactile_bayes.posterior.draws import END_ERROR, ParameterDraws
+from tactile_bayes.posterior.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws
 from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
@@ -41,12 +41,15 @@ class MethodOptions:
         Of the ensemble; None for its default.
     store
         Where an ensemble keeps its state between runs.
+    draws
+        Of ``laplace``, which has no accuracy to reach.
     """
 
     accuracy_sd: float | None = None
     accuracy_mm: float | None = None
     max_steps: int | None = None
     store: ChainStore | None = None
+    draws: int = INDEPENDENT_DRAWS
 
     def in_sd(self, fit: FieldFit) -> float | None:
         """The accuracy in posterior SDs of this fit's widths."""
@@ -105,7 +108,7 @@ def _draw(
     fit: FieldFit, method: str, *, rng: np.random.Generator, options: MethodOptions, progress: Progress | None
 ) -> ParameterDraws:
     if method == "laplace":
-        return judged_laplace(fit, rng=rng)
+        return judged_laplace(fit, rng=rng, draws=options.draws)
     accuracy = options.in_sd(fit)
     density = Sampled.of(fit)
     if method == "importance":
@@ -115,12 +118,12 @@ def _draw(
     return density.finished(draws, rng)
 
 
-def judged_laplace(fit: FieldFit, *, rng: np.random.Generator) -> ParameterDraws:
+def judged_laplace(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDEPENDENT_DRAWS) -> ParameterDraws:
     """The Gaussians' draws, with the Pareto shape of the weights that would make them exact."""
-    draws = laplace_mixture(fit, rng=rng)
-    some = draws.flat[:CHECKED]
+    drawn = laplace_mixture(fit, rng=rng, draws=draws)
+    some = drawn.flat[:CHECKED]
     _, shape = smooth_weights(fit.target(some) - fit.mixture.log_density(some))
-    return replace(draws, diagnostics=dict(draws.diagnostics) | {"pareto_k": float(shape)})
+    return replace(drawn, diagnostics=dict(drawn.diagnostics) | {"pareto_k": float(shape)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

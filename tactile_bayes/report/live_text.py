@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -11,6 +12,8 @@ from tactile_bayes.hardware.live import grey_levels
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.hardware.live import LiveState
 
@@ -23,6 +26,7 @@ _FULL_BAR_KPA: Final = 20.0
 _SAID: Final = {"low": "press harder", "in": "in range", "high": "press less", "off": "waiting for the head"}
 _TINT: Final = {"low": "94", "in": "92", "high": "91", "off": "90"}
 _TEXT_LINES: Final = 6
+_STEPS: Final = 256
 
 
 def colours_wanted(environment: Mapping[str, str]) -> bool:
@@ -96,28 +100,29 @@ def _blocks(values: FloatArray) -> list[str]:
     """Half blocks: the upper cell is the ink, the lower one the paper."""
     if len(values) % 2:
         values = np.vstack([values, np.full((1, values.shape[1]), np.nan)])
-    colours = _colours(values)
-    lines = []
-    for top, bottom, shown_top, shown_bottom in zip(
-        colours[::2], colours[1::2], np.isfinite(values[::2]), np.isfinite(values[1::2]), strict=True
-    ):
-        cells = [_cell(*one) for one in zip(top, bottom, shown_top, shown_bottom, strict=True)]
-        lines.append("".join(cells) + "\x1b[0m")
-    return lines
+    colours, shown = _colours(values), np.isfinite(values)
+    pairs = zip(colours[::2], colours[1::2], shown[::2], shown[1::2], strict=True)
+    return ["".join(map(_cell, *(one.tolist() for one in pair))) + "\x1b[0m" for pair in pairs]
 
 
-def _cell(top: FloatArray, bottom: FloatArray, shown_top: bool, shown_bottom: bool) -> str:
-    ink, paper = (";".join(str(int(c)) for c in colour) for colour in (top, bottom))
+def _cell(top: str, bottom: str, shown_top: bool, shown_bottom: bool) -> str:
     if shown_top and shown_bottom:
-        return f"\x1b[38;2;{ink};48;2;{paper}m▀"
+        return f"\x1b[38;2;{top};48;2;{bottom}m▀"
     if shown_top:
-        return f"\x1b[0;38;2;{ink}m▀"
-    return f"\x1b[0;38;2;{paper}m▄" if shown_bottom else "\x1b[0m "
+        return f"\x1b[0;38;2;{top}m▀"
+    return f"\x1b[0;38;2;{bottom}m▄" if shown_bottom else "\x1b[0m "
 
 
-def _colours(values: FloatArray) -> FloatArray:
-    place = np.nan_to_num(values) * (len(_COLOURS) - 1)
-    return np.stack([np.interp(place, np.arange(len(_COLOURS)), channel) for channel in _COLOURS.T], axis=-1)
+def _colours(values: FloatArray) -> NDArray[np.object_]:
+    """Of values from 0 to 1, in the terminal's words."""
+    return np.asarray(_palette()[np.rint(np.nan_to_num(values) * (_STEPS - 1)).astype(int)])
+
+
+@cache
+def _palette() -> NDArray[np.object_]:
+    place = np.linspace(0.0, len(_COLOURS) - 1, _STEPS)
+    channels = [np.interp(place, np.arange(len(_COLOURS)), channel).astype(int) for channel in _COLOURS.T]
+    return np.array([";".join(map(str, colour)) for colour in zip(*channels, strict=True)], dtype=object)
 
 
 def _shades(values: FloatArray) -> list[str]:
