@@ -237,6 +237,15 @@ def test_the_estimate_looks_at_one_rise_a_time_and_stays_where_a_lump_was():
     assert at == 0  # a new highest one is taken when it is looked at
 
 
+def test_the_next_fit_of_a_lump_begins_with_its_width_and_a_glance_does_not():
+    turn, begun = Turn(), []
+    for number in range(9):
+        turn.of(2)
+        begun.append(turn.width_mm)
+        turn.tell(lump=number > 0 and number != 7, width_mm=4.0 + number)
+    assert begun == [None, None, 5.0, 6.0, 7.0, 8.0, 9.0, None, 10.0]
+
+
 def test_the_live_estimate_is_the_estimate(state):
     from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
     from tactile_bayes.posterior.fit import FitOptions

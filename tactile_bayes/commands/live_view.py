@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 DRAWINGS_PER_S = 10.0
-TAKEN_EVERY_S = 0.045
+TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2
 """Frames are added to the map some at a time, twice a drawing."""
 _SHOW, _HIDE = "\x1b[?25h\x1b[?1049l", "\x1b[?1049h\x1b[?25l"
 
@@ -152,7 +152,7 @@ class Turn:
         """What came of it; whether that is worth showing: not that the highest is still none."""
         glance = self._now != self._home
         if lump or not glance:
-            self._width_mm = width_mm
+            self._width_mm = width_mm if lump else None
         if lump:
             self._home = self._now
         elif not glance:
