@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from tactile_bayes.files.tables import Table
-    from tactile_bayes.posterior.learn_size import SizeTable
+    from tactile_bayes.posterior.learn_size import SizeTable, StudyCases
 
 _FILE = click.Path(path_type=Path)
 
@@ -89,13 +89,17 @@ def size(
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
     stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The
-    declared options say how the table's maps were made; `estimate` refuses a map made otherwise.
+    declared options say how the table's maps were made; `estimate` refuses a map made otherwise. With depth_ratio and
+    stiffness_ratio the table is a study: each geometry (seat, d_mm, depth_ratio) is also left out of the learning in
+    turn, and the report tells how far Eq 6 and a quadratic in logarithms then miss the hard lumps' sizes.
 
     The log-quadratic form, ln d as a quadratic in ln a and ln sigma, tells apart what differs between bodies and
     between exams of one body. Its table comes from `population`, which made the maps: nothing is declared.
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
+    from dataclasses import replace
+
     import numpy as np
 
     from tactile_bayes.commands.progress import progress_bar
@@ -105,6 +109,7 @@ def size(
     from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.posterior.learn_size import learn_size_calibration
+    from tactile_bayes.posterior.left_out import left_out_of_study
     from tactile_bayes.posterior.size_calibration import Recipe
     from tactile_bayes.report.calibration_text import calibration_text
 
@@ -117,10 +122,11 @@ def size(
     recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise)
     rng = np.random.default_rng(seed)
     try:
+        lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
         with progress_bar("effective draws") as progress:
-            calibration = learn_size_calibration(
-                size_table(rows, least_stiffness_ratio=least_stiffness_ratio), recipe=recipe, rng=rng, progress=progress
-            )
+            calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
+        left_out = left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio)
+        calibration = replace(calibration, left_out=left_out)
     except BadDataError as error:
         raise error.at(table) from None
     settings = {
@@ -239,4 +245,16 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
     group = list(zip(columns["seat"], columns["d_mm"], columns["stiffness_ratio"], strict=True))
     change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
     change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)
-    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y)
+    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns))
+
+
+def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
+    """Which case each row is; None where a row does not say how stiff its lump is."""
+    import numpy as np
+
+    from tactile_bayes.posterior.learn_size import StudyCases
+
+    if None in columns["stiffness_ratio"]:
+        return None
+    depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))
+    return StudyCases(tuple(columns["seat"]), depth, ratio)

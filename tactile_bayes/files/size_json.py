@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,13 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json, load_json
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.posterior.size_calibration import (
+    COEFFICIENTS,
+    AxisCalibration,
+    LeftOutErrors,
+    Recipe,
+    SizeCalibration,
+)
 from tactile_bayes.presets import RESEARCH_USE
 
 SCHEMA = "tactile-bayes/size-calibration/1"
@@ -39,6 +46,7 @@ def write_size_calibration(
         "residual_correlation": _number(calibration.residual_correlation),
         "x": _axis_document(calibration.x),
         "y": _axis_document(calibration.y),
+        **_left_out_document(calibration.left_out),
         "provenance": provenance.as_dict(),
     }
     check_document(document, SCHEMA_FILE, path=path)
@@ -69,6 +77,7 @@ def _eq6(document: Any, *, path: Path) -> SizeCalibration:
             residual_correlation=float(document["residual_correlation"]),
             recipe=Recipe(**document["recipe"]),
             axes=tuple(document["axes"]),
+            left_out=_left_out(document.get("left_out")),
         )
     except BadDataError as error:
         raise error.at(path) from None
@@ -76,6 +85,19 @@ def _eq6(document: Any, *, path: Path) -> SizeCalibration:
 
 def _number(value: float) -> float:
     return float(f"{value:.9g}")
+
+
+def _left_out_document(errors: LeftOutErrors | None) -> dict[str, Any]:
+    if errors is None:
+        return {}
+    document = asdict(errors)
+    for form in ("eq6", "log_quadratic"):
+        document[form] = {widths: _number(error) for widths, error in document[form].items()}
+    return {"left_out": document}
+
+
+def _left_out(document: dict[str, Any] | None) -> LeftOutErrors | None:
+    return None if document is None else LeftOutErrors(**document)
 
 
 def _axis_document(axis: AxisCalibration) -> dict[str, Any]:

@@ -118,6 +118,28 @@ class AxisCalibration:
         return found
 
 
+@dataclass(frozen=True, slots=True)
+class LeftOutErrors:
+    """How far sizes are off when each geometry of a study is left out of the learning in turn.
+
+    Parameters
+    ----------
+    cases, geometries
+        How many were left out.
+    least_stiffness_ratio
+        Softer lumps took no part.
+    eq6, log_quadratic
+        Mean absolute error in d, as a share, of Eq 6 and of a quadratic of ln d in ln a and ln sigma: by the widths
+        ``"x"`` across the head, ``"y"`` along it, and ``"both"``.
+    """
+
+    cases: int
+    geometries: int
+    least_stiffness_ratio: float
+    eq6: Mapping[str, float]
+    log_quadratic: Mapping[str, float]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SizeCalibration:
     """Eq 6 for each axis of the head.
@@ -132,6 +154,8 @@ class SizeCalibration:
         How the table's maps were built and fitted.
     axes
         ``("x", "y")``, or ``("both",)`` when the table has one width only.
+    left_out
+        Errors in geometries left out, where the table was a study.
     """
 
     x: AxisCalibration
@@ -139,6 +163,7 @@ class SizeCalibration:
     residual_correlation: float
     recipe: Recipe
     axes: tuple[str, ...] = ("x", "y")
+    left_out: LeftOutErrors | None = None
 
     def __post_init__(self) -> None:
         if not -1.0 <= self.residual_correlation <= 1.0:

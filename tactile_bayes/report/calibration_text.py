@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, SizeCalibration
+from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
 from tactile_bayes.presets import RESEARCH_USE
 
 LABELS = {
@@ -30,6 +30,8 @@ def calibration_text(calibration: SizeCalibration) -> str:
         lines.append(f"correlation of the two residuals {calibration.residual_correlation:.2f}")
     if not calibration.x.fit.get("e_identified"):
         lines.append("the table has no depths: only m/e is determined, e is 1 by convention")
+    if calibration.left_out is not None:
+        lines += _left_out(calibration.left_out)
     recipe = calibration.recipe
     how = "declared" if recipe.declared else "as the maps were made here"
     lines.append(
@@ -37,6 +39,18 @@ def calibration_text(calibration: SizeCalibration) -> str:
         f"fit radius {recipe.radius_mm:g} mm, noise {recipe.noise}"
     )
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _left_out(errors: LeftOutErrors) -> list[str]:
+    """Mean absolute error of both forms, by both widths and by each."""
+    names = {"both": "", "x": "by the width across alone, ", "y": "by the width along alone, "}
+    said = [
+        f"{words}Eq 6 {100 * errors.eq6[widths]:.1f} %, log-quadratic {100 * errors.log_quadratic[widths]:.1f} %"
+        for widths, words in names.items()
+        if widths in errors.eq6
+    ]
+    which = f"{errors.cases} cases of E2/E1 >= {errors.least_stiffness_ratio:g}"
+    return [f"leave one geometry out: {said[0]} of d ({errors.geometries} geometries, {which})", *said[1:]]
 
 
 def _figures(axes: list[AxisCalibration]) -> list[str]:
