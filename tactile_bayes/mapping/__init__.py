@@ -1,7 +1,29 @@
 """From a scan to a tactile map (paper steps i to iii)."""
 
-from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
-from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
+    from tactile_bayes.mapping.build import build_map
+    from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 
 __all__ = ["Instrument", "MapAccumulator", "MapGrid", "MapRecipe", "TactileMap", "build_map"]
+
+_HOME = {
+    "Instrument": "accumulator",
+    "MapAccumulator": "accumulator",
+    "MapGrid": "accumulator",
+    "MapRecipe": "tactile_map",
+    "TactileMap": "tactile_map",
+    "build_map": "build",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import a name's module when it is asked for: an estimate needs the map, not what builds one."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -10,6 +10,8 @@ from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_l
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.cells import FitCells
 
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
 
 @dataclass(frozen=True, slots=True)
 class BumpPrior:
@@ -96,7 +98,9 @@ class Bump:
 
     def unit_bump(self, theta: FloatArray, cells: FitCells) -> FloatArray:
         """(m, k) bump of unit amplitude, averaged over each cell, for (m, p) parameter vectors."""
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            if not self.rotated:
+                return straight_bump(theta[:, 1], theta[:, 2], p=theta[:, 3], q=theta[:, 4], cells=cells)
             return cell_mean_gaussian(
                 cells.x_mm - theta[:, 1, None],
                 cells.y_mm - theta[:, 2, None],
@@ -120,3 +124,29 @@ class Bump:
             z.append((r / prior.log_ratio_sd, prior.log_ratio_sd))
         total = sum(-0.5 * value**2 - np.log(sd * np.sqrt(2 * np.pi)) for value, sd in z)
         return np.asarray(total)
+
+
+def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, cells: FitCells) -> FloatArray:
+    """(m, k) cell means of Gaussians along the grid's axes: `cell_mean_gaussian` from profiles of rows and columns.
+
+    It is the same formula. Its exponential is a product and its fourth cumulant a sum of what rows and columns have.
+    """
+    column, row = cells.column - cells.column.min(), cells.row - cells.row.min()
+    x, x_fourth = _profile(cells.x_mm, column, centre_mm=x_mm, sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
+    y, y_fourth = _profile(cells.y_mm, row, centre_mm=y_mm, sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
+    bump = (1.0 - y_fourth)[:, :, None] - x_fourth[:, None, :]
+    bump *= x[:, None, :]
+    bump *= y[:, :, None]
+    return np.asarray(bump.reshape(len(bump), -1).take(row * x.shape[1] + column, axis=1))
+
+
+def _profile(
+    place_mm: FloatArray, index: IntArray, *, centre_mm: FloatArray, sigma_mm: FloatArray, cell_mm: float
+) -> tuple[FloatArray, FloatArray]:
+    """(m, n) Gaussians averaged over the cells of an axis to second order, and the share that the fourth takes off."""
+    axis = np.zeros(int(index.max()) + 1)
+    axis[index] = place_mm
+    wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
+    square = (axis - centre_mm[:, None]) ** 2 / wide
+    gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
+    return gaussian, cell_mm**4 / 2880.0 * (square * (square - 6.0) + 3.0) / wide**2

@@ -25,6 +25,7 @@ from tactile_bayes.posterior.cells import FitCells
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Whitening
 from tactile_bayes.posterior.linear import FieldColumns, LinearSolution, joined, solve
 from tactile_bayes.posterior.scene import Scene
+from tactile_bayes.posterior.solved import Solution, Solved
 from tactile_bayes.posterior.window import Profiles, Projected, Window
 
 BLOCK = 64
@@ -118,7 +119,16 @@ class CollapsedTarget:
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """(m,) log density of (m, dimension) shape vectors, normalised up to a constant of the data."""
-        total = np.logaddexp.reduce(self.by_field(theta), axis=1) + self.log_prior(theta)
+        return self._mixed(theta, self.by_field(theta))
+
+    def solved_density(self, theta: FloatArray, solved: Solved) -> FloatArray:
+        """The same, with what `draw_linear` needs at these points kept in `solved`."""
+        solution = self.conditional(theta)
+        solved.add(theta, solution)
+        return self._mixed(theta, solution[0] + LOG_FIELD_PRIOR + self._made_up)
+
+    def _mixed(self, theta: FloatArray, by_field: FloatArray) -> FloatArray:
+        total = np.logaddexp.reduce(by_field, axis=1) + self.log_prior(theta)
         return np.where(np.isfinite(total), total, -np.inf)
 
     def by_field(self, theta: FloatArray) -> FloatArray:
@@ -192,26 +202,53 @@ class CollapsedTarget:
         share = np.concatenate([one.shares for one in self.fields])
         return {"field_length_mm": float(weight @ length), "field_share": float(weight @ (share / (1.0 + share)))}
 
-    def draw_linear(self, theta: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Amplitudes (m, v), level (m,) and noise scale (m,) for draws of the shape: exact, field drawn first."""
+    def conditional(self, theta: FloatArray) -> Solution:
+        """What is linear at (m, p) vectors under each of h fields.
+
+        Returns
+        -------
+        evidence, amplitude, power, slope, squares
+            Log evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power (m, h, v, v), by how much
+            the level falls with each (m, h, v), and the sum of squares (m, h).
+        """
+        parts = []
+        for i in range(0, len(theta), BLOCK):
+            evidence, one = self._solve(theta[i : i + BLOCK])
+            parts.append((evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares))
+        return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
+
+    def draw_linear(
+        self, theta: FloatArray, rng: np.random.Generator, *, solved: Solved | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Amplitudes (m, v), level (m,) and noise scale (m,) for draws of the shape: exact, field drawn first.
+
+        Points that `solved` knows are not solved again.
+        """
         unique, back = np.unique(theta, axis=0, return_inverse=True)
         back = back.reshape(-1)
         amplitude, level, noise = np.empty((len(theta), self.structures)), np.empty(len(theta)), np.empty(len(theta))
         order = np.argsort(back, kind="stable")
         edges = np.searchsorted(back[order], np.arange(0, len(unique) + BLOCK, BLOCK))
+        at_zero, level_variance = self._levels()
         for i, (first, last) in enumerate(pairwise(edges)):
             rows = order[first:last]
-            evidence, solution = self._solve(unique[i * BLOCK : (i + 1) * BLOCK])
+            points = unique[i * BLOCK : (i + 1) * BLOCK]
+            evidence, centre, power, slope, squares = (solved or self.conditional)(points)
             of = back[rows] - i * BLOCK
             h = choose(evidence[of], rng)
-            tau2 = solution.sum_of_squares[of, h] / rng.chisquare(self.dof, size=len(rows))
-            a = self._draw_amplitudes(solution.amplitude[of, h], solution.power[of, h], tau2, rng)
-            about = np.sqrt(tau2 * solution.level_covariance[h, 0, 0]) * rng.standard_normal(len(rows))
+            tau2 = squares[of, h] / rng.chisquare(self.dof, size=len(rows))
+            a = self._draw_amplitudes(centre[of, h], power[of, h], tau2, rng)
+            about = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(rows))
             amplitude[rows] = a
-            at_zero = self._mean + solution.level[h, 0]
-            level[rows] = at_zero - np.sum(solution.level_slope[of, h, :, 0] * a, axis=1) + about
+            level[rows] = at_zero[h] - np.sum(slope[of, h] * a, axis=1) + about
             noise[rows] = np.sqrt(tau2 * self.window.variance.mean())
         return amplitude, level, noise
+
+    def _levels(self) -> tuple[FloatArray, FloatArray]:
+        """(h,) levels at amplitudes of 0 under each field, and their variances over tau^2."""
+        c = len(self._plain) - 1
+        level = [np.einsum("hd,hd->h", one.inverse[:, 0], one.gram[:, :c, c]) for one in self.fields]
+        return self._mean + np.concatenate(level), np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
 
     def _draw_amplitudes(
         self, centre: FloatArray, power: FloatArray, tau2: FloatArray, rng: np.random.Generator

@@ -16,11 +16,9 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.chain_state import ChainStore
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
-from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, rotation_odds
-from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
+from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions
+from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.noise import level_offset
-from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
 from tactile_bayes.posterior.search import ROTATION_ODDS, scene_asked, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
@@ -189,10 +187,9 @@ def estimate_map(
         assert draws is not None
         posterior = MapPosterior(**seen.posterior)
     else:
-        fit, odds = _choose_rotation(tactile_map, fit, options)
-        draws = _draw(fit, options, rng=rng, progress=progress)
-        posterior = _map_posterior(fit, draws, options, rng=rng)
-        noise = _judged_noise(fit, odds)
+        fit, odds = chosen_rotation(tactile_map, fit, options=options.fit, prior=options.prior)
+        draws, figures = draw_independent(fit, options, rng=rng, progress=progress)
+        posterior, noise = MapPosterior(**figures), judged_noise(fit, odds)
     fault = shape_fault(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
@@ -277,62 +274,6 @@ def _check_options(options: EstimateOptions) -> None:
         raise UsageError("a noise field takes level and tilt with it; give --background free")
 
 
-def _choose_rotation(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tuple[BumpFit, float | None]:
-    if options.fit.rotation != "auto":
-        return fit, None
-    odds, turned = rotation_odds(tactile_map, fit, options=options.fit, prior=options.prior)
-    return (turned, odds) if turned is not None and odds > ROTATION_ODDS else (fit, odds)
-
-
-def _draw(
-    fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Callable[[int, int], None] | None
-) -> ParameterDraws:
-    if options.method == "optimise":
-        return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
-    target = fit.target(options.prior)
-    scale = np.sqrt(np.diag(fit.covariance))
-    if options.method == "laplace":
-        return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
-    mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=scale)
-    if options.method == "importance":
-        from tactile_bayes.posterior.importance import importance, importance_options
-
-        try:
-            return importance(target, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
-        except NotConvergedError:
-            pass  # its weights cannot be trusted here; chains need none
-    if options.method in ("importance", "ensemble"):
-        from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
-
-        settings = EnsembleOptions()
-        if options.max_steps is not None:
-            settings = replace(settings, max_steps=options.max_steps)
-        return ensemble(target, mode, covariance, rng=rng, options=settings, progress=progress)
-    raise ValueError(f"unknown method {options.method!r}")
-
-
-def _map_posterior(
-    fit: BumpFit, draws: ParameterDraws, options: EstimateOptions, *, rng: np.random.Generator
-) -> MapPosterior:
-    theta = draws.theta
-    sigma_x, sigma_y, angle = fit.bump.widths(theta)
-    target = fit.target(options.prior)
-    # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
-    exact = options.method in ("ensemble", "importance")
-    excess = target.excess(draws.flat) if exact else fit.linear_excess(draws.flat)
-    noise = target.draw_noise_sd(excess, rng).reshape(theta.shape[:2])
-    return MapPosterior(
-        amplitude=theta[..., 0],
-        sigma_x_mm=sigma_x,
-        sigma_y_mm=sigma_y,
-        x_mm=theta[..., 1],
-        y_mm=theta[..., 2],
-        angle_rad=angle,
-        background=fit.bump.level(theta),
-        noise_sd=noise,
-    )
-
-
 def _size(
     posterior: MapPosterior,
     calibration: SizeCalibration | LogQuadratic | None,
@@ -379,17 +320,6 @@ def _draw_under_field(
         ),
         progress=progress,
     )
-
-
-def _judged_noise(fit: BumpFit, odds: float | None) -> dict[str, object]:
-    return {
-        "noise": "independent",
-        "noise_inflation": fit.errors.inflation,
-        "noise_dof": fit.errors.dof,
-        "level_offset": level_offset(fit.fit.residual, weight=fit.weight),
-        "rotation_odds": odds,
-        "rotated": fit.bump.rotated,
-    }
 
 
 def _diagnostics(

@@ -18,6 +18,7 @@ from tactile_bayes.posterior.fit import BumpFit
 from tactile_bayes.posterior.methods import MethodOptions, draw_scene
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.scene_choice import SceneChoice, add_beside, choose_shape
+from tactile_bayes.posterior.solved import Solved
 from tactile_bayes.posterior.surroundings import Surroundings
 
 Progress = Callable[[int, int], None]
@@ -99,18 +100,19 @@ def draw(
 ) -> FieldAnswer:
     """The same with a second structure where the map asks for one, and draws."""
     choice = add_beside(answer.choice, Surroundings.of(tactile_map), scene=scene)
-    draws, passed_over = draw_scene(choice.fit, method, rng=rng, options=options, progress=progress)
+    solved = Solved(choice.fit.target.conditional)
+    draws, passed_over = draw_scene(choice.fit, method, rng=rng, options=options, progress=progress, solved=solved)
     detection = answer.detection
     if choice.fit is choice.plain and "log_evidence" in draws.diagnostics:
         detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
     figures = _diagnostics(choice) | ({"passed_over": list(passed_over)} if passed_over else {})
-    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng), figures)
+    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng, solved), figures)
 
 
-def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator) -> dict[str, FloatArray]:
+def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved) -> dict[str, FloatArray]:
     theta, shape = draws.theta, draws.theta.shape[:2]
     sigma_x, sigma_y, angle = shape_draws(fit, theta)
-    amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng)
+    amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
     return {
         "amplitude": amplitude[:, 0].reshape(shape),
         "sigma_x_mm": sigma_x,

@@ -16,6 +16,7 @@ from tactile_bayes.posterior.draws import END_ERROR, INDEPENDENT_DRAWS, Paramete
 from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
+from tactile_bayes.posterior.solved import Solved
 
 LADDER = ("laplace", "importance", "ensemble")
 STEPS_UP = 1
@@ -71,8 +72,14 @@ def draw_scene(
     rng: np.random.Generator,
     options: MethodOptions | None = None,
     progress: Progress | None = None,
+    solved: Solved | None = None,
 ) -> tuple[ParameterDraws, tuple[str, ...]]:
     """Draws by the method asked for, or by the next one where its diagnostics do not hold.
+
+    Parameters
+    ----------
+    solved
+        Where importance sampling leaves what it solved, for `CollapsedTarget.draw_linear`.
 
     Returns
     -------
@@ -91,7 +98,7 @@ def draw_scene(
     first = LADDER.index(method)
     for name in LADDER[first : first + STEPS_UP + 1]:
         try:
-            draws = _draw(fit, name, rng=rng, options=options, progress=progress)
+            draws = _draw(fit, name, rng=rng, options=options, progress=progress, solved=solved)
         except NotConvergedError as error:
             passed_over.append(f"{name}: {error}")
             figures = error.diagnostics
@@ -105,14 +112,20 @@ def draw_scene(
 
 
 def _draw(
-    fit: FieldFit, method: str, *, rng: np.random.Generator, options: MethodOptions, progress: Progress | None
+    fit: FieldFit,
+    method: str,
+    *,
+    rng: np.random.Generator,
+    options: MethodOptions,
+    progress: Progress | None,
+    solved: Solved | None,
 ) -> ParameterDraws:
     if method == "laplace":
         return judged_laplace(fit, rng=rng, draws=options.draws)
     accuracy = options.in_sd(fit)
     density = Sampled.of(fit)
     if method == "importance":
-        draws = importance_draws(density, rng=rng, accuracy_sd=accuracy)
+        draws = importance_draws(density.keeping(solved), rng=rng, accuracy_sd=accuracy)
     else:
         draws = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
     return density.finished(draws, rng)
@@ -142,6 +155,8 @@ class Sampled:
         The second structure's parameters.
     spread : (k, k) array
         Root of the covariance that the second structure's uncertainty adds.
+    solved
+        Where solutions are kept; None keeps none.
     """
 
     fit: FieldFit
@@ -149,6 +164,7 @@ class Sampled:
     covariance: FloatArray
     beside: FloatArray
     spread: FloatArray
+    solved: Solved | None = None
 
     @classmethod
     def of(cls, fit: FieldFit) -> Sampled:
@@ -165,7 +181,13 @@ class Sampled:
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """(m,) log density of (m, k) parameters of the bump."""
-        return self.fit.target(self.whole(theta))
+        if self.solved is None:
+            return self.fit.target(self.whole(theta))
+        return self.fit.target.solved_density(theta, self.solved)
+
+    def keeping(self, solved: Solved | None) -> Sampled:
+        """The same density, which leaves its solutions in `solved` if draws will be points where it was evaluated."""
+        return self if len(self.beside) else replace(self, solved=solved)
 
     def whole(self, theta: FloatArray) -> FloatArray:
         """(..., p) parameters of the scene."""

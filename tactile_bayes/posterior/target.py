@@ -10,6 +10,7 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.least_squares import ModelFunction
 from tactile_bayes.posterior.noise import ErrorModel
+from tactile_bayes.posterior.solved import Solved
 
 BLOCK = 64
 """Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""
@@ -67,9 +68,18 @@ class Target:
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """(m,) log density of (m, p) parameter vectors; -inf where the model overflows."""
+        return self._at(theta, self.excess(theta))
+
+    def solved_density(self, theta: FloatArray, solved: Solved) -> FloatArray:
+        """The same, with the `excess` at these points kept in `solved` for `draw_noise_sd`."""
+        excess = self.excess(theta)
+        solved.add(theta, (excess,))
+        return self._at(theta, excess)
+
+    def _at(self, theta: FloatArray, excess: FloatArray) -> FloatArray:
         variance = self.errors.dof * self.errors.noise_sd**2
         exponent = 0.5 * (self.errors.dof + self.dimension)
-        likelihood = -exponent * np.log1p(self.excess(theta) / variance)
+        likelihood = -exponent * np.log1p(excess / variance)
         total = likelihood + self.log_prior(theta)
         return np.where(np.isfinite(total), total, -np.inf)
 

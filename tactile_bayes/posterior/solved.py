@@ -1,0 +1,57 @@
+"""What is linear in a map, solved where the density is evaluated and kept for the draws that come from there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+Solution = tuple[FloatArray, ...]
+"""Arrays with a row a parameter vector; see `CollapsedTarget.conditional`."""
+
+
+class Solved:
+    """A memory of solutions, found again by the parameter vector that they belong to.
+
+    Importance sampling evaluates the density at points that its draws are then chosen from. Solving those a second
+    time for the amplitude, level and noise scale of the draws cost as much as the sampling.
+
+    Parameters
+    ----------
+    solve
+        (m, p) parameter vectors to arrays of m rows.
+    """
+
+    def __init__(self, solve: Callable[[FloatArray], Solution]) -> None:
+        self._solve = solve
+        self._theta: list[FloatArray] = []
+        self._solutions: list[Solution] = []
+        self._index: tuple[FloatArray, Solution] | None = None
+
+    def add(self, theta: FloatArray, solution: Solution) -> None:
+        """Keep the solution at (m, p) parameter vectors."""
+        self._theta.append(theta)
+        self._solutions.append(solution)
+        self._index = None
+
+    def __call__(self, theta: FloatArray) -> Solution:
+        """The solution at (m, p) parameter vectors: kept ones where all are known, else solved anew."""
+        if not self._theta:
+            return self._solve(theta)
+        points, kept = self._sorted()
+        row = np.minimum(np.searchsorted(points[:, 0], theta[:, 0]), len(points) - 1)
+        if not np.array_equal(points[row], theta):
+            return self._solve(theta)
+        return tuple(one[row] for one in kept)
+
+    def _sorted(self) -> tuple[FloatArray, Solution]:
+        """All points by their first coordinate, in which no two random points agree, and their solutions."""
+        if self._index is None:
+            theta = np.concatenate(self._theta)
+            order = np.argsort(theta[:, 0], kind="stable")
+            together = (np.concatenate(parts) for parts in zip(*self._solutions, strict=True))
+            self._index = theta[order], tuple(one[order] for one in together)
+        return self._index
