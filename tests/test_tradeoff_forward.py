@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from itertools import count
@@ -14,7 +15,9 @@ import pytest
 
 from tactile_bayes.commands.study import fit_line
 from tactile_bayes.commands.study_raster import fit_raster
-from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
+from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump
 from tactile_bayes.forward.study import Geometry, StudyRow, StudySettings, run_geometry
@@ -29,7 +32,12 @@ from tactile_bayes.forward.tradeoff import (
     measure,
     settings_of,
 )
-from tactile_bayes.report.tradeoff_text import SizeRule, TradeoffReport, learned_rule, tradeoff_document, tradeoff_text
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.roundness import ShapePrior
+from tactile_bayes.posterior.size_calibration import SizeCalibration
+from tactile_bayes.report.size_rules import SizeRule, calibrated_rule, learned_rule
+from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document, tradeoff_text
 
 Run = Callable[..., "CompletedProcess[str]"]
 CASE = case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)))
@@ -95,6 +103,61 @@ def test_eq_6_is_learned_axis_by_axis_and_says_what_it_leaves() -> None:
     assert rule.scatter < 1e-9
 
 
+@functools.cache
+def shipped(name: str) -> SizeCalibration | LogQuadratic:
+    path = size_calibration_path(name)
+    assert path is not None
+    return read_size_calibration(path)
+
+
+def test_a_quadratic_gives_the_median_of_what_estimate_draws() -> None:
+    """Draws of a map that says a and the widths exactly, through all that `estimate` adds: a round lump's median."""
+    quadratic = shipped("solid")
+    assert isinstance(quadratic, LogQuadratic)
+    a, x, y = 0.3, 5.2, 4.0
+    rule = calibrated_rule(quadratic, name="solid.json")
+    (size,) = rule.sizes(a, x, y)
+    p, q = 0.5 * np.log(x * y), float(quadratic.round_excess(np.log(np.array(a)), 0.5 * np.log(np.array(x * y))))
+    draws = ShapeDraws(np.full(8000, np.log(a)), np.full(8000, p), np.full(8000, q), np.zeros(8000))
+    priors = SizePriors(shape=ShapePrior(oval_probability=1e-12))
+    pooled = pooled_size([draws], calibration=quadratic, priors=priors, rng=np.random.default_rng(3))
+    spread = float(np.std(np.log(pooled.d_x_mm)))
+    assert np.median(np.log(pooled.d_x_mm)) == pytest.approx(np.log(size), abs=4 * 1.25 * spread / np.sqrt(8000))
+    # the control: the widest of two sizes by each width, as Eq 6 has it, is another number
+    assert max(rule.sizes(a, x, None)[0], rule.sizes(a, y, None)[0]) > 1.05 * size
+    assert rule.sizes(a, x, None) == pytest.approx(rule.sizes(a, x, x))
+
+
+def test_each_form_says_what_it_leaves_and_where_it_ends() -> None:
+    for name, words in (("solid", "the log-quadratic of file.json"), ("plane-strain", "Eq 6 of file.json")):
+        rule = calibrated_rule(shipped(name), name="file.json")
+        assert rule.source == words
+        assert 0.05 < rule.scatter < 0.4
+        found = report().found[-1]
+        assert rule.outside(found) == []
+        (said, *_) = rule.outside(dataclasses.replace(found, amplitude=30.0))
+        assert said.startswith("amplitude 30 (table: ")
+
+
+def test_the_change_in_size_is_told_in_mm() -> None:
+    made = report()
+    (default,) = (one for one in made.of(SOLID) if one.setting.kind == "default")
+    assert made.size_change_mm(default) == pytest.approx(15.0 * 0.002)
+    text = tradeoff_text(made)
+    assert "the default mesh leaves +0.2 % (+0.030 mm)" in text
+    (line,) = (line for line in text.splitlines() if line.startswith("solid, fineness 2 (default)"))
+    assert line.endswith("+0.20  +0.030")
+
+
+def test_a_calibration_without_sizes_or_not_there_is_refused(run_cli: Run, tmp_path: Path) -> None:
+    done = run_cli("tradeoff", "forward", "--size-calibration", "none", cwd=tmp_path)
+    assert done.returncode == EXIT_USAGE
+    assert "gives no sizes" in done.stderr
+    done = run_cli("tradeoff", "forward", "--size-calibration", "mine.json", cwd=tmp_path)
+    assert done.returncode == EXIT_BAD_DATA
+    assert "mine.json" in done.stderr
+
+
 def test_the_advice_names_the_cheapest_that_is_enough() -> None:
     made = report()
     text = tradeoff_text(made)
@@ -153,5 +216,7 @@ def test_the_command_measures_draws_and_advises(run_cli: Run, tmp_path: Path) ->
     done = run_cli("tradeoff", "forward", "--figure", "t.png", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "solid: fineness 2" in done.stdout
+    assert "sizes by the log-quadratic of solid.json" in done.stdout
+    assert "sizes by Eq 6 of plane_strain.json" in done.stdout
     assert "plane-strain: fineness 1" in done.stdout  # elements of 1.5 mm are enough for 0.5 % in this lump's size
     assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")

@@ -10,15 +10,20 @@ import click
 
 if TYPE_CHECKING:
     from tactile_bayes.forward.tradeoff import LumpCase, Measured
-    from tactile_bayes.report.tradeoff_text import SizeRule, TradeoffReport
+    from tactile_bayes.report.size_rules import SizeRule
+    from tactile_bayes.report.tradeoff_text import TradeoffReport
 
 _FILE = click.Path(path_type=Path)
+LEARNED = "learned"
 
 
 @click.command("forward")
 @click.argument("scene", required=False, metavar="[SCENE.toml]", type=_FILE)
 @click.option(
-    "--size-calibration", metavar="SIZE.json", type=_FILE, help="Eq 6 for the sizes; else it is learned on the spot."
+    "--size-calibration",
+    metavar="solid|plane-strain|learned|SIZE.json",
+    help="For the sizes: one that comes with the program, yours, or Eq 6 learned on the spot; "
+    "if nothing is said, each model's own.",
 )
 @click.option("--figure", metavar="OUT.png", type=_FILE, help="Draw error in size against time.")
 @click.option(
@@ -34,7 +39,7 @@ _FILE = click.Path(path_type=Path)
 def command(
     *,
     scene: Path | None,
-    size_calibration: Path | None,
+    size_calibration: str | None,
     figure: Path | None,
     tolerance_percent: float,
     runs: int,
@@ -45,8 +50,11 @@ def command(
 
     The empirical model, plane strain at several cells and the solid model at several meshes, ranks and rims compute the
     map of one lump, here and now; each model's finest setting is the reference of its others. Without SCENE.toml: a
-    hard ball of 15 mm at h/d 1, its centre on the gland. Without --size-calibration Eq 6 is learned from each model's
-    own lumps in the same body, which takes most of a minute.
+    hard ball of 15 mm at h/d 1, its centre on the gland.
+
+    Sizes come from the calibration that `estimate` uses, and the cylinder's from `plane-strain`. These maps have no
+    noise and a background of 1, so a size may be off; what counts is how it changes, which is given in mm and percent.
+    With --size-calibration learned Eq 6 is learned from each model's own lumps in the same body, in most of a minute.
 
     Example: tactile-bayes tradeoff forward --figure tradeoff.png
     """
@@ -87,23 +95,17 @@ def _case(path: Path | None) -> LumpCase:
         raise error.at(path) from None
 
 
-def run_tradeoff(case: LumpCase, calibration: Path | None, *, tolerance: float, runs: int) -> TradeoffReport:
-    """Learn Eq 6 or read it, then measure every setting."""
+def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
+    """Learn Eq 6 or read the calibrations, then measure every setting."""
     import time
 
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.study import fit_line
     from tactile_bayes.commands.study_raster import fit_raster
-    from tactile_bayes.forward.tradeoff import PLANE, SOLID, measure, settings_of, teach
-    from tactile_bayes.report.tradeoff_text import TradeoffReport, learned_rule
+    from tactile_bayes.forward.tradeoff import PLANE, SOLID, measure, settings_of
+    from tactile_bayes.report.tradeoff_text import TradeoffReport
 
-    rules: dict[str, SizeRule] = {}
-    for model in (PLANE, SOLID):
-        if calibration is not None:
-            rules[model] = _calibrated(calibration)
-            continue
-        with progress_bar(f"lumps for Eq 6, {model}") as progress:
-            rules[model] = learned_rule(teach(case, model, fit=fit_line, raster_fit=fit_raster, progress=progress))
+    rules = {model: _rule(case, model, calibration or model) for model in (PLANE, SOLID)}
     found: list[Measured] = []
     settings = settings_of(case)
     measure(case, settings[0], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)  # imports cost nothing
@@ -116,25 +118,21 @@ def run_tradeoff(case: LumpCase, calibration: Path | None, *, tolerance: float, 
     return TradeoffReport(case, tuple(found), rules, tolerance)
 
 
-def _calibrated(path: Path) -> SizeRule:
-    """The point estimate of a calibration's Eq 6, each axis of the head its own."""
-    import numpy as np
-
-    from tactile_bayes.errors import BadDataError
+def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
+    """How the widths of a model's maps become sizes: by a calibration's name or path, or learned."""
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.commands.study import fit_line
+    from tactile_bayes.commands.study_raster import fit_raster
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.size_calibration import SizeCalibration
-    from tactile_bayes.report.tradeoff_text import SizeRule
+    from tactile_bayes.forward.tradeoff import teach
+    from tactile_bayes.report.size_rules import calibrated_rule, learned_rule
 
-    calibration = read_size_calibration(path)
-    if not isinstance(calibration, SizeCalibration):
-        raise BadDataError("is not of the form Eq 6", way_out="give a calibration of `calibrate size`", path=str(path))
-
-    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        a = np.array([amplitude])
-        found = [float(calibration.x.size_mm(np.array([sigma_x_mm]), a)[0])]
-        if sigma_y_mm is not None:
-            found.append(float(calibration.y.size_mm(np.array([sigma_y_mm]), a)[0]))
-        return found
-
-    scatter = calibration.x.draws.mean(axis=0)[4]
-    return SizeRule(sizes, float(scatter), f"Eq 6 of {path.name}")
+    if name == LEARNED:
+        with progress_bar(f"lumps for Eq 6, {model}") as progress:
+            return learned_rule(teach(case, model, fit=fit_line, raster_fit=fit_raster, progress=progress))
+    path = size_calibration_path(name)
+    if path is None:
+        raise UsageError(f"--size-calibration {name} gives no sizes; name a calibration, or say {LEARNED}")
+    return calibrated_rule(read_size_calibration(path), name=path.name)

@@ -2,47 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from tactile_bayes.forward.study import StudyRow, learn_as_printed, seat_name
+from tactile_bayes.forward.study import seat_name
 from tactile_bayes.forward.tradeoff import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, change, cheapest
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.report.size_rules import SizeRule
 
 # Settings that differ in how finely the same thing is computed.
 _MESHES = ("mesh", "default", "contact cell", "reference")
 _NAME = 52
-
-Sizes = Callable[[float, float, float | None], list[float]]
-"""Diameters in mm from an amplitude and the widths across and along the head."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SizeRule:
-    """How a width becomes a size.
-
-    Parameters
-    ----------
-    sizes
-        Diameters; the largest is the size, as `estimate` has it.
-    scatter
-        Standard deviation of ln d that it leaves on what it was learned from.
-    source
-        In words.
-    """
-
-    sizes: Sizes
-    scatter: float
-    source: str
-
-    def size_mm(self, one: Measured) -> float:
-        """Size of a measured map; NaN where its amplitude has none."""
-        if not one.amplitude > 0:
-            return float("nan")
-        return max(self.sizes(one.amplitude, one.sigma_x_mm, one.sigma_y_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +29,7 @@ class TradeoffReport:
     found
         Every setting.
     rules
-        Eq 6 for plane strain and for the solid model.
+        From widths to sizes, for plane strain and for the solid model.
     tolerance
         Error in size, as a share, below which nothing is gained.
     """
@@ -77,31 +50,16 @@ class TradeoffReport:
         return found
 
     def size_mm(self, one: Measured) -> float:
-        """Size by the model's own Eq 6; plane strain's for the empirical one."""
+        """Size by the model's own rule; plane strain's for the empirical one."""
         return self.rules[SOLID if one.setting.model == SOLID else PLANE].size_mm(one)
 
     def size_error(self, one: Measured) -> float:
         """Against the model's reference, as a share."""
         return change(self.size_mm(one), self.size_mm(self.reference(one.setting.model)))
 
-
-def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
-    """Eq 6 in two stages from a study's rows, each axis of the head its own, and what it leaves of them."""
-    axes = ["x", "y"] if rows[0].sigma_y_mm is not None else ["x"]
-    learned = [learn_as_printed(rows, axis=axis) for axis in axes]
-
-    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        widths = (sigma_x_mm, sigma_y_mm)
-        return [
-            one.m * width / (one.e * amplitude**one.f) + one.b_mm
-            for one, width in zip(learned, widths, strict=False)
-            if one is not None and width is not None
-        ] or [float("nan")]
-
-    shown = [row for row in rows if row.detectable]
-    left = [max(sizes(row.amplitude, row.sigma_x_mm, row.sigma_y_mm)) / row.d_mm for row in shown]
-    scatter = float(np.sqrt(np.mean(np.log(np.maximum(left, 1e-3)) ** 2))) if shown else float("nan")
-    return SizeRule(sizes, scatter, f"Eq 6 in two stages from {len(shown)} hard lumps of 10 to 25 mm in this body")
+    def size_change_mm(self, one: Measured) -> float:
+        """Against the model's reference, in mm."""
+        return self.size_mm(one) - self.size_mm(self.reference(one.setting.model))
 
 
 def tradeoff_text(report: TradeoffReport) -> str:
@@ -112,9 +70,9 @@ def tradeoff_text(report: TradeoffReport) -> str:
         f"{seat_name(case.seat)}",
         "",
         f"{'':<{_NAME}}{'element':>8}{'a lump':>8}{'a map':>8}{'':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}"
-        f"   off from the model's finest, %",
+        f"   off from the model's finest, %       mm",
         f"{'model and setting':<{_NAME}}{'mm':>8}{'s CPU':>8}{'s CPU':>8}{'a':>8}{'mm':>8}{'mm':>8}{'mm':>7}"
-        f"{'a':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}",
+        f"{'a':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}{'size':>8}",
     ]
     lines += [_line(one, report) for one in report.found]
     return "\n".join([*lines, "", *advice(report)])
@@ -132,10 +90,11 @@ def _line(one: Measured, report: TradeoffReport) -> str:
         report.size_error(one),
     )
     shares = [f"{100 * value:+.2f}" if np.isfinite(value) else "" for value in off]
+    in_mm = report.size_change_mm(one)
     return (
         f"{name:<{_NAME}}{one.element_mm:>8.2f}{one.lump_s:>8.2f}{one.map_s:>8.2f}{one.amplitude:>8.4f}"
         f"{one.sigma_x_mm:>8.3f}{along:>8}{report.size_mm(one):>7.2f}"
-        f"{shares[0]:>8}{shares[1]:>8}{shares[2]:>8}{shares[3]:>7}"
+        f"{shares[0]:>8}{shares[1]:>8}{shares[2]:>8}{shares[3]:>7}{f'{in_mm:+.3f}' if np.isfinite(in_mm) else '':>8}"
     )
 
 
@@ -144,9 +103,9 @@ def advice(report: TradeoffReport) -> list[str]:
     lines = [_enough(report, SOLID), _enough(report, PLANE)]
     solid, plane, empirical = report.reference(SOLID), report.reference(PLANE), report.of(EMPIRICAL)[0]
     if report.rules[PLANE].source == report.rules[SOLID].source:
-        mistaken = f"a cylinder's map read by the same Eq 6 gives {report.size_mm(plane):.1f} mm"
+        mistaken = f"a cylinder's map read by the same calibration gives {report.size_mm(plane):.1f} mm"
     else:
-        mistaken = f"a ball's map read by the cylinder's Eq 6 gives {report.rules[PLANE].size_mm(solid):.1f} mm"
+        mistaken = f"a ball's map read by the cylinder's calibration gives {report.rules[PLANE].size_mm(solid):.1f} mm"
     lines.append(
         f"two dimensions: a cylinder shows {_percent(change(plane.amplitude, solid.amplitude))} in amplitude and "
         f"{_percent(change(plane.sigma_x_mm, solid.sigma_x_mm))} in width against a ball; {mistaken} for "
@@ -155,10 +114,13 @@ def advice(report: TradeoffReport) -> list[str]:
     lines.append(f"Eqs 1 to 4 stand in for plane strain with {_percent(report.size_error(empirical))} in size")
     for model in (SOLID, PLANE):
         rule = report.rules[model]
+        default = _default(report, model)
         lines.append(
             f"{model}: sizes by {rule.source}, which itself leaves {100 * rule.scatter:.0f} % (SD of ln d); "
-            f"the default mesh leaves {_percent(report.size_error(_default(report, model)))}"
+            f"the default mesh leaves {_percent(report.size_error(default))} ({report.size_change_mm(default):+.3f} mm)"
         )
+        if outside := rule.outside(report.reference(model)):
+            lines.append(f"{model}: the map is none of the calibration's: {', '.join(outside)}")
     return lines
 
 
@@ -221,4 +183,5 @@ def _row(one: Measured, report: TradeoffReport) -> dict[str, Any]:
         "amplitude_error": change(one.amplitude, best.amplitude),
         "sigma_x_error": change(one.sigma_x_mm, best.sigma_x_mm),
         "size_error": report.size_error(one),
+        "size_change_mm": report.size_change_mm(one),
     }
