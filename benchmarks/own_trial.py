@@ -50,6 +50,11 @@ def draw_trial() -> list[Mass]:
     return [_draw(i, np.random.default_rng([SEED, i])) for i in range(MASSES + EMPTY)]
 
 
+def draw_mass_like_trial(index: int, *, seed: int) -> list[Scene]:
+    """The exams of one more mass of this kind, never an empty body."""
+    return list(_draw(index % MASSES, np.random.default_rng([seed, index])).scenes)
+
+
 def _draw(index: int, rng: np.random.Generator) -> Mass:
     d = float(np.clip(rng.lognormal(np.log(14.0), 0.35), 6.0, 28.0))
     ratio = float(rng.triangular(0.6, 0.85, 1.6))

@@ -1,0 +1,287 @@
+"""How often the intervals of `estimate` hold, on maps that its own model did not make.
+
+    python -m benchmarks.interval_coverage widths [--maps 400] [--workers 2]
+    python -m benchmarks.interval_coverage sizes [--masses 140] [--bodies population|trial] [--workers 2] [-o ROWS]
+
+`widths`: sigma_x and sigma_y of maps with a known bump under independent errors, under fields with exponential
+correlation (drawn by the covariance's Cholesky factor, not by the model's cosines), of a bump that is no Gaussian, and
+of scans by a simulated head, whose truth is what the same estimate says of the same scan without sensor and tracker
+errors (a size calibration's widths mean the same). The last row is the
+negative control: the model of independent errors without its inflation, on maps with a field.
+
+`sizes`: the whole path. Each mass is scanned three times by the solid model, each scan mapped and sized, alone and
+pooled, with the shipped calibration. `population` draws bodies from the prior that the calibration was learned over,
+with another seed; `trial` draws those of `benchmarks.own_trial`, which differ from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from benchmarks.own_trial import draw_mass_like_trial
+from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.forward.population import draw_mass
+from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
+from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.fit import FitOptions, fit_bump
+
+NOMINAL = 0.9
+AXIS = np.arange(-28.0, 28.5)
+AMPLITUDE, SIGMA = 0.3, (4.5, 5.5)
+COUNT = 40
+SEED = 20261122
+KINDS: dict[str, dict[str, float]] = {
+    "white": {"white": 0.01},
+    "field 3 mm": {"white": 0.01, "field": 0.01, "length_mm": 3.0},
+    "field 6 mm": {"white": 0.01, "field": 0.01, "length_mm": 6.0},
+    "field-dominated": {"white": 0.002, "field": 0.02, "length_mm": 4.0},
+    "super-Gaussian, exponent 2.5": {"white": 0.01, "field": 0.01, "length_mm": 3.0, "exponent": 1.25},
+}
+CONTROL = "control: independent errors assumed, field 3 mm"
+HEAD = "simulated head"
+Row = dict[str, Any]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["widths", "sizes"])
+    parser.add_argument("--maps", type=int, default=400, help="a row")
+    parser.add_argument("--masses", type=int, default=140, help="three maps each")
+    parser.add_argument("--bodies", choices=["population", "trial"], default="population")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("-o", "--output", type=Path, help="sizes: keep the rows; an interrupted run goes on")
+    given = parser.parse_args(arguments)
+    print(f"load {os.getloadavg()[0]:.1f}")
+    with ProcessPoolExecutor(given.workers) as pool:
+        if given.what == "widths":
+            widths(partial(pool.map, chunksize=4), given.maps)
+        else:
+            sizes(pool.map, given.masses, given.bodies, given.output)
+    return 0
+
+
+def share(inside: Sequence[bool]) -> str:
+    """A share in percent with its exact 95 % interval."""
+    if not inside:
+        return "-"
+    ci = binomtest(sum(inside), len(inside)).proportion_ci()
+    return f"{np.mean(inside):.3f} [{ci.low:.3f}, {ci.high:.3f}]"
+
+
+# --- widths ---
+
+
+def widths(run: Callable[..., Iterable[Any]], maps: int) -> None:
+    """A row for each kind of error."""
+    print(f"nominal {NOMINAL:g}: share of intervals that hold, with its exact 95 % interval")
+    for kind in [*KINDS, HEAD, CONTROL]:
+        found = list(run(partial(_one_map, kind), range(maps)))
+        held = [one for one in found if one is not None]
+        x, y = ([one[i] for one in held] for i in (0, 1))
+        print(f"{kind:<50} n {len(held):>4}  sigma_x {share(x)}  sigma_y {share(y)}", flush=True)
+
+
+def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
+    rng = np.random.default_rng([SEED, index])
+    if kind == HEAD:
+        tactile_map, truth = _head_map(index)
+    else:
+        tactile_map, truth = _grid_map(KINDS["field 3 mm" if kind == CONTROL else kind], rng)
+    if kind == CONTROL:
+        return _held_by_independent(tactile_map, truth)
+    options = EstimateOptions(fit=FitOptions("free", 20.0, "off", None, "field"))
+    found = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
+    if found.map_posterior is None:
+        return None
+    tail = (1 - NOMINAL) / 2
+    x, y = (
+        np.quantile(draws, [tail, 1 - tail])
+        for draws in (found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
+    )
+    return bool(x[0] <= truth[0] <= x[1]), bool(y[0] <= truth[1] <= y[1])
+
+
+def _held_by_independent(tactile_map: TactileMap, truth: tuple[float, float]) -> tuple[bool, bool] | None:
+    """Least squares with independent errors, as a textbook has it."""
+    fit, _ = fit_bump(tactile_map, (0.0, 0.0), options=FitOptions("free", 20.0, "off"))
+    if fit is None:
+        return None
+    p, q = (fit.bump.names.index(name) for name in ("p", "q"))
+    covariance = fit.covariance / fit.errors.inflation
+    held = []
+    for sign, true in ((1.0, truth[0]), (-1.0, truth[1])):
+        mean = fit.theta[p] + sign * fit.theta[q]
+        sd = np.sqrt(covariance[p, p] + covariance[q, q] + 2 * sign * covariance[p, q])
+        held.append(bool(abs(mean - np.log(true)) <= 1.645 * sd))
+    return held[0], held[1]
+
+
+def _grid_map(kind: dict[str, float], rng: np.random.Generator) -> tuple[TactileMap, tuple[float, float]]:
+    centre = rng.uniform(-2.0, 2.0, 2)
+    exponent = kind.get("exponent", 1.0)
+    bump = AMPLITUDE * _cell_means(centre, exponent)
+    slope = 0.002 * rng.standard_normal(2)
+    level = 1.0 + slope[0] * AXIS + slope[1] * AXIS[:, None]
+    errors = kind["white"] * rng.standard_normal(bump.shape)
+    if "field" in kind:
+        errors = errors + kind["field"] * _field(kind["length_mm"], rng)
+    variance = np.full(bump.shape, COUNT * kind["white"] ** 2)
+    count = np.full(bump.shape, COUNT, dtype=np.int64)
+    recipe = MapRecipe("grid", "mean", 1.0)
+    tactile_map = TactileMap(level + bump + errors, variance, count, AXIS, AXIS, recipe=recipe, background=1.0)
+    return tactile_map, SIGMA if exponent == 1.0 else _equivalent_widths(exponent)
+
+
+def _cell_means(centre: FloatArray, exponent: float) -> FloatArray:
+    """Of a bump exp(-(r^2/2)^exponent) of unit height, r in widths; 5 by 5 points a cell."""
+    fine = (AXIS[:, None] + np.linspace(-0.4, 0.4, 5)).ravel()
+    square = ((fine - centre[0]) / SIGMA[0]) ** 2 + ((fine[:, None] - centre[1]) / SIGMA[1]) ** 2
+    n = len(AXIS)
+    return np.asarray(np.exp(-((square / 2) ** exponent)).reshape(n, 5, n, 5).mean(axis=(1, 3)))
+
+
+@cache
+def _equivalent_widths(exponent: float) -> tuple[float, float]:
+    """Widths of the Gaussian that lies nearest to the bump by least squares: what a width of it means."""
+    mean = 1.0 + AMPLITUDE * _cell_means(np.zeros(2), exponent)
+    blank = TactileMap(
+        mean, 0 * mean, np.full(mean.shape, COUNT), AXIS, AXIS, recipe=MapRecipe("grid", "mean", 1.0), background=1.0
+    )
+    fit, fault = fit_bump(blank, (0.0, 0.0), options=FitOptions("free", 20.0, "off"))
+    assert fit is not None, fault
+    return fit.widths()[:2]
+
+
+def _field(length_mm: float, rng: np.random.Generator) -> FloatArray:
+    factor = _factor(length_mm)
+    return np.asarray(factor @ rng.standard_normal(len(factor))).reshape(len(AXIS), len(AXIS))
+
+
+@cache
+def _factor(length_mm: float) -> FloatArray:
+    x, y = (one.ravel() for one in np.meshgrid(AXIS, AXIS))
+    away = np.hypot(x[:, None] - x, y[:, None] - y)
+    return np.linalg.cholesky(np.exp(-away / length_mm) + 1e-10 * np.eye(len(x)))
+
+
+def _head_map(index: int) -> tuple[TactileMap, tuple[float, float]]:
+    """A scan's map, and the widths of the same scan's map without errors."""
+    rng = np.random.default_rng([SEED, index, 1])
+    noise = Noise(
+        element_kpa=float(rng.uniform(0.05, 0.3)),
+        tracker_mm=float(rng.uniform(0.1, 0.6)),
+        tracker_deg=float(rng.uniform(0.05, 0.3)),
+        gain_share=float(rng.uniform(0.002, 0.02)),
+    )
+    x, y = rng.uniform(-3.0, 3.0, 2)
+    lump = Lump(x_mm=float(x), y_mm=float(y), amplitude=AMPLITUDE, sigma_x_mm=SIGMA[0], sigma_y_mm=SIGMA[1])
+    scene = Scene(seed=index, frame_rate_hz=100.0, lumps=(lump,), noise=noise, strokes=Strokes(yaw_deg=0.0))
+    clean = replace(scene, noise=Noise(0.0, 0.0, 0.0, 0.0, 0.0), tracker=Tracker())
+    noisy, exact = (
+        build_map(simulate(one, rng=np.random.default_rng([SEED, index, 2])).scan) for one in (scene, clean)
+    )
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
+    truth = estimate_map(exact, calibration=None, options=options, rng=rng).map_posterior
+    assert truth is not None
+    return noisy, (float(np.median(truth.sigma_x_mm)), float(np.median(truth.sigma_y_mm)))
+
+
+# --- sizes ---
+
+
+def sizes(run: Callable[..., Iterable[Row]], masses: int, bodies: str, output: Path | None) -> None:
+    """Draw, scan, map, size, pool, count."""
+    kept = [json.loads(line) for line in output.read_text().splitlines()] if output and output.exists() else []
+    rows = {row["index"]: row for row in kept if row["bodies"] == bodies}
+    for row in run(partial(_size_mass, bodies), [i for i in range(masses) if i not in rows]):
+        rows[row["index"]] = row
+        if output:
+            with output.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+        if sys.stderr.isatty():
+            print(f"\r{len(rows)} of {masses}", end="", file=sys.stderr)
+    report_sizes([rows[i] for i in sorted(rows)])
+
+
+def report_sizes(rows: list[Row]) -> None:
+    """Coverage and errors of single maps and of pooled masses."""
+    single = [(row["d_mm"], one) for row in rows for one in row["single"] if one]
+    pooled = [(row["d_mm"], row["pooled"]) for row in rows if row["pooled"]]
+    maps = sum(len(row["single"]) for row in rows)
+    print(f"{len(rows)} masses, {maps} maps; sized: {len(single)} maps, {len(pooled)} masses")
+    for name, sized in (("single map", single), ("three maps pooled", pooled)):
+        if not sized:
+            continue
+        error = np.array([one["median"] / true - 1 for true, one in sized])
+        print(f"{name}: MAE {100 * np.mean(np.abs(error)):.1f} %, bias {100 * np.mean(error):+.1f} %")
+        for level in ("50", "90", "95"):
+            inside = [one[level][0] <= true <= one[level][1] for true, one in sized]
+            print(f"  nominal {level} %: {share(inside)}")
+
+
+def _size_mass(bodies: str, index: int) -> Row:
+    from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pool_maps
+
+    path = size_calibration_path(DEFAULT)
+    assert path is not None
+    calibration = read_size_calibration(path)
+    assert isinstance(calibration, LogQuadratic)
+    scenes = draw_mass(index, scans=3, seed=SEED) if bodies == "population" else draw_mass_like_trial(index, seed=SEED)
+    lump, shapes, single = scenes[0].solid_lumps[0], [], []
+    for found in _estimates(scenes, calibration):
+        if found is None or found.map_posterior is None or found.size is None:
+            shapes.append(None)
+            single.append(None)
+            continue
+        one = found.map_posterior
+        shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad))
+        single.append(_intervals(found.size.max_size_mm))
+    pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))
+    return {
+        "index": index,
+        "bodies": bodies,
+        "d_mm": max(lump.d_mm, lump.vertical_mm),
+        "single": single,
+        "pooled": None if pooled.size is None else _intervals(pooled.size.max_size_mm),
+    }
+
+
+def _estimates(scenes: Sequence[Scene], calibration: Any) -> Iterator[Estimate | None]:
+    recipe = calibration.recipe
+    fit = FitOptions(recipe.background, recipe.radius_mm, "auto", None, recipe.noise)
+    for scene in scenes:
+        rng = np.random.default_rng([SEED, scene.seed])
+        try:
+            tactile_map = build_map(simulate(scene, rng=rng).scan)
+            yield estimate_map(tactile_map, calibration=calibration, options=EstimateOptions(fit=fit), rng=rng)
+        except TactileBayesError:
+            yield None
+
+
+def _intervals(draws: FloatArray) -> dict[str, Any]:
+    ends = {f"{level}": list(np.nanquantile(draws, [0.5 - level / 200, 0.5 + level / 200])) for level in (50, 90, 95)}
+    return {"median": float(np.nanmedian(draws)), **ends}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
