@@ -86,11 +86,13 @@ def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
 def test_the_table_has_a_width_for_each_axis_of_the_head() -> None:
     head, *_, last = table_text(rows()).splitlines()
     names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,sigma_y_mm,fit_rms,detectable"
+    names += ",thickness_mm,head_radius_mm"
     assert head == names
     cells = dict(zip(names.split(","), last.split(","), strict=True))
     assert cells["seat"] == "1.2"
     assert float(cells["sigma_x_mm"]) > float(cells["sigma_y_mm"])  # a ball looks longer across the head
     assert cells["detectable"] == "true"
+    assert (cells["thickness_mm"], cells["head_radius_mm"]) == ("70", "35")
 
 
 def test_a_ball_too_small_for_the_array_is_marked() -> None:

@@ -130,10 +130,11 @@ def test_a_harder_lump_shows_higher(rows: list[StudyRow]) -> None:
 
 def test_the_table_says_what_was_found(rows: list[StudyRow]) -> None:
     head, first, *_ = table_text(rows).splitlines()
-    assert head == "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,fit_rms,detectable"
+    names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,fit_rms,detectable,thickness_mm,head_radius_mm"
+    assert head == names
     cells = first.split(",")
     assert cells[:4] == ["centred", "10", "1", "2"]
-    assert cells[-1] == "true"
+    assert cells[-3:] == ["true", "70", "35"]
     assert float(cells[4]) == pytest.approx(rows[0].amplitude, rel=1e-5)
 
 

@@ -91,7 +91,9 @@ def size(
     stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The
     declared options say how the table's maps were made; `estimate` refuses a map made otherwise. With depth_ratio and
     stiffness_ratio the table is a study: each geometry (seat, d_mm, depth_ratio) is also left out of the learning in
-    turn, and the report tells how far Eq 6 and a quadratic in logarithms then miss the hard lumps' sizes.
+    turn, and the report tells how far Eq 6 and a quadratic in logarithms then miss the hard lumps' sizes. Where seat,
+    stiffness below 8, thickness_mm or head_radius_mm vary in it, the report tells what each does to the size that Eq 6
+    gives, and how much of its scatter would go if it were known; `estimate` does not use that.
 
     The log-quadratic form, ln d as a quadratic in ln a and ln sigma, tells apart what differs between bodies and
     between exams of one body. Its table comes from `population`, which made the maps: nothing is declared.
@@ -111,6 +113,7 @@ def size(
     from tactile_bayes.posterior.learn_size import learn_size_calibration
     from tactile_bayes.posterior.left_out import left_out_of_study
     from tactile_bayes.posterior.size_calibration import Recipe
+    from tactile_bayes.posterior.size_terms import size_terms
     from tactile_bayes.report.calibration_text import calibration_text
 
     refuse_existing(output, force=force)
@@ -138,7 +141,7 @@ def size(
     }
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, calibration, provenance=provenance, force=force)
-    click.echo(calibration_text(calibration), nl=False)
+    click.echo(calibration_text(calibration, terms=size_terms(lumps)), nl=False)
 
 
 def _refuse_declared(ctx: click.Context) -> None:
@@ -242,7 +245,8 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
         raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
     if depth is None:
         return SizeTable(d_mm, amplitude, sigma_x, sigma_y)
-    group = list(zip(columns["seat"], columns["d_mm"], columns["stiffness_ratio"], strict=True))
+    same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm")]
+    group = list(zip(*same, strict=True))
     change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
     change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)
     return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns))
@@ -257,4 +261,21 @@ def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
     if None in columns["stiffness_ratio"]:
         return None
     depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))
-    return StudyCases(tuple(columns["seat"]), depth, ratio)
+    told = {"seat_number": _seat_numbers(columns["seat"])}
+    told |= {name: columns[name] for name in ("thickness_mm", "head_radius_mm")}
+    others = {name: np.asarray(values, dtype=np.float64) for name, values in told.items() if None not in values}
+    return StudyCases(tuple(columns["seat"]), depth, ratio, others)
+
+
+def _seat_numbers(seats: list[str | None]) -> list[float | None]:
+    """0 for centred, 1 for resting; None for names that are the table's own."""
+    from tactile_bayes.errors import TactileBayesError
+    from tactile_bayes.forward.body import parse_seat
+
+    def number(seat: str | None) -> float | None:
+        try:
+            return None if seat is None else parse_seat(seat)
+        except TactileBayesError:
+            return None
+
+    return [number(seat) for seat in seats]

@@ -78,7 +78,8 @@ def command(
     background at 1: Eq 5 across a cylinder in two dimensions, Eq 7 over a ball in three. Cases with an amplitude below
     0.02 or a width that is not resolved are marked as not detectable. With -o an interrupted study goes on where it
     stopped. `calibrate size` learns from the table of the solid model as it is, from the other with
-    --fit-radius-mm 48.
+    --fit-radius-mm 48. From the joined tables of several seats, thicknesses or heads it also tells what each would
+    change.
 
     A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
     lump's centre on the fat-gland boundary, 1 (resting) its lowest point; above 1 the lump stands clear of the gland.
@@ -276,13 +277,15 @@ def table_text(rows: list[StudyRow]) -> str:
     names = ["seat", "d_mm", "depth_ratio", "stiffness_ratio", "amplitude", "sigma_x_mm"]
     if any(row.sigma_y_mm is not None for row in rows):
         names.append("sigma_y_mm")
-    names += ["fit_rms", "detectable"]
+    names += ["fit_rms", "detectable", "thickness_mm", "head_radius_mm"]
     lines = [",".join(names)]
     lines += [",".join(_cell(getattr(row, name)) for name in names) for row in rows]
     return "\n".join(lines) + "\n"
 
 
 def _cell(value: Any) -> str:
+    if value is None:
+        return ""
     if isinstance(value, bool):
         return "true" if value else "false"
     return value if isinstance(value, str) else f"{value:.6g}"

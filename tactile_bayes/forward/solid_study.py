@@ -232,6 +232,8 @@ def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: Rast
                 found.rms,
                 bool(found.amplitude >= DETECTABLE and found.resolved),
                 found.sigma_y_mm,
+                body.layers.thickness_mm,
+                settings.head.radius_mm,
             )
         )
     return rows

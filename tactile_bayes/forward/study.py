@@ -124,7 +124,8 @@ Fit = Callable[[TactileLine, float], LineFit]
 class StudyRow:
     """One case and the Gaussian its map shows; the fields are the columns of a size table.
 
-    A map in two dimensions has no `sigma_y_mm`.
+    A map in two dimensions has no `sigma_y_mm`. `thickness_mm` (depth of the chest wall) and `head_radius_mm` (of its
+    arc) are what the case was computed with.
     """
 
     seat: str
@@ -136,6 +137,8 @@ class StudyRow:
     fit_rms: float
     detectable: bool
     sigma_y_mm: float | None = None
+    thickness_mm: float | None = None
+    head_radius_mm: float | None = None
 
 
 def seat_name(seat: float) -> str:
@@ -176,7 +179,8 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
     fit
         How Eq 5 is fitted; importable by name, as `batch` needs it.
     """
-    surface = settings.surface(settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat))
+    body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
+    surface = settings.surface(body)
     rows = []
     for ratio in geometry.stiffness_ratios:
         found = fit(build_line(settings.frames(surface, ratio)), settings.fit_radius_mm)
@@ -190,6 +194,8 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
                 found.sigma_mm,
                 found.rms,
                 bool(found.amplitude >= DETECTABLE and found.resolved),
+                thickness_mm=body.layers.thickness_mm,
+                head_radius_mm=settings.head.radius_mm,
             )
         )
     return rows

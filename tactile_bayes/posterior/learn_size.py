@@ -14,8 +14,8 @@ e is then 1 by convention.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -40,16 +40,26 @@ class StudyCases:
         (n,) names or numbers as text; None where the table does not say.
     depth_ratio, stiffness_ratio : (n,) arrays
         h/d, and E2/E1.
+    others
+        (n,) arrays of what else the table tells of every row: ``thickness_mm``, ``head_radius_mm``, and ``seat_number``
+        where all seats have one.
     """
 
     seat: tuple[str | None, ...]
     depth_ratio: FloatArray
     stiffness_ratio: FloatArray
+    others: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def rows(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> StudyCases:
         """The rows for which `keep` is true."""
         seat = tuple(name for name, kept in zip(self.seat, keep, strict=True) if kept)
-        return StudyCases(seat, self.depth_ratio[keep], self.stiffness_ratio[keep])
+        others = {name: values[keep] for name, values in self.others.items()}
+        return StudyCases(seat, self.depth_ratio[keep], self.stiffness_ratio[keep], others)
+
+    def lumps(self, d_mm: FloatArray) -> list[tuple[object, ...]]:
+        """For each row what two rows share that differ in depth only."""
+        others = [values.tolist() for values in self.others.values()]
+        return list(zip(self.seat, d_mm.tolist(), self.stiffness_ratio.tolist(), *others, strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

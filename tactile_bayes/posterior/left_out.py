@@ -93,7 +93,7 @@ def _left_out(geometry: np.ndarray[tuple[int], np.dtype[np.intp]], predict: _Pre
 def _eq6(table: SizeTable, sigma_mm: FloatArray) -> _Predict:
     cases = table.cases
     assert cases is not None
-    lump = list(zip(cases.seat, table.d_mm.tolist(), cases.stiffness_ratio.tolist(), strict=True))
+    lump = cases.lumps(table.d_mm)
 
     def predict(kept: _Rows) -> FloatArray:
         group = [key for key, is_kept in zip(lump, kept, strict=True) if is_kept]

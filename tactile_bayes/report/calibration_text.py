@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
+from tactile_bayes.posterior.size_terms import SizeTerms
 from tactile_bayes.presets import RESEARCH_USE
 
 LABELS = {
@@ -15,8 +18,16 @@ LABELS = {
 }
 
 
-def calibration_text(calibration: SizeCalibration) -> str:
-    """Fit, domain and r2 of each axis, and the recipe it holds for."""
+TERM_NAMES = {
+    "seat": ("seat", "a unit"),
+    "stiffness_ratio": ("E2/E1 up to 8,", "a unit of ln"),
+    "thickness_mm": ("thickness in mm", "a unit of ln"),
+    "head_radius_mm": ("radius of the head in mm", "a unit of ln"),
+}
+
+
+def calibration_text(calibration: SizeCalibration, *, terms: Mapping[str, SizeTerms] | None = None) -> str:
+    """Fit, domain and r2 of each axis, the recipe it holds for, and what else `terms` say of the size."""
     lines = ["Eq 6: d = m sigma / (e a^f) + b, posterior mean +- SD"]
     both = calibration.axes == ("both",)
     axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]
@@ -32,6 +43,8 @@ def calibration_text(calibration: SizeCalibration) -> str:
         lines.append("the table has no depths: only m/e is determined, e is 1 by convention")
     if calibration.left_out is not None:
         lines += _left_out(calibration.left_out)
+    if terms:
+        lines += _terms(terms, both=both)
     recipe = calibration.recipe
     how = "declared" if recipe.declared else "as the maps were made here"
     lines.append(
@@ -51,6 +64,22 @@ def _left_out(errors: LeftOutErrors) -> list[str]:
     ]
     which = f"{errors.cases} cases of E2/E1 >= {errors.least_stiffness_ratio:g}"
     return [f"leave one geometry out: {said[0]} of d ({errors.geometries} geometries, {which})", *said[1:]]
+
+
+def _terms(terms: Mapping[str, SizeTerms], *, both: bool) -> list[str]:
+    """What each property changes for the same map, and what knowing it would take away."""
+    lines = ["for the same amplitude and width (no part of the calibration, `estimate` does not use it):"]
+    for axis, found in terms.items():
+        words = "" if both else {"x": ", by the width across", "y": ", by the width along"}[axis]
+        for term in found.terms:
+            name, unit = TERM_NAMES[term.name]
+            lines.append(
+                f"  {name} {term.low:g} -> {term.high:g}{words}: d {100 * term.change:+.0f} % "
+                f"(ln d {term.coefficient:+.3f} +- {term.standard_error:.3f} {unit}); "
+                f"knowing it takes away {100 * term.share:.0f} % of the residual variance"
+            )
+        lines.append(f"  all of them{words}: residual SD of ln d {found.scatter:.3f} -> {found.scatter_left:.3f}")
+    return lines
 
 
 def _figures(axes: list[AxisCalibration]) -> list[str]:

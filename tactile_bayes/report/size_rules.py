@@ -68,7 +68,8 @@ def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
     shown = [row for row in rows if row.detectable]
     left = [max(sizes(row.amplitude, row.sigma_x_mm, row.sigma_y_mm)) / row.d_mm for row in shown]
     scatter = float(np.sqrt(np.mean(np.log(np.maximum(left, 1e-3)) ** 2))) if shown else float("nan")
-    return SizeRule(sizes, scatter, f"Eq 6 in two stages from {len(shown)} hard lumps of 10 to 25 mm in this body")
+    kind = "balls" if len(axes) == 2 else "cylinders"
+    return SizeRule(sizes, scatter, f"Eq 6 in two stages from {len(shown)} hard {kind} of 10 to 25 mm in this body")
 
 
 def calibrated_rule(calibration: SizeCalibration | LogQuadratic, *, name: str) -> SizeRule:
