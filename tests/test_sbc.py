@@ -7,12 +7,24 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from tactile_bayes.commands.sbc import _shipped
 from tactile_bayes.posterior import sbc
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import window_cells
 from tactile_bayes.posterior.collapsed import independent_variance
+from tactile_bayes.posterior.estimate import MapPosterior
 from tactile_bayes.posterior.field import LENGTHS_MM
-from tactile_bayes.posterior.sbc import DRAWS, RankTest, Truth, rank_test
+from tactile_bayes.posterior.rank_tests import (
+    BAND,
+    RankTest,
+    chi2_p,
+    coverage,
+    ecdf_band,
+    ecdf_counts,
+    rank_test,
+    uniform_strays,
+)
+from tactile_bayes.posterior.sbc import DRAWS, ELSEWHERE, MapRanks, Truth, other_rises
 from tactile_bayes.posterior.window import Profiles, Window
 from tactile_bayes.report.sbc_text import verdict
 
@@ -69,8 +81,8 @@ def test_halved_intervals_hold_the_truth_as_seldom_as_theory_says() -> None:
 def test_the_band_holds_a_whole_path_as_often_as_it_says() -> None:
     """Its points alone hold far more often: that is what simultaneous means."""
     n, rng = 60, np.random.default_rng(8)
-    low, high = sbc.ecdf_band(n, DRAWS)
-    share = sbc.ecdf_counts(rng.integers(0, DRAWS + 1, size=(2000, n)), DRAWS) / n
+    low, high = ecdf_band(n, DRAWS)
+    share = ecdf_counts(rng.integers(0, DRAWS + 1, size=(2000, n)), DRAWS) / n
     inside = (share >= low) & (share <= high)
     assert 0.93 <= inside.all(axis=1).mean() <= 0.975
     assert inside.mean() > 0.99
@@ -78,19 +90,19 @@ def test_the_band_holds_a_whole_path_as_often_as_it_says() -> None:
 
 def test_ranks_of_uniform_samples_are_judged_alike_by_band_and_p_value() -> None:
     rng = np.random.default_rng(9)
-    strays = sbc.uniform_strays(60, DRAWS)
+    strays = uniform_strays(60, DRAWS)
     found = [rank_test("x", rng.integers(0, DRAWS + 1, size=60), draws=DRAWS, strays=strays).inside for _ in range(200)]
     assert 0.9 <= np.mean(found) <= 0.99
 
 
 def test_coverage_needs_an_interval_between_draws() -> None:
-    assert sbc.coverage(np.arange(DRAWS + 1), DRAWS, 0.9).covered == 0.9
+    assert coverage(np.arange(DRAWS + 1), DRAWS, 0.9).covered == 0.9
     with pytest.raises(ValueError, match="no central interval"):
-        sbc.coverage(np.arange(11), 10, 0.9)
+        coverage(np.arange(11), 10, 0.9)
 
 
 def test_few_ranks_have_no_bins_to_compare() -> None:
-    assert sbc.chi2_p(np.array([1, 2, 3]), DRAWS) == 1.0
+    assert chi2_p(np.array([1, 2, 3]), DRAWS) == 1.0
 
 
 @pytest.mark.parametrize("length", LENGTHS_MM)
@@ -129,6 +141,47 @@ def test_truths_follow_the_prior_and_fit_the_window() -> None:
     assert np.mean([one.amplitude for one in drawn]) == pytest.approx(prior.amplitude_sd * np.sqrt(2 / np.pi), rel=0.06)
 
 
+def maps_with(probability: float, elsewhere: int, *, of: int) -> list[MapRanks]:
+    ranks = (50,) * len(sbc.RANKED)
+    made = [MapRanks(i, TRUTH, None, ELSEWHERE, probability) for i in range(elsewhere)]
+    return made + [MapRanks(i, TRUTH, ranks, "importance", probability) for i in range(elsewhere, of)]
+
+
+def test_other_rises_are_held_against_what_the_probabilities_announce() -> None:
+    honest, sure = other_rises(maps_with(0.98, 5, of=200)), other_rises(maps_with(0.999, 5, of=200))
+    assert (honest.number, sure.number) == (5, 5)
+    assert honest.announced == pytest.approx(4.0)
+    assert honest.chance == pytest.approx(1 - np.exp(-4) * (1 + 4 + 8 + 64 / 6 + 256 / 24))  # five or more, mean 4
+    assert (honest.too_many, sure.too_many) == (False, True)
+    assert len(sbc.rank_tests(maps_with(0.98, 5, of=200))) == len(sbc.RANKED)
+
+
+def test_another_rise_is_one_that_neither_reaches() -> None:
+    at = {name: np.array([value]) for name, value in asdict(TRUTH).items() if name in sbc.PARAMETERS}
+    rest = {"angle_rad": np.zeros(1), "background": np.ones(1), "noise_sd": np.ones(1)}
+    near = MapPosterior(**(at | rest | {"x_mm": np.array([TRUTH.x_mm + 5.9])}))
+    far = MapPosterior(**(at | rest | {"x_mm": np.array([TRUTH.x_mm + 6.1])}))
+    assert (sbc.elsewhere(near, TRUTH), sbc.elsewhere(far, TRUTH)) == (False, True)
+
+
+def test_the_size_of_a_known_bump_ranks_uniformly() -> None:
+    """A posterior that is the truth itself: what is left is the calibration's own law, on both sides."""
+    calibration = _shipped()
+    one = {name: np.full(sbc.DRAWS, getattr(TRUTH, name)) for name in sbc.PARAMETERS}
+    rest = {name: np.zeros(sbc.DRAWS) for name in ("angle_rad", "background", "noise_sd")}
+    posterior = MapPosterior(**one, **rest)
+    # half as wide again
+    off = Truth(**asdict(TRUTH) | {"sigma_x_mm": 9.0, "sigma_y_mm": 6.8})
+
+    def ranks(truth: Truth) -> np.ndarray:
+        return np.array(
+            [sbc._ranks_in(posterior, truth, np.random.default_rng(i), calibration)[-1] for i in range(150)]
+        )
+
+    assert rank_test("size_mm", ranks(TRUTH), draws=DRAWS).inside
+    assert not rank_test("size_mm", ranks(off), draws=DRAWS).inside
+
+
 def test_a_map_is_the_same_wherever_it_is_made() -> None:
     one = sbc.ranks_of_map(2, method="laplace", seed=1)
     assert one == sbc.ranks_of_map(2, method="laplace", seed=1)
@@ -142,7 +195,7 @@ def test_the_posterior_of_a_map_is_calibrated(method: str) -> None:
     """Five bands of 95 % would let a calibrated posterior fail in one run of four: together they hold 95 %."""
     found = {one.name: one for one in sbc.rank_tests([sbc.ranks_of_map(i, method=method, seed=1) for i in range(300)])}
     for one in found.values():
-        assert one.ecdf_p > (1.0 - sbc.BAND) / len(found), one
+        assert one.ecdf_p > (1.0 - BAND) / len(found), one
         assert one.n > 150
     for name in ("sigma_x_mm", "sigma_y_mm"):
         assert 0.85 <= found[name].coverage[1].covered <= 0.95, found[name]

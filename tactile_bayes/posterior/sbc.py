@@ -11,7 +11,12 @@ are improper or depend on the map:
 - centre (uniform in a window that follows the map): uniform within `CENTRE_MM` of the map's middle.
 
 Maps that give no estimate have no ranks: ranks are conditional on detection. Whether a map gives one depends on the
-map alone, so that exact ranks stay uniform.
+map alone, so that exact ranks stay uniform. Under a field much stronger than the bump another rise may be taken for it.
+The estimate gives a probability that what it measures is a lump, and the draws are conditional on that: such maps have
+no ranks either, but are held against the number that the probabilities announce.
+
+The size is that of a round lump: the true one is a draw of the size calibration's own law at the true amplitude and
+widths.
 
 References
 ----------
@@ -21,6 +26,7 @@ and Computing 32:32 (simultaneous bands of the ECDF).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +37,10 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.estimate import EstimateOptions, MapPosterior, estimate_map
 from tactile_bayes.posterior.field import COSINES, LENGTHS_MM, MARGIN, SHARES, spectrum
 from tactile_bayes.posterior.fit import WIDEST_IN_RADII, FitOptions
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.rank_tests import RankTest, rank_test, uniform_strays
+from tactile_bayes.posterior.roundness import ShapePrior
 from tactile_bayes.posterior.window import cell_mean_profile
 
 HALF_MM = 25.0
@@ -43,11 +53,12 @@ DRAWS = 99
 """Draws among which a truth is ranked: 100 ranks, divisible into the bins and the intervals below."""
 PARAMETERS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm")
 """Ranks of an amplitude or a width are those of its logarithm."""
-PROBABILITIES = (0.5, 0.9)
-BAND = 0.95
-BAND_SIMULATIONS = 4000
-LEAST_IN_BIN = 5
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+SIZE = "size_mm"
+RANKED = (*PARAMETERS, SIZE)
+ELSEWHERE = "elsewhere"
+MANY_ELSEWHERE = 1e-3
+"""More maps measured at another rise than all but this share of chances allow: detection is too sure of itself."""
+ROUND = SizePriors(shape=ShapePrior(oval_probability=1e-12))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,67 +96,27 @@ class MapRanks:
     truth
         What was put in.
     ranks
-        Of `PARAMETERS`: how many of `DRAWS` draws lie below the truth; None without an estimate.
+        Of `RANKED`: how many of `DRAWS` draws lie below the truth; None without an estimate of this bump.
     outcome
-        The method that gave the draws, or the code of the abstention.
+        The method that gave the draws, the code of the abstention, or `ELSEWHERE` when another rise was measured.
+    probability
+        That the estimate gives to what it measured being a lump; None without an estimate.
     """
 
     index: int
     truth: Truth
     ranks: tuple[int, ...] | None
     outcome: str
+    probability: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Coverage:
-    """How often the central interval of a nominal probability held the truth, with its binomial standard error."""
-
-    probability: float
-    covered: float
-    error: float
-
-
-@dataclass(frozen=True, slots=True)
-class RankTest:
-    """What the ranks of one parameter say.
-
-    Parameters
-    ----------
-    name
-        Of the parameter.
-    n
-        Ranks.
-    chi2_p
-        P value of equal numbers in bins of ranks.
-    ecdf_p
-        Share of uniform samples whose ECDF strays at least as far, anywhere.
-    mean_rank, spread
-        Mean of (rank + 1/2) / (draws + 1), 0.5 when calibrated; and its SD over that of a uniform one: above 1 the
-        posterior is too narrow, below 1 too wide.
-    coverage
-        Of central intervals.
-    """
-
-    name: str
-    n: int
-    chi2_p: float
-    ecdf_p: float
-    mean_rank: float
-    spread: float
-    coverage: tuple[Coverage, ...]
-
-    @property
-    def inside(self) -> bool:
-        """Whether the ECDF stays inside its simultaneous band."""
-        return self.ecdf_p > 1.0 - BAND
-
-
-def settings(method: str, seed: int) -> dict[str, object]:
+def settings(method: str, seed: int, *, size: str = "") -> dict[str, object]:
     """All that the ranks of a map depend on besides its number."""
     return {
         "method": method,
         "seed": seed,
         "draws": DRAWS,
+        "size_calibration": size,
         "noise_sd": list(NOISE_SD),
         "counts": list(COUNTS),
         "lengths_mm": list(LENGTHS_MM),
@@ -154,23 +125,85 @@ def settings(method: str, seed: int) -> dict[str, object]:
     }
 
 
-def ranks_of_map(index: int, *, method: str, seed: int) -> MapRanks:
-    """Draw one map from the prior, estimate it and rank its truth: all random numbers come from seed and index."""
+def ranks_of_map(index: int, *, method: str, seed: int, calibration: LogQuadratic | None = None) -> MapRanks:
+    """Draw one map from the prior, estimate it and rank its truth: all random numbers come from seed and index.
+
+    Without a size calibration the size is not ranked.
+    """
     rng = np.random.default_rng([seed, index])
     prior = BumpPrior()
     truth = draw_truth(rng, prior)
-    options = EstimateOptions(method=method, fit=FitOptions("free", RADIUS_MM, "off", None, "field"), prior=prior)
+    fit = FitOptions("free", RADIUS_MM, "off", None, "field")
+    options = EstimateOptions(method=method, fit=fit, prior=prior)
     found = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
-    if found.map_posterior is None or found.draws is None:
+    if found.map_posterior is None or found.draws is None or found.detection is None:
         return MapRanks(index, truth, None, found.code or "none")
-    return MapRanks(index, truth, _ranks_in(found.map_posterior, truth, rng), found.draws.method)
+    probability = found.detection.probability
+    if elsewhere(found.map_posterior, truth):
+        return MapRanks(index, truth, None, ELSEWHERE, probability)
+    ranks = _ranks_in(found.map_posterior, truth, rng, calibration)
+    return MapRanks(index, truth, ranks, found.draws.method, probability)
 
 
-def _ranks_in(posterior: MapPosterior, truth: Truth, rng: np.random.Generator) -> tuple[int, ...]:
+def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
+    """Whether the measured bump is another rise: further from the true centre than either reaches with its width."""
+    away = np.hypot(np.median(posterior.x_mm) - truth.x_mm, np.median(posterior.y_mm) - truth.y_mm)
+    widths = truth.sigma_x_mm, truth.sigma_y_mm, np.median(posterior.sigma_x_mm), np.median(posterior.sigma_y_mm)
+    return bool(away > max(widths))
+
+
+@dataclass(frozen=True, slots=True)
+class OtherRises:
+    """Maps on which another rise was measured.
+
+    Parameters
+    ----------
+    number
+        Of them.
+    announced
+        How many the probabilities of all estimates lead one to expect.
+    chance
+        Of so many or more, were the probabilities right.
+    """
+
+    number: int
+    announced: float
+    chance: float
+
+    @property
+    def too_many(self) -> bool:
+        """Whether detection is too sure of itself."""
+        return self.chance < MANY_ELSEWHERE
+
+
+def other_rises(maps: list[MapRanks]) -> OtherRises:
+    """Weigh the maps measured elsewhere against what their estimates announced; the chance is a Poisson one."""
+    from scipy.stats import poisson
+
+    number = sum(one.outcome == ELSEWHERE for one in maps)
+    announced = sum(1.0 - one.probability for one in maps if one.probability is not None)
+    return OtherRises(number, announced, float(poisson.sf(number - 1, announced)) if number else 1.0)
+
+
+def _ranks_in(
+    posterior: MapPosterior, truth: Truth, rng: np.random.Generator, calibration: LogQuadratic | None
+) -> tuple[int, ...]:
     """Ranks of a truth among some of the joint draws, the same ones for every parameter."""
     number = posterior.x_mm.size
     chosen = rng.choice(number, size=DRAWS, replace=number < DRAWS)
-    return tuple(int(np.sum(getattr(posterior, name).ravel()[chosen] < getattr(truth, name))) for name in PARAMETERS)
+    drawn = {name: getattr(posterior, name).ravel()[chosen] for name in PARAMETERS}
+    true = {name: np.full(DRAWS, getattr(truth, name)) for name in PARAMETERS}
+    ranks = tuple(int(np.sum(drawn[name] < true[name])) for name in PARAMETERS)
+    if calibration is None:
+        return ranks
+    return (*ranks, int(np.sum(_sizes(drawn, calibration, rng) < _sizes(true, calibration, rng)[0])))
+
+
+def _sizes(bumps: Mapping[str, FloatArray], calibration: LogQuadratic, rng: np.random.Generator) -> FloatArray:
+    """(n,) sizes in mm, one a bump; one without a rise has none and counts as small."""
+    a, sigma_x, sigma_y = (bumps[name] for name in PARAMETERS[:3])
+    draws = ShapeDraws.of(a, sigma_x, sigma_y, np.zeros_like(a))
+    return np.nan_to_num(pooled_size([draws], calibration=calibration, priors=ROUND, rng=rng).max_size_mm.ravel())
 
 
 def draw_truth(rng: np.random.Generator, prior: BumpPrior) -> Truth:
@@ -245,92 +278,4 @@ def rank_tests(maps: list[MapRanks]) -> list[RankTest]:
     if not len(ranks):
         return []
     strays = uniform_strays(len(ranks), DRAWS)
-    return [rank_test(name, ranks[:, i], draws=DRAWS, strays=strays) for i, name in enumerate(PARAMETERS)]
-
-
-def rank_test(name: str, ranks: IntArray, *, draws: int, strays: FloatArray | None = None) -> RankTest:
-    """All tests of one parameter's ranks.
-
-    Parameters
-    ----------
-    ranks : (n,) array
-        Each from 0 to `draws`.
-    strays
-        From `uniform_strays`, where it is at hand.
-    """
-    known = uniform_strays(len(ranks), draws) if strays is None else strays
-    # equally likely strays of discrete counts differ by rounding
-    as_far = float(np.mean(known <= stray(ecdf_counts(ranks[None], draws), len(ranks))[0] * (1.0 + 1e-9)))
-    share = (ranks + 0.5) / (draws + 1)
-    uniform_sd = np.sqrt((1.0 - 1.0 / (draws + 1) ** 2) / 12.0)
-    return RankTest(
-        name=name,
-        n=len(ranks),
-        chi2_p=chi2_p(ranks, draws),
-        ecdf_p=as_far,
-        mean_rank=float(share.mean()),
-        spread=float(np.sqrt(np.mean((share - 0.5) ** 2)) / uniform_sd),
-        coverage=tuple(coverage(ranks, draws, probability) for probability in PROBABILITIES),
-    )
-
-
-def chi2_p(ranks: IntArray, draws: int) -> float:
-    """P value of the numbers in equal bins of ranks: at most 20, each with `LEAST_IN_BIN` or more expected."""
-    from scipy.stats import chi2
-
-    bins = [b for b in range(2, 21) if (draws + 1) % b == 0 and len(ranks) >= LEAST_IN_BIN * b]
-    if not bins:
-        return 1.0
-    number = np.bincount(ranks * bins[-1] // (draws + 1), minlength=bins[-1])
-    expected = len(ranks) / bins[-1]
-    return float(chi2.sf(np.sum((number - expected) ** 2) / expected, bins[-1] - 1))
-
-
-def coverage(ranks: IntArray, draws: int, probability: float) -> Coverage:
-    """Share of truths in the central interval between two draws, which holds exactly the nominal share of ranks.
-
-    Raises
-    ------
-    ValueError
-        When no central interval between draws has that probability.
-    """
-    tail = (1.0 - probability) / 2.0 * (draws + 1)
-    if abs(tail - round(tail)) > 1e-9:
-        raise ValueError(f"{draws} draws have no central interval of probability {probability:g}")
-    held = (ranks >= round(tail)) & (ranks <= draws - round(tail))
-    return Coverage(probability, float(held.mean()), float(np.sqrt(probability * (1.0 - probability) / len(ranks))))
-
-
-def ecdf_counts(ranks: IntArray, draws: int) -> IntArray:
-    """(m, draws) how many of (m, n) ranks lie below 1, 2 ... `draws`."""
-    below = ranks[..., None] < np.arange(1, draws + 1)
-    return np.asarray(below.sum(axis=-2))
-
-
-def stray(counts: IntArray, n: int) -> FloatArray:
-    """(m,) smallest two-sided binomial tail of (m, draws) counts of n ranks: small where an ECDF strays somewhere."""
-    from scipy.stats import binom
-
-    at = np.arange(1, counts.shape[-1] + 1) / (counts.shape[-1] + 1)
-    number = np.arange(n + 1)[:, None]
-    tails = 2.0 * np.minimum(binom.cdf(number, n, at), binom.sf(number - 1, n, at))
-    return np.asarray(np.min(tails[counts, np.arange(len(at))], axis=-1))
-
-
-def uniform_strays(n: int, draws: int, *, simulations: int = BAND_SIMULATIONS) -> FloatArray:
-    """(simulations,) `stray` of n uniform ranks, from random numbers of their own: the same each time."""
-    rng = np.random.default_rng([n, draws])
-    number = rng.multinomial(n, np.full(draws + 1, 1.0 / (draws + 1)), size=simulations)
-    return stray(np.cumsum(number, axis=1)[:, :-1], n)
-
-
-def ecdf_band(n: int, draws: int, *, probability: float = BAND) -> tuple[FloatArray, FloatArray]:
-    """(draws,) lowest and highest share of n ranks below 1, 2 ... that uniform ranks keep to everywhere at once.
-
-    Each point's binomial limits are as wide as makes the whole path stay inside with `probability`.
-    """
-    from scipy.stats import binom
-
-    level = float(np.quantile(uniform_strays(n, draws), 1.0 - probability))
-    at = np.arange(1, draws + 1) / (draws + 1)
-    return np.asarray(binom.ppf(level / 2.0, n, at) / n), np.asarray(binom.isf(level / 2.0, n, at) / n)
+    return [rank_test(name, column, draws=DRAWS, strays=strays) for name, column in zip(RANKED, ranks.T, strict=False)]

@@ -10,17 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.posterior.sbc import (
-    BAND,
-    DRAWS,
-    PARAMETERS,
-    MapRanks,
-    RankTest,
-    Truth,
-    ecdf_band,
-    ecdf_counts,
-    rank_tests,
-)
+from tactile_bayes.posterior.rank_tests import BAND, RankTest, ecdf_band, ecdf_counts
+from tactile_bayes.posterior.sbc import DRAWS, RANKED, MapRanks, Truth, other_rises, rank_tests
 from tactile_bayes.presets import RESEARCH_USE
 
 SCHEMA = "tactile-bayes/sbc/1"
@@ -40,15 +31,18 @@ def sbc_document(maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s
         Of the maps that this run made; None where it made none.
     """
     ranked = [one for one in maps if one.ranks is not None]
-    tests = rank_tests(list(maps))
+    tests, others = rank_tests(list(maps)), other_rises(list(maps))
     return {
         "schema": SCHEMA,
         "method": method,
         "seed": seed,
         "maps": len(maps),
         "ranked": len(ranked),
-        "abstained": dict(sorted(Counter(one.outcome for one in maps if one.ranks is None).items())),
+        "abstained": dict(
+            sorted(Counter(one.outcome for one in maps if one.ranks is None and one.probability is None).items())
+        ),
         "drawn_by": dict(sorted(Counter(one.outcome for one in ranked).items())),
+        "elsewhere": asdict(others) | {"too_many": others.too_many},
         "draws": DRAWS,
         "maps_per_s": maps_per_s,
         "parameters": [_as_dict(one) for one in tests],
@@ -82,9 +76,13 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     rate = "" if speed is None else f", {speed:.3g} maps/s"
     made = f"method {document['method']}, seed {document['seed']}"
     yield f"{document['maps']} maps from the model's own prior, {made}{rate}"
-    abstained = document["maps"] - document["ranked"]
+    others = document["elsewhere"]
+    abstained = document["maps"] - document["ranked"] - others["number"]
     why = ", ".join(f"{code} {number}" for code, number in document["abstained"].items())
     yield f"no estimate on {abstained}{f' ({why})' if why else ''}: left out, ranks are conditional on detection"
+    told = f"another rise was measured on {others['number']}, announced {others['announced']:.1f}"
+    sure = f"FAILS, detection is too sure of itself (p = {others['chance']:.1g})" if others["too_many"] else "ok"
+    yield f"{told}: {sure}; left out"
     drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
     if not document["parameters"]:
         yield "No map gave an estimate: there is nothing to rank; give more --maps"
@@ -126,13 +124,22 @@ def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[s
 
 def table_text(maps: Sequence[MapRanks]) -> str:
     """One row a map: truth, ranks (empty without an estimate) and outcome."""
-    header = ["map", *(one.name for one in fields(Truth)), *(f"rank_{name}" for name in PARAMETERS), "outcome"]
+    header = [
+        "map",
+        *(one.name for one in fields(Truth)),
+        *(f"rank_{name}" for name in RANKED),
+        "outcome",
+        "probability",
+    ]
     return "\n".join([",".join(header), *(_table_row(one) for one in maps)]) + "\n"
 
 
 def _table_row(one: MapRanks) -> str:
-    ranks = [""] * len(PARAMETERS) if one.ranks is None else [str(rank) for rank in one.ranks]
-    return ",".join([str(one.index), *(f"{value:.8g}" for value in astuple(one.truth)), *ranks, one.outcome])
+    ranks = [str(rank) for rank in one.ranks or ()]
+    ranks += [""] * (len(RANKED) - len(ranks))
+    probability = "" if one.probability is None else f"{one.probability:.8g}"
+    truth = (f"{value:.8g}" for value in astuple(one.truth))
+    return ",".join([str(one.index), *truth, *ranks, one.outcome, probability])
 
 
 def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> None:
@@ -145,12 +152,14 @@ def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> 
     """
     from tactile_bayes.report.figures import _figure as png_figure
 
-    ranks = np.array([one.ranks for one in maps if one.ranks is not None]).reshape(-1, len(PARAMETERS))
+    found = [one.ranks for one in maps if one.ranks is not None]
+    names = RANKED[: len(found[0])] if found else RANKED
+    ranks = np.array(found).reshape(-1, len(names))
     n, at = len(ranks), np.arange(1, DRAWS + 1) / (DRAWS + 1)
     inside = {test.name: test.inside for test in rank_tests(list(maps))}
-    with png_figure(path, size_in=(11.0, 2.9), force=force) as figure:
-        all_axes = figure.subplots(1, len(PARAMETERS), sharey=True)
-        for axes, name, column in zip(all_axes, PARAMETERS, ranks.T, strict=True):
+    with png_figure(path, size_in=(2.2 * len(names), 2.9), force=force) as figure:
+        all_axes = figure.subplots(1, len(names), sharey=True)
+        for axes, name, column in zip(all_axes, names, ranks.T, strict=True):
             if n:
                 low, high = ecdf_band(n, DRAWS)
                 share = ecdf_counts(column[None], DRAWS)[0] / n
