@@ -14,6 +14,7 @@ from tactile_bayes.posterior.cells import FitCells, window_cells
 from tactile_bayes.posterior.collapsed import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.field import cosine_profiles, gram_of_cosines, spectrum
 from tactile_bayes.posterior.field_posterior import FieldFit, fit_scene, shape_draws
+from tactile_bayes.posterior.linear import _one
 from tactile_bayes.posterior.methods import draw_scene
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.window import Window
@@ -161,6 +162,14 @@ def test_a_level_and_a_tilt_do_not_matter() -> None:
     plain = fitted(cells)
     tilted = cells_of(noise(2) + 0.02 * np.linspace(-1, 1, 51)[None, :] + 5.0)
     np.testing.assert_allclose(fitted(tilted).mode, plain.mode, atol=1e-3)
+
+
+def test_a_bump_that_no_cell_shows_overflows_nothing() -> None:
+    """Its power is next to nothing and its amplitude next to anything: the prior decides, without a warning."""
+    along, power = np.array([1e-30, 0.0, -1e-150]), np.array([1e-200, 1e-300, 1e-310])
+    factor, *_ = _one(along, power, np.ones(3), 1e-12, dof=100, amplitude_sd=2.0)
+    assert np.isfinite(factor[1:]).all()
+    assert factor[0] < factor[1]
 
 
 def test_a_dent_has_no_density() -> None:

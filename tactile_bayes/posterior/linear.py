@@ -165,7 +165,7 @@ def _one(
     amplitude = along / power
     squares = np.maximum(rest - along * amplitude, 0.0) + floor
     variance = amplitude_sd**2 + squares / dof / power
-    log_factor = -0.5 * (np.log(power) + np.log(2 * pi * variance) + amplitude**2 / variance)
+    log_factor = -0.5 * (np.log(power) + np.log(2 * pi * variance) + (amplitude / np.sqrt(variance)) ** 2)
     return log_factor, amplitude[..., None], power[..., None, None], squares
 
 
