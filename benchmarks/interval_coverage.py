@@ -223,10 +223,15 @@ def sizes(run: Callable[..., Iterable[Row]], masses: int, bodies: str, output: P
 def report_sizes(rows: list[Row]) -> None:
     """Coverage and errors of single maps and of pooled masses."""
     single = [(row["d_mm"], one) for row in rows for one in row["single"] if one]
+    known = [(true, one["known"]) for true, one in single if "known" in one]
     pooled = [(row["d_mm"], row["pooled"]) for row in rows if row["pooled"]]
     maps = sum(len(row["single"]) for row in rows)
     print(f"{len(rows)} masses, {maps} maps; sized: {len(single)} maps, {len(pooled)} masses")
-    for name, sized in (("single map", single), ("three maps pooled", pooled)):
+    for name, sized in (
+        ("single map", single),
+        ("single map, spread between simulated exams known", known),
+        ("three maps pooled", pooled),
+    ):
         if not sized:
             continue
         error = np.array([one["median"] / true - 1 for true, one in sized])
@@ -240,13 +245,14 @@ def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
-    from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pool_maps
+    from tactile_bayes.posterior.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
 
     path = size_calibration_path(DEFAULT)
     assert path is not None
     calibration = read_size_calibration(path)
     assert isinstance(calibration, LogQuadratic)
     scenes = draw_mass(index, scans=3, seed=SEED) if bodies == "population" else draw_mass_like_trial(index, seed=SEED)
+    known = SizePriors(BetweenMaps(calibration.exam_sd, 0.0))
     lump, shapes, single = scenes[0].solid_lumps[0], [], []
     for found in _estimates(scenes, calibration):
         if found is None or found.map_posterior is None or found.size is None:
@@ -255,7 +261,8 @@ def _size_mass(bodies: str, index: int) -> Row:
             continue
         one = found.map_posterior
         shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad))
-        single.append(_intervals(found.size.max_size_mm))
+        told = pooled_size([shapes[-1]], calibration=calibration, priors=known, rng=np.random.default_rng(index))
+        single.append(_intervals(found.size.max_size_mm) | {"known": _intervals(told.max_size_mm)})
     pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))
     return {
         "index": index,
