@@ -1,0 +1,171 @@
+"""How often each structure of a scene is reported, true or not: ``python -m benchmarks.scene_rates``.
+
+Prints the table of docs/decisions/0055. Every map goes the whole way through `estimate_map`. A structure is found where
+the report says that the map supports it (`Structure.supported`): odds above 3 for an ellipse, a rotation or a tilt;
+above 10, and a rise of 5 % of the lump's amplitude, for a second lump or a rib. Oval is an ellipse or a rotation. A
+lump is found where a size is given; a map without a size is one on which nothing was found.
+
+Lumps have an amplitude of 0.3 and sigma 5 mm (geometric mean). Errors are 0.01 from cell to cell and a field of 0.01
+with a correlation length of 1.5 to 12 mm, a thirtieth of the amplitude each; or as large and long as `sbc` draws them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binomtest
+
+from tactile_bayes.forward.gaussian import cell_mean_gaussian
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+from tactile_bayes.posterior.field import LENGTHS_MM
+from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.sbc import draw_truth
+
+HALF_MM, RADIUS_MM = 35.0, 20.0
+AXIS = np.arange(-HALF_MM, HALF_MM + 0.5)
+AMPLITUDE, SIGMA_MM, NOISE_SD = 0.3, 5.0, 0.01
+RATIO = 1.33
+SLOPE = 0.03
+"""Of the level over half a window: a tenth of the amplitude."""
+COLUMNS = ("lump", "oval", "ellipse", "rotated", "tilt", "second lump", "rib")
+Draw = Callable[[np.random.Generator], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Truths:
+    """One row: what is on the maps, and which columns name it."""
+
+    name: str
+    values: Draw
+    present: tuple[str, ...]
+    any_noise: bool = False
+
+
+def bump(rng: np.random.Generator, *, ratio: float = 1.0) -> FloatArray:
+    """A lump near the middle; its long axis along one of the head's."""
+    sigmas = rng.permutation(SIGMA_MM * np.sqrt([ratio, 1.0 / ratio]))
+    return AMPLITUDE * gaussian(*rng.uniform(-4.0, 4.0, 2), sigmas=sigmas)
+
+
+def gaussian(x: float, y: float, *, sigmas: FloatArray) -> FloatArray:
+    """(n, n) cell means of a Gaussian of unit height."""
+    u, v = np.meshgrid(AXIS, AXIS)
+    covariance = np.diag(np.square(sigmas))
+    cells = cell_mean_gaussian((u - x).ravel(), (v - y).ravel(), covariance_mm2=covariance, cell_mm=1.0)
+    return cells.reshape(u.shape)
+
+
+def correlated_field(rng: np.random.Generator, length_mm: float) -> FloatArray:
+    """(n, n) field of variance 1 and exponential correlation, cut from a torus on which the wrap does not matter."""
+    size = len(AXIS) + int(10 * length_mm)
+    lag = np.fft.fftfreq(size, 1 / size)
+    power = np.clip(np.fft.fft2(np.exp(-np.hypot(lag[:, None], lag) / length_mm)).real, 0.0, None)
+    white = rng.standard_normal(power.shape)
+    return np.fft.ifft2(np.fft.fft2(white) * np.sqrt(power)).real[: len(AXIS), : len(AXIS)]
+
+
+def slope(rng: np.random.Generator) -> FloatArray:
+    """A level that rises by `SLOPE` over half a window, in any direction."""
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return SLOPE / RADIUS_MM * (np.cos(angle) * AXIS + np.sin(angle) * AXIS[:, None])
+
+
+def second_lump(rng: np.random.Generator) -> FloatArray:
+    """A lump of sigma 4 mm, 16 to 22 mm from the middle, a third to the whole of the amplitude."""
+    away, angle = rng.uniform(16.0, 22.0), rng.uniform(0.0, 2.0 * np.pi)
+    height = AMPLITUDE * rng.uniform(1.0 / 3.0, 1.0)
+    return height * gaussian(away * np.cos(angle), away * np.sin(angle), sigmas=np.array([4.0, 4.0]))
+
+
+def rib(rng: np.random.Generator) -> FloatArray:
+    """A ridge of sigma 5 mm, 16 to 22 mm from the middle, a third to the whole of the amplitude."""
+    away, angle = rng.uniform(16.0, 22.0), rng.uniform(0.0, 2.0 * np.pi)
+    distance = np.cos(angle) * AXIS + np.sin(angle) * AXIS[:, None] - away
+    return AMPLITUDE * rng.uniform(1.0 / 3.0, 1.0) * np.exp(-0.5 * (distance / 5.0) ** 2)
+
+
+def flat(_: np.random.Generator) -> FloatArray:
+    """Nothing."""
+    return np.zeros((len(AXIS), len(AXIS)))
+
+
+ROWS = (
+    Truths("round", bump, ("lump",)),
+    Truths("ellipse 1.33:1, along an axis", lambda rng: bump(rng, ratio=RATIO), ("lump", "oval", "ellipse")),
+    Truths("round on a slope", lambda rng: bump(rng) + slope(rng), ("lump", "tilt")),
+    Truths("no lump", flat, ()),
+    Truths("no lump, errors of any size and length", slope, ("tilt",), any_noise=True),
+    Truths("round and a second lump", lambda rng: bump(rng) + second_lump(rng), ("lump", "second lump")),
+    Truths("round and a rib", lambda rng: bump(rng) + rib(rng), ("lump", "rib")),
+)
+
+
+def draw_map(row: Truths, rng: np.random.Generator) -> TactileMap:
+    """One map: what the row says, on a level of 1 with errors."""
+    length_mm, share, noise_sd = float(rng.choice(LENGTHS_MM)), 1.0, NOISE_SD
+    if row.any_noise:
+        truth = draw_truth(rng, BumpPrior())
+        length_mm, share, noise_sd = truth.length_mm, truth.share, truth.noise_sd
+    white = noise_sd * rng.standard_normal((len(AXIS), len(AXIS)))
+    field = np.sqrt(share) * noise_sd * correlated_field(rng, length_mm)
+    return TactileMap(
+        mean=1.0 + row.values(rng) + white + field,
+        variance=np.zeros(white.shape),
+        count=np.full(white.shape, 40),
+        x_mm=AXIS,
+        y_mm=AXIS,
+        recipe=MapRecipe("grid", "mean", 1.0),
+        background=1.0,
+    )
+
+
+def found_on(tactile_map: TactileMap, rng: np.random.Generator) -> set[str]:
+    """Names of `COLUMNS` that the report of one map would have."""
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", RADIUS_MM, "auto", None, "field"), draws=1000)
+    answer = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
+    if answer.scene is None:
+        return set()
+    found = {"lump"} | {one.name for one in answer.scene.structures if one.supported}
+    return found | {"oval"} if found & {"ellipse", "rotated"} else found
+
+
+def counts(row: Truths, *, maps: int, seed: int) -> Counter[str]:
+    """On how many of `maps` maps each structure was found."""
+    number: Counter[str] = Counter()
+    for index in range(maps):
+        rng = np.random.default_rng([seed, ROWS.index(row), index])
+        number.update(found_on(draw_map(row, rng), rng))
+    return number
+
+
+def share(found: int, maps: int) -> str:
+    """Per cent, with the exact (Clopper-Pearson) interval of 95 %."""
+    interval = binomtest(found, maps).proportion_ci()
+    return f"{100 * found / maps:.1f} ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+
+
+def main() -> None:
+    """Print the table as Markdown; what is on the maps of a row is set in bold."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--maps", type=int, default=200, help="of each truth (200)")
+    parser.add_argument("--seed", type=int, default=1999)
+    parser.add_argument("--only", type=int, action="append", choices=range(len(ROWS)), help="this row; may be repeated")
+    options = parser.parse_args()
+    print(f"| {options.maps} maps each: % found | {' | '.join(COLUMNS)} |")
+    print("|---|" + "---|" * len(COLUMNS))
+    for row in (ROWS[i] for i in options.only or range(len(ROWS))):
+        number = counts(row, maps=options.maps, seed=options.seed)
+        cells = [share(number[name], options.maps) for name in COLUMNS]
+        marked = [f"**{cell}**" if name in row.present else cell for name, cell in zip(COLUMNS, cells, strict=True)]
+        print(f"| {row.name} | {' | '.join(marked)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
