@@ -244,7 +244,7 @@ def report_sizes(rows: list[Row]) -> None:
 def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.posterior.log_quadratic import PARAMETERS, LogQuadratic
     from tactile_bayes.posterior.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
 
     path = size_calibration_path(DEFAULT)
@@ -252,7 +252,7 @@ def _size_mass(bodies: str, index: int) -> Row:
     calibration = read_size_calibration(path)
     assert isinstance(calibration, LogQuadratic)
     scenes = draw_mass(index, scans=3, seed=SEED) if bodies == "population" else draw_mass_like_trial(index, seed=SEED)
-    known = SizePriors(BetweenMaps(calibration.exam_sd, 0.0))
+    known = SizePriors(BetweenMaps(float(np.exp(calibration.mean[PARAMETERS.index("log_exam_sd")])), 0.0))
     lump, shapes, single = scenes[0].solid_lumps[0], [], []
     for found in _estimates(scenes, calibration):
         if found is None or found.map_posterior is None or found.size is None:
