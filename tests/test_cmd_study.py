@@ -32,6 +32,7 @@ def test_a_grid_becomes_a_table_and_a_summary(folder: Path) -> None:
     assert [(row["d_mm"], row["depth_ratio"]) for row in rows[:2]] == [("10", "0.8"), ("10", "1")]
     assert {row["seat"] for row in rows} == {"centred"}
     assert {row["detectable"] for row in rows} == {"true"}
+    assert "background" not in rows[0]  # a matter of the solid model
     said = (folder / "stdout.txt").read_text()
     assert "9 cases, 0 not detectable" in said
     assert "centred, E2/E1 = 100: d = " in said
@@ -127,6 +128,8 @@ FAULTS: dict[str, tuple[tuple[object, ...], int, list[str]]] = {
     "liquid": (("--poisson", 0.5), EXIT_BAD_DATA, ["poisson is 0.5", "below 0.5"]),
     "thin": (("--thickness-mm", 20), EXIT_BAD_DATA, ["thickness_mm is 20", "lowest point"]),
     "exists": (("-o", "there.csv"), EXIT_USAGE, ["there.csv exists", "--force"]),
+    "free": (("--background", "free"), EXIT_USAGE, ["--background free is for --model solid"]),
+    "flat field": (("--flat-field",), EXIT_USAGE, ["--flat-field is for --model solid"]),
     "no model": (("--model", "clay"), EXIT_USAGE, ["clay"]),
 }
 

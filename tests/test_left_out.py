@@ -12,6 +12,7 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes
+from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.posterior import left_out
 from tactile_bayes.posterior.learn_size import AxisRows, SizeTable, StudyCases, axis_at_mode
@@ -99,6 +100,30 @@ def test_tables_that_are_no_study_have_none() -> None:
     cut = SizeTable(table.d_mm[few], table.amplitude[few], table.sigma_x_mm[few], None, cases=table.cases.rows(few))
     assert left_out_of_study(cut) is None
     assert left_out_of_study(study(), least_stiffness_ratio=1000.0) is None
+
+
+def test_where_eq_6_has_no_mode_the_report_says_without_which_geometry(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def at_mode(rows: AxisRows) -> AxisCalibration:
+        if not np.any((rows.d_mm == 10.0) & (rows.amplitude > 1.5)):
+            raise NotConvergedError("the posterior has no maximum in every direction; try --method ensemble")
+        return axis_at_mode(rows)
+
+    monkeypatch.setattr(left_out, "axis_at_mode", at_mode)
+    table = study()
+    assert table.cases is not None
+    with pytest.raises(NotConvergedError, match=r"no mode without the geometry centred, d 10 mm, h/d 0\.6"):
+        left_out_of_study(table)
+    columns = (table.d_mm, table.cases.depth_ratio, table.cases.stiffness_ratio, table.amplitude, table.sigma_x_mm)
+    rows = ["seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm"]
+    rows += [",".join(["centred", *map(str, case)]) for case in zip(*columns, strict=True)]
+    (tmp_path / "study.csv").write_text("\n".join(rows))
+    done = run_here("calibrate", "size", "study.csv", "-o", "size.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    said = "leave one geometry out: not known, Eq 6 has no mode without the geometry centred, d 10 mm, h/d 0.6"
+    assert said in done.stdout.splitlines()
+    assert "left_out" not in json.loads((tmp_path / "size.json").read_text())
 
 
 def test_a_left_out_geometry_is_no_reference_for_width_changes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from subprocess import CompletedProcess
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +22,9 @@ from tactile_bayes.forward.study import Geometry, StudyRow
 
 Run = Callable[..., "CompletedProcess[str]"]
 SETTINGS = SolidSettings(fineness=1)
+# Maps as they are, fitted with a level of 1: how the independent programs do it.
+AS_IT_IS = SolidSettings(background="fixed", flat_field=False)
+COARSE = replace(AS_IT_IS, fineness=1)
 
 
 @cache
@@ -50,7 +55,7 @@ def test_every_reading_falls_on_the_middle_of_its_cell() -> None:
     x = np.round((ball().x_mm[:, None, None] + surface[..., 0]) / 0.75).astype(int).ravel()
     y = np.round((ball().y_mm[:, None, None] + surface[..., 1]) / 0.75).astype(int).ravel()
     share = (ball().pressure_kpa / 9.5).ravel()
-    made = raster_map(ball())
+    made = raster_map(replace(ball(), plain_kpa=None))
     row, column = np.nonzero(made.covered)
     for i in range(0, len(row), 97):
         at = (x == round(made.x_mm[column[i]] / 0.75)) & (y == round(made.y_mm[row[i]] / 0.75))
@@ -58,7 +63,33 @@ def test_every_reading_falls_on_the_middle_of_its_cell() -> None:
         assert made.mean[row[i], column[i]] == pytest.approx(share[at].mean(), abs=3e-4)
 
 
-def test_the_fit_is_the_least_squares_fit_of_eq_7() -> None:
+def test_a_raster_over_no_lump_is_flat_once_it_is_divided() -> None:
+    """To the last bits of the sums; the control is as striped as the head is uneven."""
+    body = SETTINGS.body(15.0, 1.0, seat=0.0)
+    plain = raster_frames(SETTINGS.on(body), None, SETTINGS)
+    divided, as_it_is = raster_map(plain), raster_map(replace(plain, plain_kpa=None))
+    assert np.array_equal(divided.covered, as_it_is.covered)
+    assert np.abs(divided.mean[divided.covered] - 1.0).max() < 1e-6
+    near = as_it_is.covered & (np.hypot(*np.meshgrid(as_it_is.x_mm, as_it_is.y_mm)) <= 20.0)
+    assert np.ptp(as_it_is.mean[near]) > 0.015
+    # what the control's stripes are taken for
+    taken = fit_raster(replace(plain, plain_kpa=None), COARSE).amplitude
+    assert abs(fit_raster(plain, SETTINGS).amplitude) < 1e-6 < 0.003 < abs(taken)
+
+
+def test_dividing_frames_is_nearly_dividing_maps() -> None:
+    """Over the lump's map on the map of the same body without it, taxel by taxel or cell by cell."""
+    body = SETTINGS.body(15.0, 1.0, seat=0.0)
+    plain = raster_map(replace(raster_frames(SETTINGS.on(body), None, SETTINGS), plain_kpa=None))
+    made, bare = raster_map(ball()), raster_map(replace(ball(), plain_kpa=None))
+    near = made.covered & (np.hypot(*np.meshgrid(made.x_mm, made.y_mm)) <= 20.0)
+    other = bare.mean[near] / plain.mean[near]
+    assert np.abs(made.mean[near] - other).max() < 0.02
+    assert np.corrcoef(made.mean[near], other)[0, 1] > 0.999
+
+
+@pytest.mark.parametrize("background", ["free", "fixed"])
+def test_the_fit_is_the_least_squares_fit_of_eq_7(background: str) -> None:
     """scipy's trust-region fit of the plain formula to the same cells."""
     made = raster_map(ball())
     x, y = np.meshgrid(made.x_mm, made.y_mm)
@@ -66,11 +97,12 @@ def test_the_fit_is_the_least_squares_fit_of_eq_7() -> None:
     x, y, value = x[inside], y[inside], made.mean[inside]
 
     def residual(t: np.ndarray) -> np.ndarray:
-        return 1 + t[0] * np.exp(-(x**2) / (2 * t[1] ** 2) - y**2 / (2 * t[2] ** 2)) - value
+        level = t[3] if background == "free" else 1.0
+        return level + t[0] * np.exp(-(x**2) / (2 * t[1] ** 2) - y**2 / (2 * t[2] ** 2)) - value
 
-    other = least_squares(residual, [0.3, 5.0, 4.0], xtol=1e-14, ftol=1e-14)
-    found = fit_raster(ball(), 20.0)
-    np.testing.assert_allclose((found.amplitude, found.sigma_x_mm, found.sigma_y_mm), other.x, rtol=1e-6)
+    other = least_squares(residual, [0.3, 5.0, 4.0, 1.0], xtol=1e-14, ftol=1e-14)
+    found = fit_raster(ball(), replace(SETTINGS, background=background))
+    np.testing.assert_allclose((found.amplitude, found.sigma_x_mm, found.sigma_y_mm), other.x[:3], rtol=1e-6)
     assert found.rms == pytest.approx(np.sqrt(np.mean(other.fun**2)), rel=1e-6)
     assert found.resolved
 
@@ -78,7 +110,8 @@ def test_the_fit_is_the_least_squares_fit_of_eq_7() -> None:
 def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
     none, soft, hard = rows()
     plain = raster_frames(SETTINGS.on(SETTINGS.body(12.0, 1.0, seat=1.2)), None, SETTINGS)
-    assert none.amplitude == pytest.approx(fit_raster(plain, 20.0).amplitude, abs=1e-6)
+    assert none.amplitude == pytest.approx(fit_raster(plain, SETTINGS).amplitude, abs=1e-4)
+    assert not none.detectable
     assert soft.amplitude < hard.amplitude
     assert soft.sigma_x_mm == pytest.approx(hard.sigma_x_mm, rel=0.05)  # Fig 7b
 
@@ -86,13 +119,14 @@ def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
 def test_the_table_has_a_width_for_each_axis_of_the_head() -> None:
     head, *_, last = table_text(rows()).splitlines()
     names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,sigma_y_mm,fit_rms,detectable"
-    names += ",thickness_mm,head_radius_mm"
+    names += ",thickness_mm,head_radius_mm,background,flat_field"
     assert head == names
     cells = dict(zip(names.split(","), last.split(","), strict=True))
     assert cells["seat"] == "1.2"
     assert float(cells["sigma_x_mm"]) > float(cells["sigma_y_mm"])  # a ball looks longer across the head
     assert cells["detectable"] == "true"
     assert (cells["thickness_mm"], cells["head_radius_mm"]) == ("70", "35")
+    assert (cells["background"], cells["flat_field"]) == ("free", "true")
 
 
 def test_a_ball_too_small_for_the_array_is_marked() -> None:
@@ -135,12 +169,15 @@ WHERE_TAXELS_RESOLVE = [
     [*QUICK, *[pytest.param(*case, marks=pytest.mark.slow) for case in WHERE_TAXELS_RESOLVE if case not in QUICK]],
 )
 def test_an_independent_models_phantoms_are_met(shared_data: Path, name: str, d: float, depth_ratio: float) -> None:
-    """Its "resting" balls lie a tenth of their diameter above the gland: seat 1.2. Faint ones a little further off."""
+    """Its "resting" balls lie a tenth of their diameter above the gland: seat 1.2. Faint ones a little further off.
+
+    It fits its maps as they are with a background of 1.
+    """
     with (shared_data / "phantoms.csv").open(newline="") as file:
         table = [row for row in csv.DictReader(file) if row["seat"] == name]
     (known,) = (row for row in table if (float(row["d_mm"]), float(row["depth_ratio"])) == (d, depth_ratio))
     seat = 1.2 if name == "resting" else 0.0
-    (row,) = run_solid_geometry(Geometry(seat, d, depth_ratio, (100.0,)), settings=SolidSettings(), fit=fit_raster)
+    (row,) = run_solid_geometry(Geometry(seat, d, depth_ratio, (100.0,)), settings=AS_IT_IS, fit=fit_raster)
     assert row.amplitude == pytest.approx(float(known["amplitude"]), rel=0.0125)
     assert row.sigma_x_mm == pytest.approx(float(known["sigma_x_mm"]), rel=0.01 if row.amplitude > 0.03 else 0.02)
     assert row.sigma_y_mm == pytest.approx(float(known["sigma_y_mm"]), rel=0.01)
@@ -193,6 +230,62 @@ def test_a_figure_of_balls_is_the_same_bytes_each_time(tmp_path: Path) -> None:
 def test_a_calibration_is_learned_from_the_table_by_defaults(folder: Path, run_cli: Run) -> None:
     done = run_cli("calibrate", "size", "study.csv", "-o", "size.json", cwd=folder)
     assert done.returncode == 0, done.stderr
+    assert "background free, fit radius 20 mm" in done.stdout
+
+
+def test_a_table_says_how_its_background_was_fitted(folder: Path, run_cli: Run, tmp_path: Path) -> None:
+    text = (folder / "study.csv").read_text()
+    (tmp_path / "same.csv").write_text(text)
+    (tmp_path / "mixed.csv").write_text(text.replace(",free,true", ",fixed,true", 1))
+    for table, words, said in (
+        ("same.csv", ("--background", "fixed"), "same.csv: its background is free; leave out --background"),
+        ("mixed.csv", (), "mixed.csv: background differs between rows"),
+    ):
+        done = run_cli("calibrate", "size", table, "-o", "size.json", *words, cwd=tmp_path)
+        assert done.returncode == EXIT_BAD_DATA
+        assert said in done.stderr
+
+
+OPTIONS: dict[tuple[str, ...], tuple[str, bool]] = {
+    (): ("free", True),
+    ("--background", "fixed"): ("fixed", True),
+    ("--no-flat-field",): ("free", False),
+    ("--background", "fixed", "--no-flat-field"): ("fixed", False),
+}
+
+
+def test_options_reach_the_map_and_the_fit(run_cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "grid.csv").write_text("d_mm,depth_ratio,stiffness_ratio\n15,1.2,100\n")
+    amplitudes = []
+    for words, (background, flat_field) in OPTIONS.items():
+        common = ("study", "--model", "solid", "--grid", "grid.csv", "--fineness", 1)
+        done = run_cli(*common, *words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        (found,) = csv.DictReader(done.stdout.splitlines())
+        assert (found["background"], found["flat_field"]) == (background, str(flat_field).lower())
+        settings = replace(SETTINGS, background=background, flat_field=flat_field)
+        (row,) = run_solid_geometry(Geometry(0.0, 15.0, 1.2, (100.0,)), settings=settings, fit=fit_raster)
+        assert float(found["amplitude"]) == pytest.approx(row.amplitude, rel=1e-5)
+        amplitudes.append(row.amplitude)
+    assert np.diff(sorted(amplitudes)).min() > 1e-3  # all four are maps or fits of their own
+
+
+def test_a_level_that_is_neither_is_refused() -> None:
+    with pytest.raises(BadDataError, match="background is 'open'; it must be fixed or free"):
+        SolidSettings(background="open")
+
+
+@pytest.mark.parametrize("option", [{"background": "fixed"}, {"flat_field": False}])
+def test_a_store_of_another_fit_is_refused(option: dict[str, Any], run_cli: Run, tmp_path: Path) -> None:
+    from tactile_bayes.batch import open_store
+
+    (tmp_path / "grid.csv").write_text(GRID)
+    with open_store(tmp_path / "study.csv.unfinished", settings=replace(SETTINGS, **option).as_dict()):
+        pass
+    words = ("study", "--model", "solid", "--grid", "grid.csv", "--fineness", 1, "-o", "study.csv")
+    done = run_cli(*words, cwd=tmp_path)
+    assert done.returncode == EXIT_USAGE
+    assert "other settings" in done.stderr
 
 
 def test_a_store_of_the_other_model_is_refused(run_cli: Run, tmp_path: Path) -> None:
@@ -219,7 +312,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
     done = run_cli(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     resumed = (tmp_path / "study.csv").read_text().splitlines()
-    assert resumed[1] == "centred,10,1,100,0.123,4.5,3.5,0.01,true"
+    assert resumed[1] == "centred,10,1,100,0.123,4.5,3.5,0.01,true,,,,"
     assert resumed[2] == (folder / "study.csv").read_text().splitlines()[1]
 
 

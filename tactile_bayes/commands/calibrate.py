@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from tactile_bayes.files.tables import Table
     from tactile_bayes.posterior.learn_size import SizeTable, StudyCases
+    from tactile_bayes.posterior.size_calibration import LeftOutErrors
 
 _FILE = click.Path(path_type=Path)
 
@@ -43,9 +44,7 @@ def command() -> None:
 @click.option(
     "--background",
     type=click.Choice(["fixed", "free"]),
-    default="fixed",
-    show_default=True,
-    help="How the table's maps were fitted (declared).",
+    help="How the table's maps were fitted (declared); by default what a study's table says, else fixed.",
 )
 @click.option(
     "--fit-radius-mm",
@@ -78,7 +77,7 @@ def size(
     output: Path,
     form: str,
     normalise: str,
-    background: str,
+    background: str | None,
     fit_radius_mm: float,
     noise: str,
     least_stiffness_ratio: float,
@@ -89,7 +88,8 @@ def size(
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
     stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The
-    declared options say how the table's maps were made; `estimate` refuses a map made otherwise. With depth_ratio and
+    declared options say how the table's maps were made; `estimate` refuses a map made otherwise. The table of
+    `study --model solid` has a column for its background. With depth_ratio and
     stiffness_ratio the table is a study: each geometry (seat, d_mm, depth_ratio) is also left out of the learning in
     turn, and the report tells how far Eq 6 and a quadratic in logarithms then miss the hard lumps' sizes. Where seat,
     stiffness below 8, thickness_mm or head_radius_mm vary in it, the report tells what each does to the size that Eq 6
@@ -111,7 +111,6 @@ def size(
     from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.posterior.learn_size import learn_size_calibration
-    from tactile_bayes.posterior.left_out import left_out_of_study
     from tactile_bayes.posterior.size_calibration import Recipe
     from tactile_bayes.posterior.size_terms import size_terms
     from tactile_bayes.report.calibration_text import calibration_text
@@ -122,13 +121,14 @@ def size(
         click.echo(_log_quadratic(table, output, force=force), nl=False)
         return
     rows = read_table(table, "size_table.table.json")
+    background = _background(rows, background)
     recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise)
     rng = np.random.default_rng(seed)
     try:
         lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
         with progress_bar("effective draws") as progress:
             calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
-        left_out = left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio)
+        left_out, silent = _left_out(lumps, least_stiffness_ratio=least_stiffness_ratio)
         calibration = replace(calibration, left_out=left_out)
     except BadDataError as error:
         raise error.at(table) from None
@@ -141,7 +141,21 @@ def size(
     }
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, calibration, provenance=provenance, force=force)
-    click.echo(calibration_text(calibration, terms=size_terms(lumps)), nl=False)
+    click.echo(calibration_text(calibration, terms=size_terms(lumps), not_left_out=silent), nl=False)
+
+
+def _background(table: Table, declared: str | None) -> str:
+    """How the table's maps were fitted: what its rows say, else what is declared, else fixed."""
+    from tactile_bayes.errors import BadDataError
+
+    for name in ("background", "flat_field"):
+        if len(set(table.columns[name])) > 1:
+            what = f"{name} differs between rows"
+            raise BadDataError(what, way_out="join tables of maps made alike only", path=str(table.path))
+    said: str | None = table.columns["background"][0]
+    if said and declared and said != declared:
+        raise BadDataError(f"its background is {said}", way_out="leave out --background", path=str(table.path))
+    return said or declared or "fixed"
 
 
 def _refuse_declared(ctx: click.Context) -> None:
@@ -151,6 +165,17 @@ def _refuse_declared(ctx: click.Context) -> None:
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
             raise UsageError(f"--{option} is for --form eq6: a table of `population` fixes how its maps were made")
+
+
+def _left_out(lumps: SizeTable, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
+    """Errors on geometries left out, or why Eq 6 has none."""
+    from tactile_bayes.errors import NotConvergedError
+    from tactile_bayes.posterior.left_out import left_out_of_study
+
+    try:
+        return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio), ""
+    except NotConvergedError as error:
+        return None, str(error)
 
 
 def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:

@@ -57,6 +57,16 @@ MODELS = ("plane-strain", "solid")
 @click.option("--gland-ratio", type=_ABOVE_0, default=10.0, show_default=True, help="Modulus of gland over fat.")
 @click.option("--thickness-mm", type=_ABOVE_0, help="Depth of the chest wall; 70, or deeper where the lump needs it.")
 @click.option("--fineness", type=click.IntRange(1, 8), default=2, show_default=True, help="Of the mesh; twice is half.")
+@click.option(
+    "--background",
+    type=click.Choice(["fixed", "free"]),
+    help="Eq 7's level, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1.",
+)
+@click.option(
+    "--flat-field/--no-flat-field",
+    default=None,
+    help="Take off what the head reads of the same body without the lump, solid only; by default it is.",
+)
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
 @click.option("--scheduler", metavar="ADDR", help="Send the geometries to a dask scheduler (extra [cluster]).")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
@@ -74,12 +84,13 @@ def command(
 ) -> None:
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses.
 
-    A head slides over each lump in a layered body; its frames become a map, and a Gaussian is fitted to it with the
-    background at 1: Eq 5 across a cylinder in two dimensions, Eq 7 over a ball in three. Cases with an amplitude below
+    A head slides over each lump in a layered body; its frames become a map, and a Gaussian is fitted to it: Eq 5 across
+    a cylinder in two dimensions, with the background at 1, Eq 7 over a ball in three. There the head's few lines leave
+    stripes and the lump a trough, which a flat field and a free background take off. Cases with an amplitude below
     0.02 or a width that is not resolved are marked as not detectable. With -o an interrupted study goes on where it
-    stopped. `calibrate size` learns from the table of the solid model as it is, from the other with
-    --fit-radius-mm 48. From the joined tables of several seats, thicknesses or heads it also tells what each would
-    change.
+    stopped. `calibrate size` learns from the table of the solid model as it is, for maps made with `map --flat-field`,
+    and from the other with --fit-radius-mm 48. From the joined tables of several seats, thicknesses or heads it also
+    tells what each would change.
 
     A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
     lump's centre on the fat-gland boundary, 1 (resting) its lowest point; above 1 the lump stands clear of the gland.
@@ -124,20 +135,42 @@ def study_settings(
     fineness: int,
     fat_kpa: float = 5.0,
     model: str = "plane-strain",
+    background: str | None = None,
+    flat_field: bool | None = None,
 ) -> StudySettings | SolidSettings:
-    """The study's settings from the options of the command line."""
+    """The study's settings from the options of the command line.
+
+    Raises
+    ------
+    UsageError
+        When a level or a flat field is asked of the model that has neither.
+    """
+    from tactile_bayes.errors import UsageError
     from tactile_bayes.forward.contact import Head
     from tactile_bayes.forward.study import StudySettings
 
     # both models are asked for the same section: the solid one rounds it off outside the taxels
     section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
     if model == "plane-strain":
+        if background == "free" or flat_field:
+            asked = "--background free" if background == "free" else "--flat-field"
+            raise UsageError(f"{asked} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
         return StudySettings(section, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
     from tactile_bayes.forward.scene import Head as Array
     from tactile_bayes.forward.solid_study import SolidSettings
 
     array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm)
-    return SolidSettings(array, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
+    return SolidSettings(
+        array,
+        mean_kpa,
+        poisson,
+        fat_kpa,
+        gland_ratio,
+        thickness_mm,
+        fineness=fineness,
+        background=background or "free",
+        flat_field=flat_field is not False,
+    )
 
 
 def read_grid(path: Path, *, seat: float) -> list[Geometry]:
@@ -273,11 +306,12 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
 
 
 def table_text(rows: list[StudyRow]) -> str:
-    """The study as a size table that `calibrate size` reads; sigma_y_mm only where a row has one."""
+    """The study as a size table that `calibrate size` reads; columns of the solid model only where a row has them."""
     names = ["seat", "d_mm", "depth_ratio", "stiffness_ratio", "amplitude", "sigma_x_mm"]
     if any(row.sigma_y_mm is not None for row in rows):
         names.append("sigma_y_mm")
     names += ["fit_rms", "detectable", "thickness_mm", "head_radius_mm"]
+    names += [name for name in ("background", "flat_field") if any(getattr(row, name) is not None for row in rows)]
     lines = [",".join(names)]
     lines += [",".join(_cell(getattr(row, name)) for name in names) for row in rows]
     return "\n".join(lines) + "\n"

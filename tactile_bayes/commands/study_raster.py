@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from tactile_bayes.forward.solid_study import RasterFit, RasterFrames
+    from tactile_bayes.forward.solid_study import RasterFit, RasterFrames, SolidSettings
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.cells import FitCells
-    from tactile_bayes.scan import Scan
+    from tactile_bayes.scan import CountArray, Scan
 
 # Readings travel as whole numbers: this many a unit of the frame's mean, so that 30 times the mean still fits.
 _COUNTS: Final = 2048
@@ -29,8 +29,7 @@ def raster_scan(frames: RasterFrames) -> Scan:
 
     head, count = frames.head, len(frames.x_mm)
     time = np.arange(float(count)) / 100.0
-    share = frames.pressure_kpa / frames.pressure_kpa.mean(axis=(1, 2), keepdims=True)
-    readings = np.clip(np.rint(share * _COUNTS), 0, np.iinfo(np.uint16).max - 1).astype(np.uint16)
+    readings = _readings(frames.pressure_kpa)
     shape = (head.rows, head.columns)
     return Scan(
         frames=PressureFrames(time, readings),
@@ -47,22 +46,43 @@ def raster_scan(frames: RasterFrames) -> Scan:
 
 
 def raster_map(frames: RasterFrames) -> TactileMap:
-    """The map of a raster: cells of half a pitch, so that every reading falls on the middle of one."""
+    """The map of a raster: cells of half a pitch, so that every reading falls on the middle of one.
+
+    Notes
+    -----
+    Where the raster has a plain frame, the head's own response is taken off as `map --flat-field` takes off a
+    patient's. There it is found from the scan's own calm frames; here it is known.
+    """
     from tactile_bayes.mapping.build import build_map
+    from tactile_bayes.mapping.flat_field import FlatField
 
-    return build_map(raster_scan(frames), cell_mm=frames.head.pitch_mm / 2, pressure_window_kpa=_WINDOW)
+    scan = raster_scan(frames)
+    if frames.plain_kpa is not None:
+        plain = _readings(frames.plain_kpa)
+        scan = FlatField(plain / plain.mean(), frames=1).applied(scan)
+    return build_map(scan, cell_mm=frames.head.pitch_mm / 2, pressure_window_kpa=_WINDOW)
 
 
-def fit_raster(frames: RasterFrames, radius_mm: float) -> RasterFit:
-    """Eq 7 about the lump's axis with a background of 1, all cells alike.
+def _readings(pressure_kpa: FloatArray) -> CountArray:
+    """(..., rows, columns) whole numbers of frames over their means."""
+    import numpy as np
+
+    share = pressure_kpa / pressure_kpa.mean(axis=(-2, -1), keepdims=True)
+    counts: CountArray = np.clip(np.rint(share * _COUNTS), 0, np.iinfo(np.uint16).max - 1).astype(np.uint16)
+    return counts
+
+
+def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
+    """Eq 7 about the lump's axis, all cells alike; the level is fitted, or 1, as the settings say.
 
     Notes
     -----
     All readings of a cell come from its middle, so the Gaussian is not averaged over it. A patient's readings are
     spread over their cells and the Gaussian is averaged there; what remains in both is the average over a taxel.
 
-    The lowest minimum between widths of half a taxel and three quarters of the radius is sought with the amplitude
-    eliminated, as in `study.fit_line`: steps of Gauss and Newton do not settle on a faint bump in its trough.
+    The lowest minimum between widths of half a taxel and three quarters of the radius is sought with the amplitude, and
+    a free level, eliminated, as in `study.fit_line`: steps of Gauss and Newton do not settle on a faint bump in its
+    trough.
     """
     from dataclasses import replace
 
@@ -72,11 +92,12 @@ def fit_raster(frames: RasterFrames, radius_mm: float) -> RasterFit:
     from tactile_bayes.posterior.cells import window_cells
     from tactile_bayes.posterior.fit import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 
+    radius_mm, free = settings.fit_radius_mm, settings.background == "free"
     cells = replace(window_cells(raster_map(frames), (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
     pitch = frames.head.pitch_mm
     ends = np.log([LEAST_WIDTH_IN_CELLS * pitch, WIDEST_IN_RADII * radius_mm])
-    log_widths = _lowest(cells, ends)
-    amplitude, sse = _height(log_widths, cells)
+    log_widths = _lowest(cells, ends, free=free)
+    amplitude, sse = _height(log_widths, cells, free=free)
     narrow, wide = sorted(np.exp(log_widths))
     resolved = (
         narrow >= _LEAST_WIDTH_IN_PITCHES * pitch
@@ -87,8 +108,8 @@ def fit_raster(frames: RasterFrames, radius_mm: float) -> RasterFit:
     return RasterFit(amplitude, sigma_x, sigma_y, float(np.sqrt(sse / len(cells))), bool(resolved))
 
 
-def _height(log_widths: FloatArray, cells: FitCells) -> tuple[float, float]:
-    """The best amplitude of a bump of these widths, and the sum of squares that it leaves."""
+def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[float, float]:
+    """The best amplitude of a bump of these widths on a level of 1 or a free one, and the squares that it leaves."""
     import numpy as np
 
     from tactile_bayes.posterior.bump import Bump
@@ -96,17 +117,20 @@ def _height(log_widths: FloatArray, cells: FitCells) -> tuple[float, float]:
     p, q = np.array([[0.5, 0.5], [0.5, -0.5]]) @ log_widths
     shape = Bump(background=1.0).unit_bump(np.array([[1.0, 0.0, 0.0, p, q]]), cells)[0]
     excess = cells.value - 1.0
+    if free:
+        # what is left of both once a level is taken off
+        shape, excess = shape - shape.mean(), excess - excess.mean()
     height = float(shape @ excess / (shape @ shape))
     return height, float(np.sum((excess - height * shape) ** 2))
 
 
-def _lowest(cells: FitCells, ends: FloatArray) -> FloatArray:
+def _lowest(cells: FitCells, ends: FloatArray, *, free: bool) -> FloatArray:
     """(2,) log widths of the lowest minimum between the ends."""
     import numpy as np
     from scipy.optimize import minimize
 
     def left(log_widths: FloatArray) -> float:
-        return _height(log_widths, cells)[1]
+        return _height(log_widths, cells, free=free)[1]
 
     line = np.linspace(ends[0], ends[1], _TRIED)
     tried = [np.array([x, y], dtype=np.float64) for x in line for y in line]

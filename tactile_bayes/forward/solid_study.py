@@ -27,6 +27,7 @@ from tactile_bayes.presets import FIT_RADIUS_MM
 
 REACH_MM = 33.0
 LINES_MM = (0.0, 6.0, 12.0)
+BACKGROUNDS = ("fixed", "free")
 _LEVEL = np.eye(3)
 
 
@@ -53,6 +54,10 @@ class SolidSettings:
         See `solid.skin_perturbation`.
     mesh_reach_mm
         Radius at which the mesh ends, on a rim that does not move.
+    background
+        ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
+    flat_field
+        Whether each taxel is divided by what it reads of the same body without the lump.
     """
 
     head: Head = field(default_factory=Head)
@@ -67,6 +72,8 @@ class SolidSettings:
     fineness: int = FINENESS
     rank_tolerance: float = RANK_TOLERANCE
     mesh_reach_mm: float = MeshSize().reach_mm
+    background: str = "free"
+    flat_field: bool = True
 
     def __post_init__(self) -> None:
         half = self.head.rows * self.head.pitch_mm / 2
@@ -75,6 +82,8 @@ class SolidSettings:
                 f"radius_mm of the head is {self.head.radius_mm:g}",
                 way_out=f"it must be above {half:g} mm, half the head's width",
             )
+        if self.background not in BACKGROUNDS:
+            raise BadDataError(f"background is {self.background!r}", way_out=f"it must be {' or '.join(BACKGROUNDS)}")
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a store's header."""
@@ -141,6 +150,8 @@ class RasterFrames:
     pressure_kpa : (n, rows, columns) array
     head
         What was pressed.
+    plain_kpa : (rows, columns) array
+        The head's frame over the same body without the lump, where the map is to be divided by it.
     """
 
     x_mm: FloatArray
@@ -148,6 +159,7 @@ class RasterFrames:
     depth_mm: FloatArray
     pressure_kpa: FloatArray
     head: Head
+    plain_kpa: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +169,7 @@ class RasterFit:
     Parameters
     ----------
     amplitude, sigma_x_mm, sigma_y_mm
-        a and the widths of Eq 7, across and along the head.
+        a (height above the level, in units of the map) and the widths of Eq 7, across and along the head.
     rms
         Root mean square of what the Gaussian leaves, in units of the background.
     resolved
@@ -171,8 +183,8 @@ class RasterFit:
     resolved: bool
 
 
-RasterFitter = Callable[[RasterFrames, float], RasterFit]
-"""Builds the map of a raster and fits Eq 7 within a radius in mm."""
+RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]
+"""Builds the map of a raster and fits Eq 7 with the radius and the level of the settings."""
 
 
 def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSettings) -> RasterFrames:
@@ -181,7 +193,8 @@ def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSetti
     Notes
     -----
     The lump is symmetric about both axes of the level head, so the frame at (-x, y) is the one at (x, y) with its rows
-    turned about, and that at (x, -y) with its columns.
+    turned about, and that at (x, -y) with its columns. The layers are alike everywhere, so one frame tells all that the
+    head reads without the lump.
     """
     pitch = settings.head.pitch_mm
     count = int(np.floor(settings.reach_mm / pitch + 1e-9))
@@ -204,8 +217,11 @@ def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSetti
                     places.append((side * x, end * y))
                     depths.append(one.depth_mm)
                     frames.append(one.pressure_kpa[::side, ::end])
+    plain = None
+    if settings.flat_field:
+        plain = head.frame([], rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa).pressure_kpa
     place = np.array(places)
-    return RasterFrames(place[:, 0], place[:, 1], np.array(depths), np.stack(frames), settings.head)
+    return RasterFrames(place[:, 0], place[:, 1], np.array(depths), np.stack(frames), settings.head, plain)
 
 
 def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: RasterFitter) -> list[StudyRow]:
@@ -220,7 +236,7 @@ def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: Rast
     head, condensed = settings.on(body), settings.condensed(body)
     rows = []
     for ratio in geometry.stiffness_ratios:
-        found = fit(raster_frames(head, settings.placed(condensed, ratio), settings), settings.fit_radius_mm)
+        found = fit(raster_frames(head, settings.placed(condensed, ratio), settings), settings)
         rows.append(
             StudyRow(
                 seat_name(geometry.seat),
@@ -234,6 +250,8 @@ def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: Rast
                 found.sigma_y_mm,
                 body.layers.thickness_mm,
                 settings.head.radius_mm,
+                settings.background,
+                settings.flat_field,
             )
         )
     return rows

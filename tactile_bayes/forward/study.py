@@ -125,7 +125,8 @@ class StudyRow:
     """One case and the Gaussian its map shows; the fields are the columns of a size table.
 
     A map in two dimensions has no `sigma_y_mm`. `thickness_mm` (depth of the chest wall) and `head_radius_mm` (of its
-    arc) are what the case was computed with.
+    arc) are what the case was computed with. `background` (``"fixed"`` or ``"free"``) and `flat_field` say how a map in
+    three dimensions was fitted and divided; in two they are None: the level is 1 and nothing is divided.
     """
 
     seat: str
@@ -139,6 +140,8 @@ class StudyRow:
     sigma_y_mm: float | None = None
     thickness_mm: float | None = None
     head_radius_mm: float | None = None
+    background: str | None = None
+    flat_field: bool | None = None
 
 
 def seat_name(seat: float) -> str:

@@ -46,7 +46,8 @@ class LumpCase:
     d_mm, depth_ratio, stiffness_ratio, seat
         As in `study.Geometry`.
     plane, solid
-        The default settings of both models for its body and head.
+        The default settings of both models for its body and head. All maps are as they are and fitted with a level of
+        1, as those in two dimensions are.
     """
 
     d_mm: float
@@ -141,7 +142,7 @@ def case_of(scene: Scene) -> LumpCase:
         lump.stiffness_ratio,
         round(seat, 9) + 0.0,
         StudySettings(section, *tissue),
-        SolidSettings(scene.head, *tissue),
+        SolidSettings(scene.head, *tissue, background="fixed", flat_field=False),
     )
     _ = case.body  # refuses what neither model can do
     return case
@@ -241,7 +242,7 @@ def _solid(case: LumpCase, setting: Setting) -> _Prepared:
 
     def shown(_: Fit, raster_fit: RasterFitter) -> _Shown:
         frames = raster_frames(head, settings.placed(condensed, case.stiffness_ratio), settings)
-        found = raster_fit(frames, settings.fit_radius_mm)
+        found = raster_fit(frames, settings)
         return found.amplitude, found.sigma_x_mm, found.sigma_y_mm
 
     return shown

@@ -27,10 +27,14 @@ def left_out_of_study(table: SizeTable, *, least_stiffness_ratio: float = 0.0) -
     Parameters
     ----------
     table
-        Of detectable cases; None is returned unless it has `StudyCases` in at least eight geometries, and where Eq 6
-        has no mode without one of them.
+        Of detectable cases; None is returned unless it has `StudyCases` in at least eight geometries.
     least_stiffness_ratio
         Softer lumps take no part; 0 is `HARD_RATIO`.
+
+    Raises
+    ------
+    NotConvergedError
+        When Eq 6 has no mode without one of the geometries.
 
     Notes
     -----
@@ -51,10 +55,7 @@ def left_out_of_study(table: SizeTable, *, least_stiffness_ratio: float = 0.0) -
         return None
     widths = {"x": table.sigma_x_mm} if table.sigma_y_mm is None else {"x": table.sigma_x_mm, "y": table.sigma_y_mm}
     both = np.exp(np.mean([np.log(sigma) for sigma in widths.values()], axis=0))
-    try:
-        eq6 = {name: _left_out(geometry, _eq6(table, sigma)) for name, sigma in widths.items()}
-    except NotConvergedError:
-        return None
+    eq6 = {name: _left_out(geometry, _eq6(table, sigma)) for name, sigma in widths.items()}
     eq6["both"] = np.exp(np.mean([np.log(np.maximum(size, 1e-3)) for size in eq6.values()], axis=0))
     quadratic = {name: _left_out(geometry, _quadratic(table, sigma)) for name, sigma in widths.items()}
     quadratic["both"] = _left_out(geometry, _quadratic(table, both))
@@ -98,7 +99,12 @@ def _eq6(table: SizeTable, sigma_mm: FloatArray) -> _Predict:
     def predict(kept: _Rows) -> FloatArray:
         group = [key for key, is_kept in zip(lump, kept, strict=True) if is_kept]
         change = width_changes(sigma_mm[kept], depth_ratio=cases.depth_ratio[kept], group=group)
-        axis = axis_at_mode(AxisRows(table.d_mm[kept], table.amplitude[kept], sigma_mm[kept], change))
+        try:
+            axis = axis_at_mode(AxisRows(table.d_mm[kept], table.amplitude[kept], sigma_mm[kept], change))
+        except NotConvergedError:
+            out = int(np.flatnonzero(~kept)[0])
+            where = f"{cases.seat[out]}, d {table.d_mm[out]:g} mm, h/d {cases.depth_ratio[out]:g}"
+            raise NotConvergedError(f"Eq 6 has no mode without the geometry {where}") from None
         return axis.size_mm(sigma_mm, table.amplitude)
 
     return predict

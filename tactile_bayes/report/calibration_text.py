@@ -26,8 +26,16 @@ TERM_NAMES = {
 }
 
 
-def calibration_text(calibration: SizeCalibration, *, terms: Mapping[str, SizeTerms] | None = None) -> str:
-    """Fit, domain and r2 of each axis, the recipe it holds for, and what else `terms` say of the size."""
+def calibration_text(
+    calibration: SizeCalibration, *, terms: Mapping[str, SizeTerms] | None = None, not_left_out: str = ""
+) -> str:
+    """Fit, domain and r2 of each axis, the recipe it holds for, and what else `terms` say of the size.
+
+    Parameters
+    ----------
+    not_left_out
+        Why the table's geometries could not be left out in turn, where that is so.
+    """
     lines = ["Eq 6: d = m sigma / (e a^f) + b, posterior mean +- SD"]
     both = calibration.axes == ("both",)
     axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]
@@ -43,6 +51,8 @@ def calibration_text(calibration: SizeCalibration, *, terms: Mapping[str, SizeTe
         lines.append("the table has no depths: only m/e is determined, e is 1 by convention")
     if calibration.left_out is not None:
         lines += _left_out(calibration.left_out)
+    elif not_left_out:
+        lines.append(f"leave one geometry out: not known, {not_left_out}")
     if terms:
         lines += _terms(terms, both=both)
     recipe = calibration.recipe

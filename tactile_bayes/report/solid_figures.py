@@ -134,7 +134,7 @@ def figure_7(
         left, right = figure.subplots(1, 2)
         for colour, ratio in zip(_COLOURS, _RATIOS, strict=False):
             frames = raster_frames(head, settings.placed(condensed, ratio), settings)
-            found, (x, value) = fit(frames, settings.fit_radius_mm), _section(build(frames), "x")
+            found, (x, value) = fit(frames, settings), _section(build(frames), "x")
             near = np.abs(x) <= 20.0
             text = f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {found.sigma_x_mm:.1f} x {found.sigma_y_mm:.1f} mm"
             left.plot(x[near], value[near], color=colour, label=text)
@@ -245,5 +245,6 @@ def _caption(name: str, settings: SolidSettings, seat: float) -> str:
     head = settings.head
     return (
         f"{name}: balls {seat_name(seat)}, head R {head.radius_mm:g} mm with a {head.rim_mm:g} mm rim, "
-        f"mean {settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said.  {RESEARCH_USE}"
+        f"mean {settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said"
+        f"{', flat field' if settings.flat_field else ''}.  {RESEARCH_USE}"
     )
