@@ -164,22 +164,24 @@ def test_another_rise_is_one_that_neither_reaches() -> None:
     assert (sbc.elsewhere(near, TRUTH), sbc.elsewhere(far, TRUTH)) == (False, True)
 
 
-def test_the_size_of_a_known_bump_ranks_uniformly() -> None:
-    """A posterior that is the truth itself: what is left is the calibration's own law, on both sides."""
-    calibration = _shipped()
-    one = {name: np.full(sbc.DRAWS, getattr(TRUTH, name)) for name in sbc.PARAMETERS}
-    rest = {name: np.zeros(sbc.DRAWS) for name in ("angle_rad", "background", "noise_sd")}
-    posterior = MapPosterior(**one, **rest)
-    # half as wide again
-    off = Truth(**asdict(TRUTH) | {"sigma_x_mm": 9.0, "sigma_y_mm": 6.8})
+def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:
+    """Ranks of the size where truth and draws have one law, log-normal about an oval bump; `wider` spoils it."""
+    ranks = []
+    for i in range(n):
+        rng = np.random.default_rng(i)
+        middle = {"amplitude": 1.2, "sigma_x_mm": 8.0, "sigma_y_mm": 3.5}
+        drawn = {name: value * np.exp(0.15 * rng.standard_normal(1000)) for name, value in middle.items()}
+        true = {name: float(value * np.exp(0.15 * rng.standard_normal())) for name, value in middle.items()}
+        true |= {name: wider * true[name] for name in ("sigma_x_mm", "sigma_y_mm")}
+        rest = ("x_mm", "y_mm", "angle_rad", "background", "noise_sd")
+        posterior = MapPosterior(**drawn, **dict.fromkeys(rest, np.zeros(1000)))
+        ranks.append(sbc._ranks_in(posterior, Truth(**asdict(TRUTH) | true), rng, _shipped())[-1])
+    return np.array(ranks)
 
-    def ranks(truth: Truth) -> np.ndarray:
-        return np.array(
-            [sbc._ranks_in(posterior, truth, np.random.default_rng(i), calibration)[-1] for i in range(150)]
-        )
 
-    assert rank_test("size_mm", ranks(TRUTH), draws=DRAWS).inside
-    assert not rank_test("size_mm", ranks(off), draws=DRAWS).inside
+def test_a_size_drawn_from_the_law_of_its_draws_ranks_uniformly() -> None:
+    assert rank_test("size_mm", size_ranks(150), draws=DRAWS).inside
+    assert not rank_test("size_mm", size_ranks(150, wider=1.3), draws=DRAWS).inside
 
 
 def test_a_map_is_the_same_wherever_it_is_made() -> None:

@@ -12,8 +12,8 @@ are improper or depend on the map:
 
 Maps that give no estimate have no ranks: ranks are conditional on detection. Whether a map gives one depends on the
 map alone, so that exact ranks stay uniform. Under a field much stronger than the bump another rise may be taken for it.
-The estimate gives a probability that what it measures is a lump, and the draws are conditional on that: such maps have
-no ranks either, but are held against the number that the probabilities announce.
+The estimate gives a probability that there is a lump, and the draws keep to the place where it was found: such maps
+have no ranks either, but are held against the number that the probabilities announce.
 
 The size is that of a round lump: the true one is a draw of the size calibration's own law at the true amplitude and
 widths.
@@ -57,8 +57,8 @@ SIZE = "size_mm"
 RANKED = (*PARAMETERS, SIZE)
 ELSEWHERE = "elsewhere"
 MANY_ELSEWHERE = 1e-3
-"""More maps measured at another rise than all but this share of chances allow: detection is too sure of itself."""
-ROUND = SizePriors(shape=ShapePrior(oval_probability=1e-12))
+"""More maps measured at another rise than all but this share of chances allow: the draws are too sure of the place."""
+ROUND = SizePriors(shape=ShapePrior(oval_sd=1e-9))
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +172,7 @@ class OtherRises:
 
     @property
     def too_many(self) -> bool:
-        """Whether detection is too sure of itself."""
+        """Whether the draws are too sure of the place: they keep to the rise that was found first."""
         return self.chance < MANY_ELSEWHERE
 
 

@@ -81,7 +81,7 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     why = ", ".join(f"{code} {number}" for code, number in document["abstained"].items())
     yield f"no estimate on {abstained}{f' ({why})' if why else ''}: left out, ranks are conditional on detection"
     told = f"another rise was measured on {others['number']}, announced {others['announced']:.1f}"
-    sure = f"FAILS, detection is too sure of itself (p = {others['chance']:.1g})" if others["too_many"] else "ok"
+    sure = f"FAILS, the draws keep to one place (p = {others['chance']:.1g})" if others["too_many"] else "ok"
     yield f"{told}: {sure}; left out"
     drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
     if not document["parameters"]:
