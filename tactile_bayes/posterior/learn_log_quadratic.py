@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
@@ -24,6 +25,8 @@ from tactile_bayes.posterior.log_quadratic import HiddenTerms, LogQuadratic, Rou
 from tactile_bayes.posterior.size_calibration import Recipe
 
 LEAST_BODIES = 20
+HELD = 0.9
+"""Probability of the intervals that are held against bodies left out."""
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 
@@ -233,7 +236,17 @@ def _figures(table: PopulationTable, data: _Regression, mode: FloatArray) -> dic
         "left_out_sd": float(error.std()),
         "left_out_mae_percent": float(100 * np.mean(np.abs(np.expm1(error)))),
         "left_out_bias_percent": float(100 * np.mean(np.expm1(error))),
+        "left_out_held_percent": 100 * _held(data, mode, error),
     }
+
+
+def _held(data: _Regression, mode: FloatArray, error: FloatArray) -> float:
+    """Share of the bodies left out whose size lies in the interval of `HELD` by the spreads that were learned."""
+    inverse = np.linalg.inv(data.mean_terms.T @ data.mean_terms)
+    leverage = np.einsum("ni,ij,nj->n", data.mean_terms, inverse, data.mean_terms)
+    spread = np.exp(2 * (mode[6] + mode[7] * data.mean_terms[:, 1]))
+    spread = spread + (np.exp(2 * mode[8]) + data.mean(data.map_variance)) / data.exams
+    return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(spread / (1.0 - leverage))))
 
 
 def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:

@@ -32,7 +32,8 @@ def log_quadratic_text(calibration: LogQuadratic) -> str:
         unknowns_text(calibration.unknowns),
         f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; each body left out in turn: "
         f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
-        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %",
+        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %"
+        + (f", {fit['left_out_held_percent']:.0f} % in their 90 % interval" if "left_out_held_percent" in fit else ""),
     ]
     for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
         low, high = calibration.domain[name]
