@@ -60,7 +60,8 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
         axes.margins(x=0.2, y=0.1)
         case = report.case
         title = (
-            f"one lump, d {case.d_mm:g} mm, h/d {case.depth_ratio:g}; grey: not worth paying for; dashed: Eq 6 itself"
+            f"one lump, d {case.d_mm:g} mm, h/d {case.depth_ratio:g}; "
+            "grey: not worth paying for; dashed: the calibration itself"
         )
         _finish(axes, title, "CPU for one map (s)", "error in size (%)")
         figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")
