@@ -151,12 +151,10 @@ class Turn:
     def tell(self, *, lump: bool, width_mm: float | None = None) -> bool:
         """What came of it; whether that is worth showing: not that the highest is still none."""
         glance = self._now != self._home
-        if lump or not glance:
-            self._width_mm = width_mm if lump else None
         if lump:
-            self._home = self._now
+            self._home, self._width_mm = self._now, width_mm
         elif not glance:
-            self._home += 1
+            self._home, self._width_mm = self._home + 1, None
         return lump or not glance
 
 
