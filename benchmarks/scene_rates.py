@@ -26,7 +26,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.sbc import draw_truth
+from tactile_bayes.posterior.sbc import draw_field, draw_truth
 
 HALF_MM, RADIUS_MM = 35.0, 20.0
 AXIS = np.arange(-HALF_MM, HALF_MM + 0.5)
@@ -60,15 +60,6 @@ def gaussian(x: float, y: float, *, sigmas: FloatArray) -> FloatArray:
     covariance = np.diag(np.square(sigmas))
     cells = cell_mean_gaussian((u - x).ravel(), (v - y).ravel(), covariance_mm2=covariance, cell_mm=1.0)
     return cells.reshape(u.shape)
-
-
-def correlated_field(rng: np.random.Generator, length_mm: float) -> FloatArray:
-    """(n, n) field of variance 1 and exponential correlation, cut from a torus on which the wrap does not matter."""
-    size = len(AXIS) + int(10 * length_mm)
-    lag = np.fft.fftfreq(size, 1 / size)
-    power = np.clip(np.fft.fft2(np.exp(-np.hypot(lag[:, None], lag) / length_mm)).real, 0.0, None)
-    white = rng.standard_normal(power.shape)
-    return np.fft.ifft2(np.fft.fft2(white) * np.sqrt(power)).real[: len(AXIS), : len(AXIS)]
 
 
 def slope(rng: np.random.Generator) -> FloatArray:
@@ -114,7 +105,7 @@ def draw_map(row: Truths, rng: np.random.Generator) -> TactileMap:
         truth = draw_truth(rng, BumpPrior())
         length_mm, share, noise_sd = truth.length_mm, truth.share, truth.noise_sd
     white = noise_sd * rng.standard_normal((len(AXIS), len(AXIS)))
-    field = np.sqrt(share) * noise_sd * correlated_field(rng, length_mm)
+    field = np.sqrt(share) * noise_sd * draw_field(AXIS, rng, length_mm=length_mm)
     return TactileMap(
         mean=1.0 + row.values(rng) + white + field,
         variance=np.zeros(white.shape),

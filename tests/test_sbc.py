@@ -10,8 +10,6 @@ import pytest
 from tactile_bayes.commands.sbc import _shipped
 from tactile_bayes.posterior import sbc
 from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.cells import window_cells
-from tactile_bayes.posterior.collapsed import independent_variance
 from tactile_bayes.posterior.estimate import MapPosterior
 from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.posterior.rank_tests import (
@@ -25,7 +23,6 @@ from tactile_bayes.posterior.rank_tests import (
     uniform_strays,
 )
 from tactile_bayes.posterior.sbc import DRAWS, ELSEWHERE, MapRanks, Truth, other_rises
-from tactile_bayes.posterior.window import Profiles, Window
 from tactile_bayes.report.sbc_text import verdict
 
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
@@ -105,21 +102,30 @@ def test_few_ranks_have_no_bins_to_compare() -> None:
     assert chi2_p(np.array([1, 2, 3]), DRAWS) == 1.0
 
 
+def mean_product(fields: np.ndarray, lag: int) -> tuple[float, float]:
+    """Of cells `lag` apart, and its standard error over the fields."""
+    products = np.mean(fields[:, :, : fields.shape[2] - lag] * fields[:, :, lag:], axis=(1, 2))
+    return float(products.mean()), float(products.std() / np.sqrt(len(products)))
+
+
 @pytest.mark.parametrize("length", LENGTHS_MM)
-def test_simulated_errors_are_those_that_the_posterior_assumes(length: float) -> None:
-    """Along the directions in which the model's precision is diagonal, squares are as large as its eigenvalues say."""
-    truth = Truth(**asdict(TRUTH) | {"length_mm": length, "x_mm": 0.0, "y_mm": 0.0, "share": 30.0, "amplitude": 0.0})
-    squares = []
-    for i in range(4):
-        tactile_map = sbc.draw_map(truth, np.random.default_rng(i), BumpPrior(tilt_sd=0.0))
-        cells = window_cells(tactile_map, (0.0, 0.0), radius_mm=sbc.RADIUS_MM)
-        window = Window(cells, independent_variance(cells))
-        field = window.field(length)
-        errors = window.on_grid((cells.value[None] - 1.0) / truth.noise_sd)
-        along = window.project(Profiles(grid=errors), errors).low[0] @ field.turn
-        expected = field.eigenvalues * (1.0 + truth.share * field.eigenvalues)
-        squares.append(np.mean(along**2 / expected))
-    assert np.mean(squares) == pytest.approx(1.0, abs=0.15)
+def test_simulated_fields_have_the_exponential_correlation(length: float) -> None:
+    axis = np.arange(0.0, 51.0)
+    fields = np.array([sbc.draw_field(axis, np.random.default_rng(i), length_mm=length) for i in range(200)])
+    for lag in (0, 1, 3, 6, 12):
+        mean, error = mean_product(fields, lag)
+        assert mean == pytest.approx(np.exp(-lag / length), abs=4 * error), lag
+    mean, error = mean_product(fields, round(length))
+    assert abs(mean - np.exp(-round(length) / (2 * length))) > 4 * error  # the control: twice as long
+
+
+@pytest.mark.parametrize("length", LENGTHS_MM)
+def test_a_field_is_as_strong_at_the_rim_of_a_map_as_inside(length: float) -> None:
+    """One made of cosines is twice as strong where they are mirrored."""
+    axis = np.arange(0.0, 51.0)
+    fields = np.array([sbc.draw_field(axis, np.random.default_rng(i), length_mm=length) for i in range(300)])
+    rim = np.mean(np.stack([fields[:, 0], fields[:, -1], fields[:, :, 0], fields[:, :, -1]]) ** 2, axis=(0, 2))
+    assert abs(np.mean(rim) - 1.0) < 4 * np.std(rim) / np.sqrt(len(rim))
 
 
 def test_a_map_has_the_errors_it_says() -> None:

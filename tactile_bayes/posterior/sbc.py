@@ -8,7 +8,10 @@ are improper or depend on the map:
 - amplitude: its normal prior restricted to rises, for an estimate needs one; ranks are conditional on that.
 - noise scale (improper): an independent SD of a cell log-uniform on `NOISE_SD`; level (improper): 1; tilt (improper):
   normal of `BumpPrior.tilt_sd`. For such parameters of location and scale ranks are uniform at every value.
-- centre (uniform in a window that follows the map): uniform within `CENTRE_MM` of the map's middle.
+- centre (uniform in a window that follows the map): uniform within `CENTRE_MM` of the map's middle;
+- field: the exponential correlation itself. The posterior writes it in cosines on a rectangle that follows its window:
+  what that approximation costs is part of what the ranks judge. (Cosines mirror a field at their rectangle's edge. Maps
+  made of them had folds where they reached beyond, which other windows took for lumps.)
 
 Maps that give no estimate have no ranks: ranks are conditional on detection. Whether a map gives one depends on the
 map alone, so that exact ranks stay uniform. Under a field much stronger than the bump another rise may be taken for it.
@@ -35,7 +38,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.estimate import EstimateOptions, MapPosterior, estimate_map
-from tactile_bayes.posterior.field import COSINES, LENGTHS_MM, MARGIN, SHARES, spectrum
+from tactile_bayes.posterior.field import LENGTHS_MM, SHARES
 from tactile_bayes.posterior.fit import WIDEST_IN_RADII, FitOptions
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
@@ -121,6 +124,7 @@ def settings(method: str, seed: int, *, size: str = "") -> dict[str, object]:
         "counts": list(COUNTS),
         "lengths_mm": list(LENGTHS_MM),
         "shares": list(SHARES),
+        "field": "exponential",
         **BumpPrior().as_dict(),
     }
 
@@ -240,7 +244,7 @@ def draw_map(truth: Truth, rng: np.random.Generator, prior: BumpPrior) -> Tactil
     slope = prior.tilt_sd * rng.standard_normal(2) / RADIUS_MM
     level = 1.0 + slope[0] * axis + slope[1] * axis[:, None]
     errors = np.sqrt(reading_variance / count) * rng.standard_normal(count.shape)
-    field = np.sqrt(truth.share) * truth.noise_sd * draw_field(axis, truth, rng)
+    field = np.sqrt(truth.share) * truth.noise_sd * draw_field(axis, rng, length_mm=truth.length_mm)
     return TactileMap(
         mean=level + truth.amplitude * _bump(axis, truth) + errors + field,
         variance=np.full(count.shape, reading_variance),
@@ -259,17 +263,14 @@ def _bump(axis: FloatArray, truth: Truth) -> FloatArray:
     return np.asarray(rows[:, None] * columns)
 
 
-def draw_field(axis: FloatArray, truth: Truth, rng: np.random.Generator) -> FloatArray:
-    """(n, n) values of the noise field of mean variance 1: the model's cosines on a rectangle about the bump."""
-    side = 2.0 * MARGIN * np.floor(RADIUS_MM / CELL_MM) * CELL_MM
-    order = np.arange(COSINES)
-    height = np.where(order > 0, np.sqrt(2.0), 1.0)
-    across, along = (
-        height * np.cos(np.pi * order * ((axis - centre)[:, None] / side + 0.5)) for centre in (truth.x_mm, truth.y_mm)
-    )
-    frequency2 = (np.pi * order / side) ** 2
-    variance = spectrum((frequency2[:, None] + frequency2).ravel(), truth.length_mm).reshape(COSINES, COSINES)
-    return np.asarray(along @ (np.sqrt(variance) * rng.standard_normal(variance.shape)) @ across.T)
+def draw_field(axis: FloatArray, rng: np.random.Generator, *, length_mm: float) -> FloatArray:
+    """(n, n) field of variance 1 and exponential correlation, cut from a torus on which the wrap does not matter."""
+    cell_mm = float(axis[1] - axis[0])
+    size = len(axis) + int(10 * length_mm / cell_mm)
+    lag = np.fft.fftfreq(size, 1 / size) * cell_mm
+    power = np.clip(np.fft.fft2(np.exp(-np.hypot(lag[:, None], lag) / length_mm)).real, 0.0, None)
+    white = rng.standard_normal(power.shape)
+    return np.asarray(np.fft.ifft2(np.fft.fft2(white) * np.sqrt(power)).real[: len(axis), : len(axis)])
 
 
 def rank_tests(maps: list[MapRanks]) -> list[RankTest]:
