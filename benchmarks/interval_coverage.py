@@ -4,10 +4,11 @@
     python -m benchmarks.interval_coverage sizes [--masses 140] [--bodies population|trial] [--workers 2] [-o ROWS]
 
 `widths`: sigma_x and sigma_y of maps with a known bump under independent errors, under fields with exponential
-correlation (drawn by the covariance's Cholesky factor, not by the model's cosines), of a bump that is no Gaussian, and
-of scans by a simulated head, whose truth is what the same estimate says of the same scan without sensor and tracker
-errors (a size calibration's widths mean the same). The last row is the
-negative control: the model of independent errors without its inflation, on maps with a field.
+correlation (drawn by the covariance's Cholesky factor, not by the model's cosines), of a bump that is no Gaussian (the
+truth is the nearest Gaussian, under the row's errors or by plain squares), and of scans by a simulated head, whose truth
+is what the same estimate says of the same scan without sensor and tracker errors (a size calibration's widths mean the
+same). The last row is the negative control: the model of independent errors without its inflation, on maps with a
+field.
 
 `sizes`: the whole path. Each mass is scanned three times by the solid model, each scan mapped and sized, alone and
 pooled, with the shipped calibration. `population` draws bodies from the prior that the calibration was learned over,
@@ -28,10 +29,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.stats import binomtest
 
 from benchmarks.own_trial import draw_mass_like_trial
 from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.forward.population import draw_mass
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
@@ -53,8 +56,10 @@ KINDS: dict[str, dict[str, float]] = {
     "field-dominated": {"white": 0.002, "field": 0.02, "length_mm": 4.0},
     "super-Gaussian, exponent 2.5": {"white": 0.01, "field": 0.01, "length_mm": 3.0, "exponent": 1.25},
 }
+BY_SQUARES = "the same, nearest by plain squares"
 CONTROL = "control: independent errors assumed, field 3 mm"
-HEAD = "simulated head"
+HEADS = {"simulated head": AMPLITUDE, "simulated head, lump of 0.05": 0.05}
+ROWS = (*KINDS, BY_SQUARES, *HEADS, CONTROL)
 Row = dict[str, Any]
 
 
@@ -63,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["widths", "sizes"])
     parser.add_argument("--maps", type=int, default=400, help="a row")
+    parser.add_argument("--only", type=int, action="append", choices=range(len(ROWS)), help="widths: this row")
     parser.add_argument("--masses", type=int, default=140, help="three maps each")
     parser.add_argument("--bodies", choices=["population", "trial"], default="population")
     parser.add_argument("--workers", type=int, default=1)
@@ -71,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"load {os.getloadavg()[0]:.1f}")
     with ProcessPoolExecutor(given.workers) as pool:
         if given.what == "widths":
-            widths(partial(pool.map, chunksize=4), given.maps)
+            widths(partial(pool.map, chunksize=4), given.maps, given.only or range(len(ROWS)))
         else:
             sizes(pool.map, given.masses, given.bodies, given.output)
     return 0
@@ -88,10 +94,10 @@ def share(inside: Sequence[bool]) -> str:
 # --- widths ---
 
 
-def widths(run: Callable[..., Iterable[Any]], maps: int) -> None:
+def widths(run: Callable[..., Iterable[Any]], maps: int, rows: Iterable[int]) -> None:
     """A row for each kind of error."""
     print(f"nominal {NOMINAL:g}: share of intervals that hold, with its exact 95 % interval")
-    for kind in [*KINDS, HEAD, CONTROL]:
+    for kind in (ROWS[i] for i in rows):
         found = list(run(partial(_one_map, kind), range(maps)))
         held = [one for one in found if one is not None]
         x, y = ([one[i] for one in held] for i in (0, 1))
@@ -100,10 +106,11 @@ def widths(run: Callable[..., Iterable[Any]], maps: int) -> None:
 
 def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
     rng = np.random.default_rng([SEED, index])
-    if kind == HEAD:
-        tactile_map, truth = _head_map(index)
+    if kind in HEADS:
+        tactile_map, truth = _head_map(index, HEADS[kind])
     else:
-        tactile_map, truth = _grid_map(KINDS["field 3 mm" if kind == CONTROL else kind], rng)
+        same = {CONTROL: "field 3 mm", BY_SQUARES: "super-Gaussian, exponent 2.5"}
+        tactile_map, truth = _grid_map(KINDS[same.get(kind, kind)], rng, by_squares=kind == BY_SQUARES)
     if kind == CONTROL:
         return _held_by_independent(tactile_map, truth)
     options = EstimateOptions(fit=FitOptions("free", 20.0, "off", None, "field"))
@@ -133,7 +140,9 @@ def _held_by_independent(tactile_map: TactileMap, truth: tuple[float, float]) ->
     return held[0], held[1]
 
 
-def _grid_map(kind: dict[str, float], rng: np.random.Generator) -> tuple[TactileMap, tuple[float, float]]:
+def _grid_map(
+    kind: dict[str, float], rng: np.random.Generator, *, by_squares: bool = False
+) -> tuple[TactileMap, tuple[float, float]]:
     centre = rng.uniform(-2.0, 2.0, 2)
     exponent = kind.get("exponent", 1.0)
     bump = AMPLITUDE * _cell_means(centre, exponent)
@@ -146,7 +155,10 @@ def _grid_map(kind: dict[str, float], rng: np.random.Generator) -> tuple[Tactile
     count = np.full(bump.shape, COUNT, dtype=np.int64)
     recipe = MapRecipe("grid", "mean", 1.0)
     tactile_map = TactileMap(level + bump + errors, variance, count, AXIS, AXIS, recipe=recipe, background=1.0)
-    return tactile_map, SIGMA if exponent == 1.0 else _equivalent_widths(exponent)
+    if exponent == 1.0:
+        return tactile_map, SIGMA
+    field, length_mm = (0.0, 1.0) if by_squares else (kind["field"], kind["length_mm"])
+    return tactile_map, _nearest_widths(exponent, kind["white"], field, length_mm)
 
 
 def _cell_means(centre: FloatArray, exponent: float) -> FloatArray:
@@ -158,15 +170,26 @@ def _cell_means(centre: FloatArray, exponent: float) -> FloatArray:
 
 
 @cache
-def _equivalent_widths(exponent: float) -> tuple[float, float]:
-    """Widths of the Gaussian that lies nearest to the bump by least squares: what a width of it means."""
-    mean = 1.0 + AMPLITUDE * _cell_means(np.zeros(2), exponent)
-    blank = TactileMap(
-        mean, 0 * mean, np.full(mean.shape, COUNT), AXIS, AXIS, recipe=MapRecipe("grid", "mean", 1.0), background=1.0
-    )
-    fit, fault = fit_bump(blank, (0.0, 0.0), options=FitOptions("free", 20.0, "off"))
-    assert fit is not None, fault
-    return fit.widths()[:2]
+def _nearest_widths(exponent: float, white: float, field: float, length_mm: float) -> tuple[float, float]:
+    """Widths of the Gaussian nearest to the bump under these errors: what the widths of a wrong model tend to.
+
+    Nearest is by squares under the errors' own covariance, level and slope free (White 1982, Econometrica 50:1).
+    """
+    x, y = (one.ravel() for one in np.meshgrid(AXIS, AXIS))
+    inside = np.hypot(x, y) <= 20.0
+    x, y = x[inside], y[inside]
+    away = np.hypot(x[:, None] - x, y[:, None] - y)
+    factor = np.linalg.cholesky(field**2 * np.exp(-away / length_mm) + white**2 * np.eye(len(x)))
+    bump = _cell_means(np.zeros(2), exponent).ravel()[inside]
+    rest = np.linalg.solve(factor, np.stack([np.ones_like(x), x, y, bump], axis=1))
+
+    def residual(log_widths: FloatArray) -> FloatArray:
+        gaussian = cell_mean_gaussian(x, y, covariance_mm2=np.diag(np.exp(2 * log_widths)), cell_mm=1.0)
+        columns = np.concatenate([rest[:, :3], np.linalg.solve(factor, gaussian)[:, None]], axis=1)
+        return np.asarray(columns @ np.linalg.lstsq(columns, rest[:, 3], rcond=None)[0] - rest[:, 3])
+
+    found = np.exp(least_squares(residual, np.log(SIGMA)).x)
+    return float(found[0]), float(found[1])
 
 
 def _field(length_mm: float, rng: np.random.Generator) -> FloatArray:
@@ -181,7 +204,7 @@ def _factor(length_mm: float) -> FloatArray:
     return np.linalg.cholesky(np.exp(-away / length_mm) + 1e-10 * np.eye(len(x)))
 
 
-def _head_map(index: int) -> tuple[TactileMap, tuple[float, float]]:
+def _head_map(index: int, amplitude: float) -> tuple[TactileMap, tuple[float, float]]:
     """A scan's map, and the widths of the same scan's map without errors."""
     rng = np.random.default_rng([SEED, index, 1])
     noise = Noise(
@@ -191,7 +214,7 @@ def _head_map(index: int) -> tuple[TactileMap, tuple[float, float]]:
         gain_share=float(rng.uniform(0.002, 0.02)),
     )
     x, y = rng.uniform(-3.0, 3.0, 2)
-    lump = Lump(x_mm=float(x), y_mm=float(y), amplitude=AMPLITUDE, sigma_x_mm=SIGMA[0], sigma_y_mm=SIGMA[1])
+    lump = Lump(x_mm=float(x), y_mm=float(y), amplitude=amplitude, sigma_x_mm=SIGMA[0], sigma_y_mm=SIGMA[1])
     scene = Scene(seed=index, frame_rate_hz=100.0, lumps=(lump,), noise=noise, strokes=Strokes(yaw_deg=0.0))
     clean = replace(scene, noise=Noise(0.0, 0.0, 0.0, 0.0, 0.0), tracker=Tracker())
     noisy, exact = (
