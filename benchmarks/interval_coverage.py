@@ -5,10 +5,10 @@
 
 `widths`: sigma_x and sigma_y of maps with a known bump under independent errors, under fields with exponential
 correlation (drawn by the covariance's Cholesky factor, not by the model's cosines), of a bump that is no Gaussian (the
-truth is the nearest Gaussian, under the row's errors or by plain squares), and of scans by a simulated head, whose truth
-is what the same estimate says of the same scan without sensor and tracker errors (a size calibration's widths mean the
-same). The last row is the negative control: the model of independent errors without its inflation, on maps with a
-field.
+truth is the nearest Gaussian, under the row's errors or by plain squares), and of scans by a simulated head, whose
+truth is what the same estimate says of the same scan without sensor and tracker errors (a size calibration's widths
+mean the same). The last row is the negative control: the model of independent errors without its inflation, on maps
+with a field.
 
 `sizes`: the whole path. Each mass is scanned three times by the solid model, each scan mapped and sized, alone and
 pooled, with the shipped calibration. `population` draws bodies from the prior that the calibration was learned over,
