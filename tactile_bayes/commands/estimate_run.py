@@ -199,14 +199,20 @@ def size_priors(settings: Settings) -> SizePriors:
 def answer_of(tactile_map: TactileMap, estimate: Estimate, provenance: Provenance, settings: Settings) -> Answer:
     """The report of one map."""
     from tactile_bayes.files.prior_toml import read_prior
-    from tactile_bayes.report.estimate_document import estimate_document
+    from tactile_bayes.report.estimate_document import estimate_document, estimate_quantities
     from tactile_bayes.report.estimate_text import estimate_text
 
     prior = read_prior(settings.prior)
+    quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
     document = estimate_document(
-        estimate, tactile_map, probability=settings.interval, prior=prior, provenance=provenance
+        estimate,
+        tactile_map,
+        probability=settings.interval,
+        prior=prior,
+        provenance=provenance,
+        quantities=quantities,
     )
-    text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior)
+    text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     return Answer(document, text, exit_code, _shape(tactile_map, estimate))
 

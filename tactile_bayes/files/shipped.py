@@ -11,6 +11,11 @@ NONE: Final = "none"
 _FOLDER = Path(__file__).resolve().parents[1] / "calibrations"
 
 
+def is_shipped(path: Path) -> bool:
+    """Whether a file came with the program; the tests hold those against their schemas, once for all."""
+    return path.parent == _FOLDER
+
+
 def size_calibration_path(name: str) -> Path | None:
     """Where the calibration of a name or path is; None for ``none``.
 

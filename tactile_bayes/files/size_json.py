@@ -13,6 +13,7 @@ from tactile_bayes.files import size_quadratic_json as quadratic
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json, load_json
+from tactile_bayes.files.shipped import is_shipped
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.size_calibration import (
     COEFFICIENTS,
@@ -61,11 +62,12 @@ def read_size_calibration(path: Path) -> SizeCalibration | LogQuadratic:
     BadDataError
         When the file is not one, or a field breaks the schema.
     """
-    document = load_json(path)
-    if isinstance(document, dict) and document.get("form") == "log-quadratic":
-        check_document(document, quadratic.SCHEMA_FILE, path=path)
+    document: Any = load_json(path)
+    wanted = isinstance(document, dict) and document.get("form") == "log-quadratic"
+    if not is_shipped(path):
+        check_document(document, quadratic.SCHEMA_FILE if wanted else SCHEMA_FILE, path=path)
+    if wanted:
         return quadratic.parse_log_quadratic(document, path=path)
-    check_document(document, SCHEMA_FILE, path=path)
     return _eq6(document, path=path)
 
 

@@ -59,7 +59,11 @@ def summarise(draws: FloatArray, *, probability: float, effective_draws: float) 
     if not values.size:
         raise ValueError("no finite draws")
     tail = (1.0 - probability) / 2.0
-    low, median, high = np.quantile(values, [tail, 0.5, 1.0 - tail])
+    # an end's standard error is half the way between order statistics a binomial SD below and above (Maritz-Jarrett in
+    # spirit)
+    step = np.sqrt(tail * (1.0 - tail) / max(effective_draws, 1.0))
+    about = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
+    low, median, high, *ends = np.quantile(values, [tail, 0.5, 1.0 - tail, *about])
     return Quantity(
         median=float(median),
         mean=float(values.mean()),
@@ -67,13 +71,5 @@ def summarise(draws: FloatArray, *, probability: float, effective_draws: float) 
         low=float(low),
         high=float(high),
         probability=probability,
-        mc_error=_end_error(values, tail, effective_draws),
+        mc_error=float(max(ends[1] - ends[0], ends[3] - ends[2]) / 2.0),
     )
-
-
-def _end_error(values: FloatArray, tail: float, effective_draws: float) -> float:
-    """Standard error of a tail quantile from the spread of neighbouring order statistics (Maritz-Jarrett in spirit)."""
-    step = np.sqrt(tail * (1.0 - tail) / max(effective_draws, 1.0))
-    probabilities = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
-    ends = np.quantile(values, probabilities)
-    return float(max(ends[1] - ends[0], ends[3] - ends[2]) / 2.0)

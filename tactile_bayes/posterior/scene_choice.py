@@ -21,7 +21,6 @@ SECOND_ODDS = 10.0
 """For a second lump or a rib: a bump that is not quite a Gaussian must not bring one."""
 LEAST_RISE = 0.05
 """Of the bump's amplitude: beside 15 single simulated lumps the most was 0.01, beside a second one 0.08 and more."""
-MOST_LOOKED_AT = 48
 LONG = 1.5
 """A bump with a larger axis ratio is also tried as two round lumps side by side."""
 GRID_MM = 4.0
@@ -261,11 +260,10 @@ def _starts(
 ) -> tuple[list[FloatArray], float]:
     """Where to look for the mode with a second structure, and a bound on the log evidence gained there."""
     grid = second_lumps(plain, fitter) if extra == "second lump" else ribs(fitter)
-    gains = _gains(plain, grid, extra)
-    order = np.argsort(-gains)[:MOST_LOOKED_AT]
-    rising = order[_rises(plain, surroundings, extra, grid[order])]
-    starts = [np.concatenate([plain.mode, grid[i]]) for i in rising[:1]]
-    bound = float(gains[rising[0]]) if len(rising) else -np.inf
+    rising = grid[_rises(plain, surroundings, extra, grid)]
+    gains = _gains(plain, rising, extra)
+    best = int(np.argmax(gains))
+    starts, bound = [np.concatenate([plain.mode, one]) for one in rising[best : best + 1]], float(gains[best])
     if extra == "second lump" and (halves := _split(plain)) is not None:
         # two lumps that one long bump was laid over: no template beside that bump would find them
         return [*starts, halves], np.inf

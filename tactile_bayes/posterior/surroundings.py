@@ -13,15 +13,20 @@ from tactile_bayes.posterior.scene import Extra
 
 CLEAR_IN_WIDTHS = 2.0
 """Cells nearer to the bump than this many of its widths say nothing of what lies beside it."""
+STRIP_MM = 0.5
+LEAST_CELLS = 4.0
+"""Of a place's weight: with less of it on the map there is nothing to see."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """The smoothed map's excess over its level, everywhere the map has data.
+    """The smoothed map's excess over its level, not finite where the map has no data.
 
     Parameters
     ----------
-    x_mm, y_mm, excess : (k,) arrays
+    x_mm : (nx,) array
+    y_mm : (ny,) array
+    excess : (ny, nx) array
     """
 
     x_mm: FloatArray
@@ -31,9 +36,7 @@ class Surroundings:
     @classmethod
     def of(cls, tactile_map: TactileMap) -> Surroundings:
         """From a map."""
-        excess = smoothed_excess(tactile_map)
-        row, column = np.nonzero(np.isfinite(excess))
-        return cls(tactile_map.x_mm[column], tactile_map.y_mm[row], excess[row, column])
+        return cls(tactile_map.x_mm, tactile_map.y_mm, smoothed_excess(tactile_map))
 
     def rise(
         self,
@@ -55,17 +58,31 @@ class Surroundings:
         places : (g, 3) array
             As in `Scene`: ``x2, y2, w2`` or ``angle, offset, w2``; `middle` is the window's.
         """
-        away = np.hypot(self.x_mm - bump_mm[0], self.y_mm - bump_mm[1])
-        clear = away > CLEAR_IN_WIDTHS * bump_width_mm
-        x, y = self.x_mm[clear], self.y_mm[clear]
+        away = np.hypot(self.x_mm - bump_mm[0], (self.y_mm - bump_mm[1])[:, None])
+        clear = np.isfinite(self.excess) & (away > CLEAR_IN_WIDTHS * bump_width_mm)
         wide = bump_width_mm**2 + SMOOTHING_MM**2
-        bump = amplitude * bump_width_mm**2 / wide * np.exp(-0.5 * away[clear] ** 2 / wide)
-        excess = self.excess[clear] - bump
-        one, two, width = places[:, 0, None], places[:, 1, None], np.exp(places[:, 2, None])
-        if extra == "second lump":
-            square = (x - one) ** 2 + (y - two) ** 2
-        else:
-            square = (np.cos(one) * (x - middle[0]) + np.sin(one) * (y - middle[1]) - two) ** 2
-        weight = np.exp(-0.5 * square / width**2)
-        total = weight.sum(axis=1)
-        return np.where(total > 4.0, weight @ excess / np.maximum(total, 1e-300), -np.inf)
+        bump = amplitude * bump_width_mm**2 / wide * np.exp(-0.5 * away**2 / wide)
+        excess = np.where(clear, self.excess - bump, 0.0)
+        weigh = self._under_lumps if extra == "second lump" else self._under_ribs
+        number, total = weigh(places, np.stack([clear.astype(np.float64), excess]), middle)
+        return np.where(number > LEAST_CELLS, total / np.maximum(number, 1e-300), -np.inf)
+
+    def _under_lumps(self, places: FloatArray, values: FloatArray, _: tuple[float, float]) -> FloatArray:
+        """(2, g) sums of (2, ny, nx) values under round lumps: products of a profile along each axis."""
+        x, y, width = places[:, 0, None], places[:, 1, None], np.exp(places[:, 2, None])
+        columns = np.exp(-0.5 * ((self.x_mm - x) / width) ** 2)
+        rows = np.exp(-0.5 * ((self.y_mm - y) / width) ** 2)
+        return np.asarray(np.einsum("vgx,gx->vg", rows @ values, columns))
+
+    def _under_ribs(self, places: FloatArray, values: FloatArray, middle: tuple[float, float]) -> FloatArray:
+        """(2, g) sums of (2, ny, nx) values under ridges: those of one direction see the same strips of cells."""
+        found, flat = np.empty((2, len(places))), values.reshape(2, -1)
+        for angle in np.unique(places[:, 0]):
+            these = places[:, 0] == angle
+            along = np.cos(angle) * (self.x_mm - middle[0]) + np.sin(angle) * (self.y_mm[:, None] - middle[1])
+            strip = np.rint((along - along.min()) / STRIP_MM).astype(np.intp).ravel()
+            strips = np.stack([np.bincount(strip, one) for one in flat])
+            at = along.min() + STRIP_MM * np.arange(strips.shape[1])
+            near = (at - places[these, 1, None]) / np.exp(places[these, 2, None])
+            found[:, these] = strips @ np.exp(-0.5 * near**2).T
+        return found

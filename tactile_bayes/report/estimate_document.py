@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,11 @@ def estimate_document(
     probability: float,
     prior: BumpPrior,
     provenance: Provenance,
+    quantities: Mapping[str, Quantity] | None = None,
 ) -> dict[str, Any]:
-    """The JSON object of one map, see data_schema/estimate.schema.json."""
-    quantities = estimate_quantities(estimate, tactile_map, probability=probability)
+    """The JSON object of one map, see data_schema/estimate.schema.json; `quantities` where they are at hand."""
+    if quantities is None:
+        quantities = estimate_quantities(estimate, tactile_map, probability=probability)
 
     def one(name: str) -> dict[str, float | str] | None:
         return quantities[name].as_dict() if name in quantities else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
@@ -41,13 +42,22 @@ def decimals(mc_error: float, *, most: int = 3) -> int:
 
 
 def estimate_text(
-    estimate: Estimate, tactile_map: TactileMap, *, probability: float, prior: BumpPrior | None = None
+    estimate: Estimate,
+    tactile_map: TactileMap,
+    *,
+    probability: float,
+    prior: BumpPrior | None = None,
+    quantities: Mapping[str, Quantity] | None = None,
 ) -> str:
-    """The report of one map: what was found with its interval, where the uncertainty comes from, what was left out."""
+    """The report of one map: what was found with its interval, where the uncertainty comes from, what was left out.
+
+    `quantities` where they are at hand.
+    """
     if estimate.status == "no_estimate":
         advice = [f"What would help: {estimate.advice}."] if estimate.advice else []
         return "\n".join([f"No estimate: {estimate.reason}.", *advice, *_looked_at(estimate), RESEARCH_USE]) + "\n"
-    quantities = estimate_quantities(estimate, tactile_map, probability=probability)
+    if quantities is None:
+        quantities = estimate_quantities(estimate, tactile_map, probability=probability)
     lines = [_table(quantities, probability), ""]
     if estimate.reason:
         lines.append(f"No size: {estimate.reason}.")
@@ -56,7 +66,7 @@ def estimate_text(
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def _table(quantities: dict[str, Quantity], probability: float) -> str:
+def _table(quantities: Mapping[str, Quantity], probability: float) -> str:
     head = f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
     rows = [head]
     for name, label, unit in ROWS:

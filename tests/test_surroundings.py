@@ -1,0 +1,57 @@
+"""What rises beside a bump: sums by profiles and strips are those over the cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tactile_bayes.posterior.cells import SMOOTHING_MM
+from tactile_bayes.posterior.scene import Extra
+from tactile_bayes.posterior.surroundings import CLEAR_IN_WIDTHS, LEAST_CELLS, Surroundings
+
+BUMP = {"bump_mm": (1.0, -2.0), "bump_width_mm": 4.0, "amplitude": 0.3, "middle": (0.5, 0.5)}
+
+
+def surroundings() -> Surroundings:
+    rng = np.random.default_rng(3)
+    x, y = np.arange(-30.0, 31.0), np.arange(-25.0, 26.0)
+    excess = 0.1 * rng.standard_normal((len(y), len(x)))
+    excess[:4, :10] = -np.inf
+    return Surroundings(x, y, excess)
+
+
+def cell_by_cell(around: Surroundings, extra: Extra, place: tuple[float, float, float]) -> float:
+    total = number = 0.0
+    for j, y in enumerate(around.y_mm):
+        for i, x in enumerate(around.x_mm):
+            away = np.hypot(x - 1.0, y + 2.0)
+            if not np.isfinite(around.excess[j, i]) or away <= CLEAR_IN_WIDTHS * 4.0:
+                continue
+            wide = 4.0**2 + SMOOTHING_MM**2
+            left = around.excess[j, i] - 0.3 * 4.0**2 / wide * np.exp(-0.5 * away**2 / wide)
+            one, two, width = place[0], place[1], np.exp(place[2])
+            if extra == "second lump":
+                near = np.hypot(x - one, y - two) / width
+            else:
+                near = (np.cos(one) * (x - 0.5) + np.sin(one) * (y - 0.5) - two) / width
+            weight = np.exp(-0.5 * near**2)
+            number, total = number + weight, total + weight * left
+    return total / number if number > LEAST_CELLS else -np.inf
+
+
+@pytest.mark.parametrize(
+    ("extra", "places", "exact"),
+    [
+        ("second lump", [(15.0, 3.0, np.log(3.0)), (-12.0, -9.0, np.log(8.0)), (90.0, 90.0, np.log(3.0))], 1e-9),
+        ("rib", [(0.3, 16.0, np.log(5.0)), (0.3, -16.0, np.log(3.0)), (2.0, 80.0, np.log(3.0))], 2e-3),
+    ],
+)
+def test_a_rise_is_the_mean_over_the_cells(
+    extra: Extra, places: list[tuple[float, float, float]], exact: float
+) -> None:
+    around = surroundings()
+    found = around.rise(extra, np.array(places), **BUMP)
+    wanted = [cell_by_cell(around, extra, place) for place in places]
+    assert wanted[-1] == -np.inf
+    assert found == pytest.approx(wanted, abs=exact)
+    assert np.ptp(wanted[:2]) > 3e-3  # the places differ by more than they may be off
