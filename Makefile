@@ -52,7 +52,7 @@ bench-trial: $(VENV)/.installed
 # The size calibrations that come with the program, made again: an hour on two cores for the population's scans.
 calibrations: $(VENV)/.installed
 	mkdir -p build
-	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 80 --seed 7 --workers 2 \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 240 --seed 7 --workers 2 \
 		-o build/population.csv --force
 	$(BIN)/tactile-bayes calibrate size build/population.csv --form log-quadratic \
 		-o tactile_bayes/calibrations/solid.json --force

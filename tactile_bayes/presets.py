@@ -29,3 +29,6 @@ NORMALISE: Final = ("mean", "gain", "none")
 METHODS: Final = ("optimise", "laplace", "importance", "ensemble")
 NOISE: Final = ("independent", "field")
 INTERVAL: Final = 0.95
+# Along each axis, of a map's noise field. Fewer are faster; what is finer than they resolve counts as independent.
+FIELD_COSINES: Final = 18
+MOST_FIELD_COSINES: Final = 40

@@ -69,6 +69,18 @@ def test_without_a_word_the_shipped_calibration_is_used_and_named(folder: Path) 
     assert document["max_size_mm"]["median"] > 0
 
 
+def test_a_finer_noise_field_is_recorded_and_hardly_moves_a_clear_lump(folder: Path) -> None:
+    finer = json.loads(run_here("estimate", "mass1.nc", *FAST, "--field-cosines", "24", "--json", cwd=folder).stdout)
+    default = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)
+    settings = [one["provenance"]["settings"]["field_cosines"] for one in (default, finer)]
+    assert settings == [18, 24]
+    off = finer["sigma_x_mm"]["median"] - default["sigma_x_mm"]["median"]
+    assert 0 < abs(off) < 0.3 * default["sigma_x_mm"]["sd"]
+    refused = run_here("estimate", "mass1.nc", "--field-cosines", "5", cwd=folder)
+    assert refused.returncode == 2
+    assert "--field-cosines" in refused.stderr
+
+
 def test_none_gives_widths_and_a_map_made_otherwise_says_why_it_has_no_size(folder: Path) -> None:
     done = run_here("estimate", "mass1.nc", *FAST, "--size-calibration", "none", cwd=folder)
     assert "largest size" not in done.stdout

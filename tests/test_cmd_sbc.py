@@ -14,10 +14,11 @@ from tactile_bayes.posterior.sbc import PARAMETERS, MapRanks, Truth
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
 
 
-def quick(index: int, *, method: str, seed: int) -> MapRanks:
+def quick(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
     """In place of a simulated map: ranks as calibrated as can be; every tenth map gives none."""
     if index % 10 == 9:
         return MapRanks(index, TRUTH, None, "undetected")
+    del cosines
     return MapRanks(index, TRUTH, tuple((index * 37 + k * 11 + seed) % 100 for k in range(5)), method)
 
 
@@ -43,11 +44,11 @@ def test_six_maps(tmp_path: Path) -> None:
 def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, monkeypatch) -> None:
     calls: list[int] = []
 
-    def stopping(index: int, *, method: str, seed: int) -> MapRanks:
+    def stopping(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
         calls.append(index)
         if index == 3 and calls.count(3) == 1:
             raise KeyboardInterrupt
-        return quick(index, method=method, seed=seed)
+        return quick(index, method=method, seed=seed, cosines=cosines)
 
     monkeypatch.setattr(command, "ranks_of_map", stopping)
     words = ("sbc", "--maps", 12, "-o", "s.csv")
@@ -77,8 +78,8 @@ def test_findings_as_data(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_a_posterior_that_fails_is_said_to_fail_and_the_exit_code_stays(tmp_path: Path, monkeypatch) -> None:
-    def narrow(index: int, *, method: str, seed: int) -> MapRanks:
-        del seed
+    def narrow(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
+        del seed, cosines
         end = (0, 99)[index % 2]
         return MapRanks(index, TRUTH, (index, end, index, index, index), method)
 
@@ -99,10 +100,10 @@ def test_maps_that_all_abstain_leave_nothing_to_rank(tmp_path: Path, monkeypatch
 
 
 def test_a_map_that_fails_is_named_and_the_others_count(tmp_path: Path, monkeypatch) -> None:
-    def failing(index: int, *, method: str, seed: int) -> MapRanks:
+    def failing(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
         if index == 1:
             raise ValueError("no such thing")
-        return quick(index, method=method, seed=seed)
+        return quick(index, method=method, seed=seed, cosines=cosines)
 
     monkeypatch.setattr(command, "ranks_of_map", failing)
     done = run_here("sbc", "--maps", 3, "-o", "s.csv", cwd=tmp_path)

@@ -35,6 +35,7 @@ def report() -> Tradeoff:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tradeoff, "STEPS", (150,))
         patch.setattr(tradeoff, "REFERENCE_POINTS", 4096)
+        patch.setattr(tradeoff, "FIELDS", (8, 18, 24))
         found = measure(
             bump_map(noise=errors()), radius_mm=20.0, prior=BumpPrior(), clock=lambda: float(next(ticks)), runs=2
         )
@@ -53,6 +54,12 @@ def test_every_method_is_measured() -> None:
     assert by["laplace", ""].error_sd < 0.3
     # least squares with judged errors is another model: it is not the field's posterior
     assert by["optimise", ""].error_sd > 2 * fine.error_sd
+
+
+def test_finer_noise_fields_move_the_ends_less_and_less() -> None:
+    coarse, default, finest = report().fields
+    assert coarse.change_sd > 0.3 > default.change_sd > finest.change_sd == 0.0
+    assert coarse.change_mm == pytest.approx(coarse.change_sd * np.mean(report().sd_mm), rel=0.5)
 
 
 def test_errors_in_mm_are_those_in_sd_times_the_sd() -> None:

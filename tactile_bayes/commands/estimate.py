@@ -11,7 +11,7 @@ import click
 
 from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
-from tactile_bayes.presets import INTERVAL, METHODS, NOISE
+from tactile_bayes.presets import FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
@@ -81,6 +81,14 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
     "As the calibration's, if not given.",
 )
 @click.option(
+    "--field-cosines",
+    type=click.IntRange(min=6, max=MOST_FIELD_COSINES),
+    default=FIELD_COSINES,
+    show_default=True,
+    help="Of the noise field along each axis: more are slower and see finer correlation; `tradeoff estimate` measures "
+    "what they change.",
+)
+@click.option(
     "--accuracy-sd",
     type=click.FloatRange(min=0.001, max=0.5),
     help="Monte-Carlo error of interval ends, in posterior SDs; if not given, 0.02 for importance, 0.1 for the "
@@ -131,6 +139,7 @@ def command(
     centre_mm: tuple[float, float] | None,
     max_steps: int | None,
     noise: str | None,
+    field_cosines: int,
     accuracy_sd: float | None,
     accuracy_mm: float | None,
     scene: str,
@@ -170,6 +179,7 @@ def command(
         accuracy_mm,
         prior,
         checkpoint,
+        field_cosines,
     )
     if checkpoint is not None and len(maps) > 1:
         raise UsageError("--checkpoint takes one map at a time")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
-from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
@@ -42,6 +42,7 @@ class Settings:
     accuracy_mm: float | None = None
     prior: Path | None = None
     checkpoint: Path | None = None
+    field_cosines: int = FIELD_COSINES
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +107,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         "rotation": settings.rotation,
         "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
         "noise": options.fit.noise,
+        "field_cosines": options.fit.field_cosines,
         "accuracy_sd": settings.accuracy_sd,
         "accuracy_mm": settings.accuracy_mm,
         "scene": settings.scene,
@@ -169,7 +171,7 @@ def _options(settings: Settings, calibration: SizeCalibration | LogQuadratic | N
     printed = "free" if noise == "field" else "fixed"
     background = settings.background or (calibration.recipe.background if calibration else printed)
     radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
-    fit = FitOptions(background, radius, settings.rotation, settings.centre_mm, noise)
+    fit = FitOptions(background, radius, settings.rotation, settings.centre_mm, noise, None, settings.field_cosines)
     return EstimateOptions(
         method=settings.method,
         fit=fit,

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.presets import FIELD_COSINES, MOST_FIELD_COSINES
+
 if TYPE_CHECKING:
     from tactile_bayes.batch import BatchStore, Outcome
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
@@ -27,6 +29,13 @@ _FILE = click.Path(path_type=Path)
     show_default=True,
     help="How the posterior is drawn from, as in `estimate`.",
 )
+@click.option(
+    "--field-cosines",
+    type=click.IntRange(min=6, max=MOST_FIELD_COSINES),
+    default=FIELD_COSINES,
+    show_default=True,
+    help="As of `estimate`.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
 @click.option("--scheduler", metavar="ADDR", help="Send the maps to a dask scheduler (extra [cluster]).")
@@ -39,6 +48,7 @@ _FILE = click.Path(path_type=Path)
 def command(
     maps: int,
     method: str,
+    field_cosines: int,
     seed: int,
     workers: int,
     scheduler: str | None,
@@ -68,7 +78,7 @@ def command(
         if path is not None:
             refuse_existing(path, force=force)
     begun = monotonic()
-    outcomes, made = _run(maps, method, seed, workers=workers, scheduler=scheduler, output=output)
+    outcomes, made = _run(maps, method, seed, field_cosines, workers=workers, scheduler=scheduler, output=output)
     speed = made / (monotonic() - begun) if made else None
     found = [outcome.value for outcome in outcomes if outcome.value is not None]
     if output is not None:
@@ -76,12 +86,12 @@ def command(
     if figure is not None:
         sbc_figure(found, figure, force=force)
     _finish(outcomes, output)
-    document = sbc_document(found, method=method, seed=seed, maps_per_s=speed)
+    document = sbc_document(found, method=method, seed=seed, maps_per_s=speed, cosines=field_cosines)
     click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
 
 
 def _run(
-    maps: int, method: str, seed: int, *, workers: int, scheduler: str | None, output: Path | None
+    maps: int, method: str, seed: int, cosines: int, *, workers: int, scheduler: str | None, output: Path | None
 ) -> tuple[list[Outcome[MapRanks]], int]:
     """Every map's outcome, and how many of them this run made."""
     from functools import partial
@@ -93,12 +103,12 @@ def _run(
 
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
-        _open_kept(output, settings(method, seed, size=DEFAULT)) as store,
+        _open_kept(output, settings(method, seed, size=DEFAULT, cosines=cosines)) as store,
         progress_bar("maps") as progress,
     ):
         had = 0 if store is None else len(store.values)
         outcomes = run_batch(
-            partial(ranks_of_map, method=method, seed=seed),
+            partial(ranks_of_map, method=method, seed=seed, cosines=cosines),
             range(maps),
             key=str,
             executor=executor,
@@ -108,11 +118,11 @@ def _run(
     return outcomes, max(maps - had, 0)
 
 
-def ranks_of_map(index: int, *, method: str, seed: int) -> MapRanks:
+def ranks_of_map(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
     """The ranks of one map, in whichever process."""
     from tactile_bayes.posterior import sbc
 
-    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped())
+    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped(), cosines=cosines)
 
 
 @cache

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import FIELD_COSINES
 
-COSINES = 18
 MARGIN = 1.3
 """Width of the rectangle in widths of the window: the field need not be flat where the window ends."""
 LENGTHS_MM = (1.5, 3.0, 6.0, 12.0)
@@ -61,7 +61,7 @@ class Whitening:
         return np.asarray(np.log1p(np.asarray(share)[..., None] * self.eigenvalues).sum(axis=-1))
 
 
-def cosine_profiles(axis_mm: FloatArray, *, cosines: int = COSINES) -> tuple[FloatArray, FloatArray]:
+def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tuple[FloatArray, FloatArray]:
     """Cosines along one axis, and their squared angular frequencies.
 
     Returns
@@ -83,7 +83,9 @@ def _phase(axis_mm: FloatArray) -> tuple[FloatArray, float]:
     return (axis_mm - middle) / side + 0.5, side
 
 
-def gram_of_cosines(x_mm: FloatArray, y_mm: FloatArray, *, weight: FloatArray, cosines: int = COSINES) -> FloatArray:
+def gram_of_cosines(
+    x_mm: FloatArray, y_mm: FloatArray, *, weight: FloatArray, cosines: int = FIELD_COSINES
+) -> FloatArray:
     """Inner products of the plane's cosines under (ny, nx) weights: (cosines^2, cosines^2), y's order counted first.
 
     A product of two cosines is half the sum of the cosines of the sum and the difference: all products come from the

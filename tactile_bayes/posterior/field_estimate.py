@@ -20,6 +20,7 @@ from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.scene_choice import SceneChoice, add_beside, choose_shape
 from tactile_bayes.posterior.solved import Solved
 from tactile_bayes.posterior.surroundings import Surroundings
+from tactile_bayes.presets import FIELD_COSINES
 
 Progress = Callable[[int, int], None]
 
@@ -57,6 +58,7 @@ def look(
     radius_mm: float,
     scene: str = "auto",
     least_odds: float,
+    cosines: int = FIELD_COSINES,
 ) -> FieldAnswer:
     """Fit the bump under correlated errors and weigh it against none.
 
@@ -66,7 +68,7 @@ def look(
         When the density has no mode.
     """
     choice = choose_shape(
-        field_window(fit),
+        field_window(fit, cosines=cosines),
         start_vector(fit, Scene("rotated")),
         prior=prior,
         radius_mm=radius_mm,

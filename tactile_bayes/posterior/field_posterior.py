@@ -17,6 +17,7 @@ from tactile_bayes.posterior.laplace import mode_and_covariance
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.target import finite_differences, stencil
 from tactile_bayes.posterior.window import Window
+from tactile_bayes.presets import FIELD_COSINES
 
 MOST_SETTLINGS = 6
 LEAST_SHARE = 1e-2
@@ -104,9 +105,9 @@ class FieldFit:
         return float(np.sqrt(self.covariance[i, i]))
 
 
-def field_window(least_squares: BumpFit) -> Window:
+def field_window(least_squares: BumpFit, *, cosines: int = FIELD_COSINES) -> Window:
     """The window of a least-squares bump."""
-    return Window(least_squares.cells, independent_variance(least_squares.cells))
+    return Window(least_squares.cells, independent_variance(least_squares.cells), cosines=cosines)
 
 
 def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:

@@ -45,6 +45,7 @@ from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
 from tactile_bayes.posterior.rank_tests import RankTest, rank_test, uniform_strays
 from tactile_bayes.posterior.roundness import ShapePrior
 from tactile_bayes.posterior.window import cell_mean_profile
+from tactile_bayes.presets import FIELD_COSINES
 
 HALF_MM = 25.0
 CELL_MM = 1.0
@@ -113,7 +114,7 @@ class MapRanks:
     probability: float | None = None
 
 
-def settings(method: str, seed: int, *, size: str = "") -> dict[str, object]:
+def settings(method: str, seed: int, *, size: str = "", cosines: int = FIELD_COSINES) -> dict[str, object]:
     """All that the ranks of a map depend on besides its number."""
     return {
         "method": method,
@@ -125,11 +126,14 @@ def settings(method: str, seed: int, *, size: str = "") -> dict[str, object]:
         "lengths_mm": list(LENGTHS_MM),
         "shares": list(SHARES),
         "field": "exponential",
+        "field_cosines": cosines,
         **BumpPrior().as_dict(),
     }
 
 
-def ranks_of_map(index: int, *, method: str, seed: int, calibration: LogQuadratic | None = None) -> MapRanks:
+def ranks_of_map(
+    index: int, *, method: str, seed: int, calibration: LogQuadratic | None = None, cosines: int = FIELD_COSINES
+) -> MapRanks:
     """Draw one map from the prior, estimate it and rank its truth: all random numbers come from seed and index.
 
     Without a size calibration the size is not ranked.
@@ -137,7 +141,7 @@ def ranks_of_map(index: int, *, method: str, seed: int, calibration: LogQuadrati
     rng = np.random.default_rng([seed, index])
     prior = BumpPrior()
     truth = draw_truth(rng, prior)
-    fit = FitOptions("free", RADIUS_MM, "off", None, "field")
+    fit = FitOptions("free", RADIUS_MM, "off", None, "field", field_cosines=cosines)
     options = EstimateOptions(method=method, fit=fit, prior=prior)
     found = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
     if found.map_posterior is None or found.draws is None or found.detection is None:

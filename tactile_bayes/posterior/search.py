@@ -117,6 +117,7 @@ def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> De
             radius_mm=options.fit.radius_mm,
             scene=scene_asked(options),
             least_odds=ROTATION_ODDS,
+            cosines=options.fit.field_cosines,
         )
     except NotConvergedError:
         # no mode: under these errors nothing stands out that could be weighed

@@ -20,12 +20,15 @@ from tactile_bayes.posterior.methods import Sampled, importance_draws
 from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.scene_choice import LEAST_ODDS, add_beside
 from tactile_bayes.posterior.surroundings import Surroundings
+from tactile_bayes.presets import FIELD_COSINES
 
 ENDS = (0.025, 0.975)
 REFERENCE_POINTS = 16384
 """Points of each of the reference's replicates."""
 ACCURACIES_SD = (0.05, 0.02, 0.01, 0.005)
 STEPS = (150, 600, 2400)
+FIELDS = (12, FIELD_COSINES, 24, 30)
+FIELD_ACCURACY_SD = 0.01
 Clock = Callable[[], float]
 Progress = Callable[[int, int], None]
 
@@ -74,6 +77,8 @@ class Tradeoff:
         Posterior SDs of sigma_x and sigma_y.
     runs
         Runs that errors and times are means of.
+    fields
+        Noise fields from coarse to fine.
     """
 
     measured: tuple[Measured, ...]
@@ -81,6 +86,7 @@ class Tradeoff:
     search_cpu_s: float
     sd_mm: tuple[float, float]
     runs: int
+    fields: tuple[FieldRow, ...] = ()
 
     def advised(self, tolerance_sd: float) -> Measured | None:
         """The cheapest within a tolerance; None where there is none."""
@@ -104,7 +110,9 @@ class MapCase:
     fit: FieldFit
 
 
-def map_case(tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior) -> MapCase | str:
+def map_case(
+    tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior, cosines: int = FIELD_COSINES
+) -> MapCase | str:
     """The highest bump's fits, or why there is none."""
     free = FitOptions("free", radius_mm, "off", None, "field")
     search = replace(free, background="fixed") if tactile_map.background is not None else free
@@ -114,8 +122,59 @@ def map_case(tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior) -> 
     found = candidates[-1]
     if found.fault or found.fit is None:
         return f"no bump can be measured: {found.fault}"
-    answer = look(tactile_map, found.fit, prior=prior, radius_mm=radius_mm, least_odds=LEAST_ODDS)
+    answer = look(tactile_map, found.fit, prior=prior, radius_mm=radius_mm, least_odds=LEAST_ODDS, cosines=cosines)
     return MapCase(found.fit, add_beside(answer.choice, Surroundings.of(tactile_map)).fit)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldRow:
+    """A noise field of so many cosines along each axis.
+
+    Parameters
+    ----------
+    cosines
+        Of `FitOptions.field_cosines`.
+    cpu_s
+        From the map to the draws.
+    change_sd, change_mm
+        Root mean square over the four ends of the 95 % intervals of the widths, against the finest field: of ln sigma
+        in its posterior SDs, of sigma in mm.
+    """
+
+    cosines: int
+    cpu_s: float
+    change_sd: float
+    change_mm: float
+
+
+def field_ladder(
+    tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior, clock: Clock, seed: int = 1
+) -> tuple[FieldRow, ...]:
+    """The same map under noise fields from coarse to fine; empty where one of them shows no bump to draw."""
+    spent, widths = [], []
+    for cosines in FIELDS:
+        begun = clock()
+        case = map_case(tactile_map, radius_mm=radius_mm, prior=prior, cosines=cosines)
+        if isinstance(case, str):
+            return ()
+        density, rng = Sampled.of(case.fit), np.random.default_rng([seed, 3])
+        try:
+            draws = density.finished(importance_draws(density, rng=rng, accuracy_sd=FIELD_ACCURACY_SD), rng)
+        except NotConvergedError:
+            return ()
+        spent.append(clock() - begun)
+        widths.append(_widths(case.fit, draws))
+    ends = [np.quantile(one, ENDS, axis=1) for one in widths]
+    log_sd = np.log(widths[-1]).std(axis=1)
+    return tuple(
+        FieldRow(
+            cosines,
+            cpu_s,
+            float(np.sqrt(np.mean(((np.log(one) - np.log(ends[-1])) / log_sd) ** 2))),
+            float(np.sqrt(np.mean((one - ends[-1]) ** 2))),
+        )
+        for cosines, cpu_s, one in zip(FIELDS, spent, ends, strict=True)
+    )
 
 
 def measure(
@@ -156,7 +215,9 @@ def measure(
         if progress is not None:
             progress(number + 1, len(ladder))
     sd = np.std(truth, axis=1)
-    return Tradeoff(tuple(found), long.diagnostics["end_error_sd"], search_s, (float(sd[0]), float(sd[1])), runs)
+    fields = field_ladder(tactile_map, radius_mm=radius_mm, prior=prior, clock=clock, seed=seed)
+    error_sd, sd_mm = long.diagnostics["end_error_sd"], (float(sd[0]), float(sd[1]))
+    return Tradeoff(tuple(found), error_sd, search_s, sd_mm, runs, fields)
 
 
 Run = Callable[[np.random.Generator], tuple[FloatArray, float]]

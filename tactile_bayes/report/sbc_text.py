@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_bayes.posterior.rank_tests import BAND, RankTest, ecdf_band, ecdf_counts
 from tactile_bayes.posterior.sbc import DRAWS, RANKED, MapRanks, Truth, other_rises, rank_tests
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.presets import FIELD_COSINES, RESEARCH_USE
 
 SCHEMA = "tactile-bayes/sbc/1"
 _COLOURS = ("#1f3b73", "#c8641e")
@@ -22,7 +22,9 @@ SHIFT = 3.0
 """Standard errors of the mean rank beyond which a posterior is called too low or too high."""
 
 
-def sbc_document(maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None) -> dict[str, Any]:
+def sbc_document(
+    maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: int = FIELD_COSINES
+) -> dict[str, Any]:
     """Everything found, as data.
 
     Parameters
@@ -35,6 +37,7 @@ def sbc_document(maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s
     return {
         "schema": SCHEMA,
         "method": method,
+        "field_cosines": cosines,
         "seed": seed,
         "maps": len(maps),
         "ranked": len(ranked),
@@ -74,7 +77,7 @@ def sbc_text(document: dict[str, Any]) -> str:
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     speed = document["maps_per_s"]
     rate = "" if speed is None else f", {speed:.3g} maps/s"
-    made = f"method {document['method']}, seed {document['seed']}"
+    made = f"method {document['method']}, {document['field_cosines']} cosines, seed {document['seed']}"
     yield f"{document['maps']} maps from the model's own prior, {made}{rate}"
     others = document["elsewhere"]
     abstained = document["maps"] - document["ranked"] - others["number"]

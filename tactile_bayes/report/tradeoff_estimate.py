@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.posterior.tradeoff import Measured, Tradeoff
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.posterior.tradeoff import FIELD_ACCURACY_SD, Measured, Tradeoff
+from tactile_bayes.presets import FIELD_COSINES, RESEARCH_USE
 
 SCHEMA = "tactile-bayes/tradeoff-estimate/1"
 _MARKS = {"optimise": "s", "laplace": "^", "importance": "o", "ensemble": "D"}
@@ -19,6 +19,7 @@ def tradeoff_text(found: Tradeoff, *, tolerance_sd: float) -> str:
     """The table and one line of advice."""
     head = f"{'method':<12}{'setting':<20}{'CPU s':>8}{'evaluations':>13}{'error, SD':>11}{'error, mm':>11}"
     rows = [_row(one) for one in found.measured]
+    rows += ["", *_field_rows(found)] if found.fields else []
     notes = [
         f"Errors of the ends of 95 % intervals of the widths, root mean square of {found.runs} runs, against a "
         f"reference good to {found.reference_error_sd:.3f} SD.",
@@ -35,6 +36,21 @@ def _row(one: Measured) -> str:
         return f"{one.method:<12}{one.setting:<20}  {one.failed}"
     count = f"{one.evaluations:.0f}" if one.evaluations else "-"
     return f"{one.method:<12}{one.setting:<20}{one.cpu_s:>8.3f}{count:>13}{one.error_sd:>11.3f}{one.error_mm:>11.4f}"
+
+
+def _field_rows(found: Tradeoff) -> list[str]:
+    """What a finer noise field costs, and what it moves."""
+    finest = found.fields[-1].cosines
+    head = f"{'noise field':<32}{'CPU s':>8}{'':>13}{'moved, SD':>11}{'moved, mm':>11}"
+    rows = [
+        f"{f'--field-cosines {one.cosines}':<32}{one.cpu_s:>8.3f}{'':>13}{one.change_sd:>11.3f}{one.change_mm:>11.4f}"
+        for one in found.fields
+    ]
+    note = (
+        f"Whole estimates by importance; the same ends, against those of {finest} cosines (Monte-Carlo error "
+        f"{FIELD_ACCURACY_SD:g} SD). {FIELD_COSINES} are the default."
+    )
+    return [head, *rows, note]
 
 
 def advice(found: Tradeoff, *, tolerance_sd: float) -> str:
@@ -68,6 +84,15 @@ def tradeoff_document(found: Tradeoff, *, tolerance_sd: float) -> dict[str, Any]
                 "failed": one.failed,
             }
             for one in found.measured
+        ],
+        "fields": [
+            {
+                "cosines": one.cosines,
+                "cpu_s": _plain(one.cpu_s),
+                "change_sd": _plain(one.change_sd),
+                "change_mm": _plain(one.change_mm),
+            }
+            for one in found.fields
         ],
         "advice": advice(found, tolerance_sd=tolerance_sd),
         "research_use": RESEARCH_USE,
