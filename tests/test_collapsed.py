@@ -244,3 +244,22 @@ def test_intervals_cover_within_85_to_95_percent(errors: dict[str, float]) -> No
     # the goal with three binomial SDs of 400 maps (0.015 each)
     assert found.min() >= 0.85 - 0.045
     assert found.max() <= 0.95 + 0.045
+
+
+def test_a_template_that_the_window_hardly_has_changes_nothing_and_overflows_nothing() -> None:
+    """Its amplitude keeps its prior, so the evidence is as without it; wholly beyond the window it is no rise."""
+    target = target_of(cells_of(noise(2)), scene=STRAIGHT)
+    offsets = np.array([20.0, 30.0, 35.0, *np.arange(40.0, 130.0, 0.25), 5000.0])
+    templates = target.window.ridges(0.0 * offsets, offsets, log_width=np.full(len(offsets), np.log(3.0)))
+    with np.errstate(all="raise", under="ignore"):
+        gains = target.gains(templates, TURNED.carried(START, STRAIGHT))
+    assert gains[0] < -1.0  # a ridge on the window that is not there costs evidence
+    assert np.all((np.abs(gains[1:]) < 0.5) | (gains[1:] == -np.inf))
+    assert abs(gains[2]) < 0.1
+    assert gains[-1] == -np.inf
+
+
+def test_a_draw_without_evidence_takes_the_first_field_quietly() -> None:
+    evidence = np.array([[-np.inf, -np.inf], [-1e300, 0.0]])
+    with np.errstate(all="raise", under="ignore"):
+        assert collapsed.choose(evidence, np.random.default_rng(1)).tolist() == [0, 1]

@@ -336,8 +336,9 @@ def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
 
 
 def choose(evidence: FloatArray, rng: np.random.Generator) -> IntArray:
-    """(m,) one field for each draw, with its share of the evidence."""
-    weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+    """(m,) one field for each draw, with its share of the evidence; the first where a draw has none."""
+    best = evidence.max(axis=1, keepdims=True)
+    weight = np.exp(evidence - np.where(np.isfinite(best), best, 0.0))
     edges = np.cumsum(weight, axis=1)
     uniform = rng.uniform(size=len(evidence)) * edges[:, -1]
     return np.asarray((edges < uniform[:, None]).sum(axis=1))

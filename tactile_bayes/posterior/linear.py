@@ -15,6 +15,9 @@ FLOOR = 1e-9
 """Share of the data's sum of squares that is noise in any case: 3e-5 of the signal, less than any sensor's steps.
 Without it a map free of noise leaves differences of large sums, which are rounding."""
 
+LEAST_POWER = 1e-9
+"""Of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearSolution:
@@ -132,8 +135,10 @@ def solve(
         shared = (low[i] * low[j]) @ columns.weight
         return np.asarray(product[:, None] - shared - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
 
-    diagonal = [np.maximum(power(i, i, one.square), 1e-300) for i, one in enumerate(projected)]
     rest, floor = columns.rest(), columns.floor
+    # a template that the window hardly has, beyond its rim or between its cells, leaves the prior as it is
+    least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / amplitude_sd**2
+    diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(projected)]
     if cross is None:
         found = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=amplitude_sd)
     else:
