@@ -28,6 +28,7 @@ LEAST_COVERED_SHARE = 0.6
 LEAST_WIDTH_IN_CELLS = 0.5
 WIDEST_IN_RADII = 0.75
 MOST_AXIS_RATIO = 4.0
+CLOSE_IN_RADII = 0.6
 FIT_TOLERANCE = 1e-8
 """Of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 
@@ -203,6 +204,22 @@ def fit_bump(
     share = covered_share(tactile_map, centre, radius_mm=1.5 * float(max(sigma_x, sigma_y)))
     result = BumpFit(bump, cells, weight, fit, errors, covariance, share)
     return result, lump_fault(result, options)
+
+
+def fit_close(
+    tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: FitOptions
+) -> tuple[BumpFit | None, str]:
+    """Where to begin beside something that pulls the bump away: least squares in a window of `CLOSE_IN_RADII`.
+
+    The ellipse may turn, so that a ridge shows as one. The cells are those of the whole window: under a noise field
+    least squares is only a start.
+    """
+    near = replace(options, radius_mm=CLOSE_IN_RADII * options.radius_mm, rotation="on")
+    fit, fault = fit_bump(tactile_map, centre_mm, options=near)
+    if fit is None or fault:
+        return None, fault
+    centre = (float(fit.theta[1]), float(fit.theta[2]))
+    return replace(fit, cells=window_cells(tactile_map, centre, radius_mm=options.radius_mm)), ""
 
 
 def _bump(tactile_map: TactileMap, options: FitOptions, *, rotated: bool) -> Bump:

@@ -18,6 +18,7 @@ from tactile_bayes.posterior.fit import (
     BumpFit,
     Candidate,
     FitOptions,
+    fit_close,
     fitted_candidates,
 )
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 WIDE_IN_RADII = 0.4
 ENCLOSED_IN_WIDTHS = 1.2
 """How far the map must reach on every side of a bump wide for its window: a rise to the edge looks like half."""
+OUTGROWN = "wider than the window"
 MOST_LOOKS = 3
 """Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
 ROTATION_ODDS = 3.0
@@ -65,9 +67,38 @@ def search(
         if looks == MOST_LOOKS:
             break
         tried[-1] = replace(candidate, fault=f"no lump by the evidence (probability {probability:.2g})")
+    if options.fit.noise == "field":
+        close = _close_search(tactile_map, tried, options)
+        if close is not None:
+            return close
     if first is None:
         return tuple(tried), None
     return (*(one for one in tried if one.centre_mm != first[0].centre_mm), first[0]), first[1]
+
+
+def _close_search(
+    tactile_map: TactileMap, tried: list[Candidate], options: EstimateOptions
+) -> tuple[tuple[Candidate, ...], FieldAnswer] | None:
+    """A second look, from close by, at the highest places from which the fit ran away; None where none is a lump.
+
+    Beside a rib least squares grows over both. The posterior has errors that can be a rib, and asks for one after.
+    """
+    looks = 0
+    for i, candidate in enumerate(tried):
+        if candidate.fault and (candidate.fit is None or candidate.fault.startswith(OUTGROWN)):
+            fit, fault = fit_close(tactile_map, candidate.centre_mm, options=_search_options(tactile_map, options.fit))
+            if fit is None or fault:
+                continue
+            seen = _look(tactile_map, fit, options)
+            if isinstance(seen, Detection) or _field_fault(tactile_map, seen):
+                continue
+            if seen.detection.probability >= options.least_probability:
+                others = (one for j, one in enumerate(tried) if j != i)
+                return (*others, replace(candidate, fit=fit, fault="")), seen
+            looks += 1
+            if looks == MOST_LOOKS:
+                break
+    return None
 
 
 def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
