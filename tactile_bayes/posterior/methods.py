@@ -293,6 +293,7 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
         "scale": target.amplitude_scale,
         "bounds": [target.widest_mm, target.radius_mm],
         "fields": target.chosen_fields(),
+        "cosines": target.window.cosines,
         "settings": settings,
         "rng": str(rng.bit_generator.state),
     }

@@ -15,6 +15,7 @@ from tactile_bayes.posterior.detection import Detection, detect
 from tactile_bayes.posterior.fit import (
     LEAST_COVERED_SHARE,
     LEAST_WIDTH_IN_CELLS,
+    OUTGROWN,
     BumpFit,
     Candidate,
     FitOptions,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 WIDE_IN_RADII = 0.4
 ENCLOSED_IN_WIDTHS = 1.2
 """How far the map must reach on every side of a bump wide for its window: a rise to the edge looks like half."""
-OUTGROWN = "wider than the window"
 MOST_LOOKS = 3
 """Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
 ROTATION_ODDS = 3.0

@@ -154,11 +154,11 @@ def field_ladder(
     spent, widths = [], []
     for cosines in FIELDS:
         begun = clock()
-        case = map_case(tactile_map, radius_mm=radius_mm, prior=prior, cosines=cosines)
-        if isinstance(case, str):
-            return ()
-        density, rng = Sampled.of(case.fit), np.random.default_rng([seed, 3])
         try:
+            case = map_case(tactile_map, radius_mm=radius_mm, prior=prior, cosines=cosines)
+            if isinstance(case, str):
+                return ()
+            density, rng = Sampled.of(case.fit), np.random.default_rng([seed, 3])
             draws = density.finished(importance_draws(density, rng=rng, accuracy_sd=FIELD_ACCURACY_SD), rng)
         except NotConvergedError:
             return ()

@@ -70,7 +70,7 @@ class Window:
     """
 
     def __init__(self, cells: FitCells, variance: FloatArray, *, cosines: int = FIELD_COSINES) -> None:
-        self.cells, self.variance, self._cosines = cells, variance, cosines
+        self.cells, self.variance, self.cosines = cells, variance, cosines
         self.x_mm, self._column = np.unique(cells.x_mm, return_inverse=True)
         self.y_mm, self._row = np.unique(cells.y_mm, return_inverse=True)
         self.weight = self.on_grid(1.0 / variance)
@@ -91,7 +91,7 @@ class Window:
         """The noise field of one correlation length."""
         if length_mm not in self._fields:
             if self._gram is None:
-                self._gram = gram_of_cosines(self.x_mm, self.y_mm, weight=self.weight, cosines=self._cosines)
+                self._gram = gram_of_cosines(self.x_mm, self.y_mm, weight=self.weight, cosines=self.cosines)
             frequency2 = (self._frequency_y[:, None] + self._frequency_x[None, :]).ravel()
             self._fields[length_mm] = whitening(self._gram, frequency2, length_mm=length_mm)
         return self._fields[length_mm]
@@ -104,7 +104,7 @@ class Window:
         assert rows is not None
         assert columns is not None
         m, c = len(rows), len(plain)
-        half = (columns @ self._weighted_across).reshape(m, len(self.y_mm), self._cosines)
+        half = (columns @ self._weighted_across).reshape(m, len(self.y_mm), self.cosines)
         low = np.matmul(self._along.T, half * rows[:, :, None]).reshape(m, -1)
         beside = (columns @ plain.transpose(2, 1, 0).reshape(len(self.x_mm), -1)).reshape(m, -1, c)
         with_plain = np.matmul(rows[:, None, :], beside)[:, 0]
@@ -114,7 +114,7 @@ class Window:
     def _project_grid(self, grid: FloatArray, plain: FloatArray) -> Projected:
         m = len(grid)
         weighted = grid * self.weight
-        half = (weighted.reshape(-1, len(self.x_mm)) @ self._across).reshape(m, len(self.y_mm), self._cosines)
+        half = (weighted.reshape(-1, len(self.x_mm)) @ self._across).reshape(m, len(self.y_mm), self.cosines)
         low = np.matmul(self._along.T, half).reshape(m, -1)
         with_plain = grid.reshape(m, -1) @ plain.reshape(len(plain), -1).T
         return Projected(low, with_plain, np.einsum("mrc,mrc->m", weighted, grid))
