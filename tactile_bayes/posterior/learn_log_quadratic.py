@@ -242,8 +242,7 @@ def _figures(table: PopulationTable, data: _Regression, mode: FloatArray) -> dic
 
 def _held(data: _Regression, mode: FloatArray, error: FloatArray) -> float:
     """Share of the bodies left out whose size lies in the interval of `HELD` by the spreads that were learned."""
-    inverse = np.linalg.inv(data.mean_terms.T @ data.mean_terms)
-    leverage = np.einsum("ni,ij,nj->n", data.mean_terms, inverse, data.mean_terms)
+    leverage = _leverage(data.mean_terms)
     spread = np.exp(2 * (mode[6] + mode[7] * data.mean_terms[:, 1]))
     spread = spread + (np.exp(2 * mode[8]) + data.mean(data.map_variance)) / data.exams
     return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(spread / (1.0 - leverage))))
@@ -253,7 +252,12 @@ def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
     """(n,) ln(predicted / true size) of each row when it is left out of the least-squares fit, in closed form."""
     inverse = np.linalg.inv(terms.T @ terms)
     residual = log_d - terms @ (inverse @ (terms.T @ log_d))
-    return np.asarray(-residual / (1.0 - np.einsum("ni,ij,nj->n", terms, inverse, terms)))
+    return np.asarray(-residual / (1.0 - _leverage(terms)))
+
+
+def _leverage(terms: FloatArray) -> FloatArray:
+    """(n,) weight of each row in its own least-squares prediction."""
+    return np.asarray(np.einsum("ni,ij,nj->n", terms, np.linalg.inv(terms.T @ terms), terms))
 
 
 def _domain(table: PopulationTable) -> dict[str, tuple[float, float]]:

@@ -83,21 +83,21 @@ def _close_search(
 
     Beside a rib least squares grows over both. The posterior has errors that can be a rib, and asks for one after.
     """
-    looks = 0
+    looks, settings = 0, _search_options(tactile_map, options.fit)
     for i, candidate in enumerate(tried):
-        if candidate.fault and (candidate.fit is None or candidate.fault.startswith(OUTGROWN)):
-            fit, fault = fit_close(tactile_map, candidate.centre_mm, options=_search_options(tactile_map, options.fit))
-            if fit is None or fault:
-                continue
-            seen = _look(tactile_map, fit, options)
-            if isinstance(seen, Detection) or _field_fault(tactile_map, seen):
-                continue
-            if seen.detection.probability >= options.least_probability:
-                others = (one for j, one in enumerate(tried) if j != i)
-                return (*others, replace(candidate, fit=fit, fault="")), seen
-            looks += 1
-            if looks == MOST_LOOKS:
-                break
+        if candidate.fit is not None and not candidate.fault.startswith(OUTGROWN):
+            continue
+        fit, fault = fit_close(tactile_map, candidate.centre_mm, options=settings)
+        if fit is None or fault:
+            continue
+        seen = _look(tactile_map, fit, options)
+        if isinstance(seen, Detection) or _field_fault(tactile_map, seen):
+            continue
+        if seen.detection.probability >= options.least_probability:
+            return (*tried[:i], *tried[i + 1 :], replace(candidate, fit=fit, fault="")), seen
+        looks += 1
+        if looks == MOST_LOOKS:
+            break
     return None
 
 
