@@ -78,8 +78,26 @@ def second_lump(rng: np.random.Generator) -> FloatArray:
 def rib(rng: np.random.Generator) -> FloatArray:
     """A ridge of sigma 5 mm, 16 to 22 mm from the middle, a third to the whole of the amplitude."""
     away, angle = rng.uniform(16.0, 22.0), rng.uniform(0.0, 2.0 * np.pi)
+    return AMPLITUDE * rng.uniform(1.0 / 3.0, 1.0) * ridge(away, angle)
+
+
+def ridge(away: float, angle: float) -> FloatArray:
+    """(n, n) values of a straight ridge of unit height and sigma 5 mm."""
     distance = np.cos(angle) * AXIS + np.sin(angle) * AXIS[:, None] - away
-    return AMPLITUDE * rng.uniform(1.0 / 3.0, 1.0) * np.exp(-0.5 * (distance / 5.0) ** 2)
+    return np.asarray(np.exp(-0.5 * (distance / 5.0) ** 2))
+
+
+def rib_anywhere(rng: np.random.Generator) -> FloatArray:
+    """A ridge up to 22 mm from the middle, a third to the whole of the amplitude of a lump that is not there."""
+    away, angle = rng.uniform(0.0, 22.0), rng.uniform(0.0, 2.0 * np.pi)
+    return AMPLITUDE * rng.uniform(1.0 / 3.0, 1.0) * ridge(away, angle)
+
+
+def two_ribs(rng: np.random.Generator) -> FloatArray:
+    """Two of them side by side, 20 to 26 mm apart, each as high as it happens to be."""
+    first, apart, angle = rng.uniform(-20.0, 0.0), rng.uniform(20.0, 26.0), rng.uniform(0.0, 2.0 * np.pi)
+    heights = AMPLITUDE * rng.uniform(1.0 / 3.0, 1.0, 2)
+    return np.asarray(heights[0] * ridge(first, angle) + heights[1] * ridge(first + apart, angle))
 
 
 def flat(_: np.random.Generator) -> FloatArray:
@@ -95,6 +113,8 @@ ROWS = (
     Truths("no lump, errors of any size and length", slope, ("tilt",), any_noise=True),
     Truths("round and a second lump", lambda rng: bump(rng) + second_lump(rng), ("lump", "second lump")),
     Truths("round and a rib", lambda rng: bump(rng) + rib(rng), ("lump", "rib")),
+    Truths("a rib and no lump", rib_anywhere, ("rib",)),
+    Truths("two ribs and no lump", two_ribs, ("rib",)),
 )
 
 

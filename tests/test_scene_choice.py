@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior import scene_choice
+from tactile_bayes.posterior import beside
+from tactile_bayes.posterior.beside import add_beside
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import window_cells
 from tactile_bayes.posterior.collapsed import independent_variance
 from tactile_bayes.posterior.scene import Scene
-from tactile_bayes.posterior.scene_choice import SceneChoice, Structure, add_beside, choose_shape
+from tactile_bayes.posterior.scene_choice import SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.surroundings import Surroundings
 from tactile_bayes.posterior.window import Window
 from tests.posterior_maps import bump_values, correlated_field, grid_map
@@ -169,7 +170,7 @@ def test_a_dips_far_side_is_no_rib() -> None:
 
 
 def test_without_that_question_it_would_be_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_choice, "LEAST_RISE", -10.0)
+    monkeypatch.setattr(beside, "LEAST_RISE", -10.0)
     away = np.hypot(AXIS[None, :] - 1.0, AXIS[:, None] + 1.0)
     dip = -0.06 * np.exp(-0.5 * ((away - 13.0) / 4.0) ** 2)
     values = bump() + dip * (np.abs(AXIS[:, None] + 1.0) < 12.0) + errors(5, field=0.003, white=0.003)

@@ -11,6 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import trusted
+from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.fit import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
@@ -111,13 +112,14 @@ def extend_advice(short: dict[str, float]) -> str:
     return f"extend the strokes {' and '.join(parts[:2])}" if parts else ""
 
 
-def undetected(probability: float, least: float) -> Abstention:
-    """No lump that the noise would not make by itself."""
-    return Abstention(
-        "undetected",
-        f"no lump detected (probability {probability:.2g}, needed {least:g})",
-        "go over the place again, more slowly or with more lines, and map all scans together",
-    )
+def undetected(detection: Detection, least: float) -> Abstention:
+    """No lump that the noise, or a ridge as a rib makes, would not explain as well."""
+    figures = f"(probability {detection.probability:.2g}, needed {least:g})"
+    if detection.ridge:
+        reason = f"no lump detected: {detection.ridge}, explains what rises {figures}"
+        return Abstention("undetected", reason, "feel whether it is a rib; name a lump's place with --centre-mm")
+    again = "go over the place again, more slowly or with more lines, and map all scans together"
+    return Abstention("undetected", f"no lump detected {figures}", again)
 
 
 def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, prior: BumpPrior) -> Abstention | None:

@@ -29,10 +29,13 @@ class Detection:
         Posterior probability of a bump at even prior odds.
     log_bayes_factor
         Natural log of the evidence ratio.
+    ridge
+        The ridge, in words, that a lump's evidence was held against; empty where it was held against noise alone.
     """
 
     probability: float
     log_bayes_factor: float
+    ridge: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,9 +88,9 @@ def detect(
     return detection_from_odds(log_factor)
 
 
-def detection_from_odds(log_bayes_factor: float) -> Detection:
+def detection_from_odds(log_bayes_factor: float, *, ridge: str = "") -> Detection:
     """The probability that goes with a Bayes factor at even prior odds."""
-    return Detection(float(1.0 / (1.0 + np.exp(-np.clip(log_bayes_factor, -700, 700)))), log_bayes_factor)
+    return Detection(float(1.0 / (1.0 + np.exp(-np.clip(log_bayes_factor, -700, 700)))), log_bayes_factor, ridge)
 
 
 def _blocks(tactile_map: TactileMap, bump: Bump, theta: FloatArray) -> _Blocks:

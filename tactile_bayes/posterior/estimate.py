@@ -170,7 +170,7 @@ def estimate_map(
         return _none(no_bump(tactile_map, candidates), candidates)
     detection = seen if isinstance(seen, Detection) else seen.detection
     if detection.probability < options.least_probability:
-        return _none(undetected(detection.probability, options.least_probability), candidates, detection)
+        return _none(undetected(detection, options.least_probability), candidates, detection)
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.beside import WANTED, add_beside
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
@@ -16,8 +18,9 @@ from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.field_posterior import FieldFit, field_window, shape_draws, start_vector
 from tactile_bayes.posterior.fit import BumpFit
 from tactile_bayes.posterior.methods import MethodOptions, draw_scene
+from tactile_bayes.posterior.ridge import ridge_instead, ridge_text
 from tactile_bayes.posterior.scene import Scene
-from tactile_bayes.posterior.scene_choice import SceneChoice, add_beside, choose_shape
+from tactile_bayes.posterior.scene_choice import ASKING, SceneChoice, choose_shape
 from tactile_bayes.posterior.solved import Solved
 from tactile_bayes.posterior.surroundings import Surroundings
 from tactile_bayes.presets import FIELD_COSINES
@@ -84,10 +87,31 @@ def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: floa
 
     The window's evidence has the centre anywhere in the window; the search over the rest of the map is paid for.
     """
+    return detection_from_odds(log_evidence - plain.target.null_log_evidence() - _searched(plain, tactile_map))
+
+
+def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
+    """Log of how many windows the map has."""
     area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2
-    window = np.pi * plain.target.radius_mm**2
-    searched = np.log(max(area / window, 1.0))
-    return detection_from_odds(log_evidence - plain.target.null_log_evidence() - searched)
+    return float(np.log(max(area / (np.pi * plain.target.radius_mm**2), 1.0)))
+
+
+def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: str = "auto") -> FieldAnswer:
+    """The same with a second structure where the map asks for one, the lump weighed against a ridge where one rises.
+
+    Only scenes that ask what lies beside the lump are weighed so: without a rib in the model a lump beside one would
+    lose to it.
+    """
+    if scene not in ASKING:
+        return answer
+    surroundings = Surroundings.of(tactile_map)
+    choice = add_beside(answer.choice, surroundings, scene=scene)
+    ridge = ridge_instead(choice, surroundings)
+    found = replace(answer, choice=choice)
+    if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
+        return found
+    log_factor = choice.fit.log_evidence - ridge.log_evidence - _searched(choice.plain, tactile_map)
+    return replace(found, detection=detection_from_odds(log_factor, ridge=ridge_text(ridge)))
 
 
 def draw(
@@ -100,12 +124,20 @@ def draw(
     options: MethodOptions | None = None,
     progress: Progress | None = None,
 ) -> FieldAnswer:
-    """The same with a second structure where the map asks for one, and draws."""
-    choice = add_beside(answer.choice, Surroundings.of(tactile_map), scene=scene)
+    """The same with draws.
+
+    Raises
+    ------
+    NotConvergedError
+        When no method converges, or the neighbour that the scene asks for was not found.
+    """
+    choice, wanted = answer.choice, WANTED.get(scene, "")
+    if wanted and choice.fit.scene.extra != wanted:
+        raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {scene}")
     solved = Solved(choice.fit.target.conditional)
     draws, passed_over = draw_scene(choice.fit, method, rng=rng, options=options, progress=progress, solved=solved)
     detection = answer.detection
-    if choice.fit is choice.plain and "log_evidence" in draws.diagnostics:
+    if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
         detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
     figures = _diagnostics(choice) | ({"passed_over": list(passed_over)} if passed_over else {})
     return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng, solved), figures)

@@ -1,4 +1,7 @@
-"""What a window may hold: a bump, round or not, turned or not, and beside it a second lump or the edge of a rib."""
+"""What a window may hold: a bump, round or not, turned or not, and beside it a second lump or the edge of a rib.
+
+Or a ridge in the bump's place: what a lump's evidence is held against where a ridge is to be feared.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.window import Profiles, Window
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-Shape = Literal["round", "ellipse", "rotated"]
+Shape = Literal["round", "ellipse", "rotated", "ridge"]
 Extra = Literal["", "second lump", "rib"]
 REACH_IN_RADII = 1.5
 """How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
@@ -29,6 +32,8 @@ STEP = {
     "w2": 0.15,
     "angle": 0.08,
     "offset": 0.6,
+    "along": 0.08,
+    "across": 0.6,
 }
 """About one posterior standard deviation of each parameter: steps of the search for the mode."""
 
@@ -39,7 +44,7 @@ class Scene:
 
     The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a
     round bump, with r for a turned one; then ``x2, y2, w2`` (centre and log width of a second round lump) or
-    ``angle, offset, w2`` (a ridge).
+    ``angle, offset, w2`` (a ridge). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
 
     Parameters
     ----------
@@ -58,7 +63,12 @@ class Scene:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the shape parameters, the most important first (see `importance`)."""
-        bump = {"round": ("u", "x", "y"), "ellipse": ("u", "v", "x", "y"), "rotated": ("u", "v", "x", "y", "r")}
+        bump = {
+            "round": ("u", "x", "y"),
+            "ellipse": ("u", "v", "x", "y"),
+            "rotated": ("u", "v", "x", "y", "r"),
+            "ridge": ("u", "along", "across"),
+        }
         beside = {"": (), "second lump": ("x2", "y2", "w2"), "rib": ("angle", "offset", "w2")}
         return bump[self.shape] + beside[self.extra]
 
@@ -93,8 +103,11 @@ class Scene:
     def templates(self, theta: FloatArray, window: Window) -> list[Profiles]:
         """The bump, and the second structure if there is one, of (m, p) vectors."""
         p, q, r = self.widths(theta)
-        x, y = self.column(theta, "x"), self.column(theta, "y")
-        found = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
+        if self.shape == "ridge":
+            found = [window.ridges(self.column(theta, "along"), self.column(theta, "across"), log_width=p)]
+        else:
+            x, y = self.column(theta, "x"), self.column(theta, "y")
+            found = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
         w = self.column(theta, "w2")
         if self.extra == "second lump":
             x2, y2 = self.column(theta, "x2"), self.column(theta, "y2")
@@ -110,10 +123,14 @@ class Scene:
         """(m,) normalised log prior of the shape; -inf outside the window and where a bump is wider than it."""
         p, q, r = self.widths(theta)
         ratio = np.hypot(q, r)
-        x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
-        inside = (np.hypot(x, y) <= radius_mm) & (p + ratio <= np.log(widest_mm))
-        total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd) - np.log(np.pi * radius_mm**2)
-        if self.shape != "round":
+        total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd)
+        if self.shape == "ridge":
+            inside, volume = ridge_place(self.column(theta, "across"), radius_mm)
+        else:
+            x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
+            inside, volume = np.hypot(x, y) <= radius_mm, np.pi * radius_mm**2
+        inside, total = inside & (p + ratio <= np.log(widest_mm)), total - np.log(volume)
+        if self.shape in ("ellipse", "rotated"):
             # q is half of u - v, p half of their sum: the volume of (u, v) is twice that of (p, q)
             total = total + log_normal_density(q, 0.0, prior.log_ratio_sd) - np.log(2.0)
         if self.shape == "rotated":
@@ -130,14 +147,21 @@ class Scene:
         w, reach = self.column(theta, "w2"), REACH_IN_RADII * radius_mm
         total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
         if self.extra == "rib":
-            offset = self.column(theta, "offset")
-            return total - np.log(np.pi) - np.log(2.0 * reach), np.abs(offset) <= reach
+            allowed, volume = ridge_place(self.column(theta, "offset"), radius_mm)
+            return total - np.log(volume), allowed
         x2, y2 = self.column(theta, "x2"), self.column(theta, "y2")
-        away = np.hypot(x2 - self.column(theta, "x"), y2 - self.column(theta, "y"))
-        p, _, _ = self.widths(theta)
-        allowed = away >= APART * np.exp(np.maximum(p, w))
-        allowed &= np.hypot(x2 - middle[0], y2 - middle[1]) <= reach
+        allowed = np.hypot(x2 - middle[0], y2 - middle[1]) <= reach
+        if self.shape != "ridge":
+            away = np.hypot(x2 - self.column(theta, "x"), y2 - self.column(theta, "y"))
+            p, _, _ = self.widths(theta)
+            allowed &= away >= APART * np.exp(np.maximum(p, w))
         return total - np.log(np.pi * reach**2), allowed
+
+
+def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:
+    """(m,) whether ridges may lie so far from the window's middle, and the volume of their angles and offsets."""
+    reach = REACH_IN_RADII * radius_mm
+    return np.abs(offset) <= reach, float(np.pi * 2.0 * reach)
 
 
 def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:

@@ -55,18 +55,19 @@ def search(
         tried.append(candidate)
         if candidate.fault or candidate.fit is None:
             continue
-        seen = _look(tactile_map, candidate.fit, options)
-        fault = "" if isinstance(seen, Detection) else _field_fault(tactile_map, seen)
+        seen, fault = _look(tactile_map, candidate.fit, options)
         if fault:
             tried[-1] = replace(candidate, fault=fault)
             continue
-        probability = (seen if isinstance(seen, Detection) else seen.detection).probability
-        if probability >= options.least_probability:
+        detection = _detection(seen)
+        if detection.probability >= options.least_probability:
             return tuple(tried), seen
         first, looks = first or (candidate, seen), looks + 1
         if looks == MOST_LOOKS:
             break
-        tried[-1] = replace(candidate, fault=f"no lump by the evidence (probability {probability:.2g})")
+        rather = f": rather {detection.ridge}" if detection.ridge else ""
+        fault = f"no lump by the evidence (probability {detection.probability:.2g}){rather}"
+        tried[-1] = replace(candidate, fault=fault)
     if options.fit.noise == "field":
         close = _close_search(tactile_map, tried, options)
         if close is not None:
@@ -90,8 +91,8 @@ def _close_search(
         fit, fault = fit_close(tactile_map, candidate.centre_mm, options=settings)
         if fit is None or fault:
             continue
-        seen = _look(tactile_map, fit, options)
-        if isinstance(seen, Detection) or _field_fault(tactile_map, seen):
+        seen, fault = _look(tactile_map, fit, options)
+        if isinstance(seen, Detection) or fault:
             continue
         if seen.detection.probability >= options.least_probability:
             return (*tried[:i], *tried[i + 1 :], replace(candidate, fit=fit, fault="")), seen
@@ -134,25 +135,34 @@ def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:
     return replace(fit, background="fixed") if known else fit
 
 
-def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Detection | FieldAnswer:
-    """Whether there is a lump; under a noise field with the fit that says so."""
-    if options.fit.noise != "field":
-        return detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
-    from tactile_bayes.posterior.field_estimate import look
+def _detection(seen: Detection | FieldAnswer) -> Detection:
+    return seen if isinstance(seen, Detection) else seen.detection
 
+
+def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tuple[Detection | FieldAnswer, str]:
+    """Whether there is a lump, under a noise field with the fit that says so; and why it can be none all the same."""
+    if options.fit.noise != "field":
+        return detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior), ""
+    from tactile_bayes.posterior.field_estimate import look, with_neighbours
+
+    scene = scene_asked(options)
     try:
-        return look(
+        seen = look(
             tactile_map,
             fit,
             prior=options.prior,
             radius_mm=options.fit.radius_mm,
-            scene=scene_asked(options),
+            scene=scene,
             least_odds=ROTATION_ODDS,
             cosines=options.fit.field_cosines,
         )
     except NotConvergedError:
         # no mode: under these errors nothing stands out that could be weighed
-        return Detection(0.0, -np.inf)
+        return Detection(0.0, -np.inf), ""
+    fault = _field_fault(tactile_map, seen)
+    if fault or seen.detection.probability < options.least_probability:
+        return seen, fault
+    return with_neighbours(seen, tactile_map, scene=scene), ""
 
 
 def scene_asked(options: EstimateOptions) -> str:

@@ -12,14 +12,13 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.field_estimate import look
+from tactile_bayes.posterior.field_estimate import look, with_neighbours
 from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture, shape_draws
 from tactile_bayes.posterior.fit import BumpFit, FitOptions, find_bump
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.methods import Sampled, importance_draws
 from tactile_bayes.posterior.optimise import optimise
-from tactile_bayes.posterior.scene_choice import LEAST_ODDS, add_beside
-from tactile_bayes.posterior.surroundings import Surroundings
+from tactile_bayes.posterior.scene_choice import LEAST_ODDS
 from tactile_bayes.presets import FIELD_COSINES
 
 ENDS = (0.025, 0.975)
@@ -123,7 +122,7 @@ def map_case(
     if found.fault or found.fit is None:
         return f"no bump can be measured: {found.fault}"
     answer = look(tactile_map, found.fit, prior=prior, radius_mm=radius_mm, least_odds=LEAST_ODDS, cosines=cosines)
-    return MapCase(found.fit, add_beside(answer.choice, Surroundings.of(tactile_map)).fit)
+    return MapCase(found.fit, with_neighbours(answer, tactile_map).choice.fit)
 
 
 @dataclass(frozen=True, slots=True)
