@@ -30,5 +30,7 @@ METHODS: Final = ("optimise", "laplace", "importance", "ensemble")
 NOISE: Final = ("independent", "field")
 INTERVAL: Final = 0.95
 # Along each axis, of a map's noise field. Fewer are faster; what is finer than they resolve counts as independent.
+# A narrow bump gets more than these by itself, up to the second number.
 FIELD_COSINES: Final = 18
+FINE_FIELD_COSINES: Final = 30
 MOST_FIELD_COSINES: Final = 40

@@ -73,12 +73,14 @@ def test_a_finer_noise_field_is_recorded_and_hardly_moves_a_clear_lump(folder: P
     finer = json.loads(run_here("estimate", "mass1.nc", *FAST, "--field-cosines", "24", "--json", cwd=folder).stdout)
     default = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)
     settings = [one["provenance"]["settings"]["field_cosines"] for one in (default, finer)]
-    assert settings == [18, 24]
+    assert settings == ["auto", 24]
+    assert [one["diagnostics"]["field_cosines"] for one in (default, finer)] == [18, 24]
     off = finer["sigma_x_mm"]["median"] - default["sigma_x_mm"]["median"]
     assert 0 < abs(off) < 0.3 * default["sigma_x_mm"]["sd"]
-    refused = run_here("estimate", "mass1.nc", "--field-cosines", "5", cwd=folder)
-    assert refused.returncode == 2
-    assert "--field-cosines" in refused.stderr
+    for wrong in ("5", "fine"):
+        refused = run_here("estimate", "mass1.nc", "--field-cosines", wrong, cwd=folder)
+        assert refused.returncode == 2
+        assert "--field-cosines" in refused.stderr
 
 
 def test_none_gives_widths_and_a_map_made_otherwise_says_why_it_has_no_size(folder: Path) -> None:

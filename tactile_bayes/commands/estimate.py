@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
+from tactile_bayes.commands.number_or import WholeOrAuto
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
-from tactile_bayes.presets import FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
+from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
@@ -82,11 +83,12 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 )
 @click.option(
     "--field-cosines",
-    type=click.IntRange(min=6, max=MOST_FIELD_COSINES),
-    default=FIELD_COSINES,
+    type=WholeOrAuto(min=6, max=MOST_FIELD_COSINES),
+    metavar="N|auto",
+    default="auto",
     show_default=True,
     help="Of the noise field along each axis: more are slower and see finer correlation; `tradeoff estimate` measures "
-    "what they change.",
+    f"what they change. auto: {FIELD_COSINES}, for a narrow bump up to {FINE_FIELD_COSINES}.",
 )
 @click.option(
     "--accuracy-sd",
@@ -139,7 +141,7 @@ def command(
     centre_mm: tuple[float, float] | None,
     max_steps: int | None,
     noise: str | None,
-    field_cosines: int,
+    field_cosines: int | None,
     accuracy_sd: float | None,
     accuracy_mm: float | None,
     scene: str,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
-from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
+from tactile_bayes.presets import FIT_RADIUS_MM
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
@@ -42,7 +42,7 @@ class Settings:
     accuracy_mm: float | None = None
     prior: Path | None = None
     checkpoint: Path | None = None
-    field_cosines: int = FIELD_COSINES
+    field_cosines: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         "rotation": settings.rotation,
         "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
         "noise": options.fit.noise,
-        "field_cosines": options.fit.field_cosines,
+        "field_cosines": options.fit.field_cosines or "auto",
         "accuracy_sd": settings.accuracy_sd,
         "accuracy_mm": settings.accuracy_mm,
         "scene": settings.scene,

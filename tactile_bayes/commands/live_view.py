@@ -184,7 +184,7 @@ def estimate_text(tactile_map: TactileMap, calibration_path: str | None, turn: T
     from tactile_bayes.posterior.cells import candidate_centres
     from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
     from tactile_bayes.posterior.fit import FitOptions
-    from tactile_bayes.presets import INTERVAL
+    from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
 
     try:
         centres = candidate_centres(tactile_map)
@@ -193,7 +193,7 @@ def estimate_text(tactile_map: TactileMap, calibration_path: str | None, turn: T
         centre = centres[turn.of(len(centres))]
         calibration = _calibration_of(calibration_path) if calibration_path else None
         # whether an ellipse is turned is a question for afterwards, and takes a third of the time
-        fit = FitOptions(rotation="off", centre_mm=centre, start_width_mm=turn.width_mm)
+        fit = FitOptions("fixed", FIT_RADIUS_MM, "off", centre, "independent", turn.width_mm, FIELD_COSINES)
         if calibration is not None:
             recipe = calibration.recipe
             fit = replace(fit, background=recipe.background, radius_mm=recipe.radius_mm, noise=recipe.noise)

@@ -1,4 +1,4 @@
-"""An option that takes a number or one of a few words."""
+"""Options that take a number or one of a few words."""
 
 from __future__ import annotations
 
@@ -10,6 +10,14 @@ if TYPE_CHECKING:
     _ParamType = click.ParamType[Any]
 else:
     _ParamType = click.ParamType  # takes no parameter before click 8.4
+
+
+class WholeOrAuto(click.IntRange):
+    """A whole number, or None for "auto"."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number, or None."""
+        return None if value == "auto" else super().convert(value, param, ctx)
 
 
 class NumberOr(_ParamType):

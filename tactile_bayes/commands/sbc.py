@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.presets import FIELD_COSINES, MOST_FIELD_COSINES
+from tactile_bayes.commands.number_or import WholeOrAuto
+from tactile_bayes.presets import MOST_FIELD_COSINES
 
 if TYPE_CHECKING:
     from tactile_bayes.batch import BatchStore, Outcome
@@ -31,8 +32,9 @@ _FILE = click.Path(path_type=Path)
 )
 @click.option(
     "--field-cosines",
-    type=click.IntRange(min=6, max=MOST_FIELD_COSINES),
-    default=FIELD_COSINES,
+    type=WholeOrAuto(min=6, max=MOST_FIELD_COSINES),
+    metavar="N|auto",
+    default="auto",
     show_default=True,
     help="As of `estimate`.",
 )
@@ -48,7 +50,7 @@ _FILE = click.Path(path_type=Path)
 def command(
     maps: int,
     method: str,
-    field_cosines: int,
+    field_cosines: int | None,
     seed: int,
     workers: int,
     scheduler: str | None,
@@ -91,7 +93,7 @@ def command(
 
 
 def _run(
-    maps: int, method: str, seed: int, cosines: int, *, workers: int, scheduler: str | None, output: Path | None
+    maps: int, method: str, seed: int, cosines: int | None, *, workers: int, scheduler: str | None, output: Path | None
 ) -> tuple[list[Outcome[MapRanks]], int]:
     """Every map's outcome, and how many of them this run made."""
     from functools import partial
@@ -118,7 +120,7 @@ def _run(
     return outcomes, max(maps - had, 0)
 
 
-def ranks_of_map(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
+def ranks_of_map(index: int, *, method: str, seed: int, cosines: int | None) -> MapRanks:
     """The ranks of one map, in whichever process."""
     from tactile_bayes.posterior import sbc
 

@@ -17,13 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
 MARGIN = 1.3
 """Width of the rectangle in widths of the window: the field need not be flat where the window ends."""
 LENGTHS_MM = (1.5, 3.0, 6.0, 12.0)
 SHARES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Variances of the field tried, over the mean independent variance of a cell."""
+HALF_WAVE_IN_WIDTHS = 0.83
+"""The shortest half wave that a bump's width calls for: below 3.5 mm, in a window of 20 mm, more than the fewest."""
 TOUCHED = 1e-2
 """Directions in which the field's variance is a smaller part of the independent one are dropped."""
 
@@ -75,6 +77,17 @@ def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tup
     profiles = np.cos(np.pi * order * phase[:, None])
     profiles[:, 1:] *= np.sqrt(2.0)
     return profiles, np.asarray((np.pi * order / side) ** 2, dtype=np.float64)
+
+
+def cosines_for(width_mm: float, axis_mm: FloatArray) -> int:
+    """Cosines along an axis that a bump of this width calls for, from `FIELD_COSINES` to `FINE_FIELD_COSINES`.
+
+    Errors shorter than the shortest half wave count as independent. For a narrow bump they are not: they have its
+    shape.
+    """
+    _, side = _phase(axis_mm)
+    wanted = np.ceil(side / (HALF_WAVE_IN_WIDTHS * max(width_mm, 1e-6)))
+    return int(np.clip(wanted, FIELD_COSINES, FINE_FIELD_COSINES))
 
 
 def _phase(axis_mm: FloatArray) -> tuple[FloatArray, float]:

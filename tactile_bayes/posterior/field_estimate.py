@@ -15,6 +15,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draws import ParameterDraws
+from tactile_bayes.posterior.field import cosines_for
 from tactile_bayes.posterior.field_posterior import FieldFit, field_window, shape_draws, start_vector
 from tactile_bayes.posterior.fit import BumpFit
 from tactile_bayes.posterior.methods import MethodOptions, draw_scene
@@ -61,25 +62,49 @@ def look(
     radius_mm: float,
     scene: str = "auto",
     least_odds: float,
-    cosines: int = FIELD_COSINES,
+    cosines: int | None = None,
 ) -> FieldAnswer:
     """Fit the bump under correlated errors and weigh it against none.
+
+    Parameters
+    ----------
+    cosines
+        As `FitOptions.field_cosines`. Without a number a bump that may be a lump and is narrow is fitted once more,
+        with a finer field.
 
     Raises
     ------
     NotConvergedError
         When the density has no mode.
     """
-    choice = choose_shape(
-        field_window(fit, cosines=cosines),
-        start_vector(fit, Scene("rotated")),
-        prior=prior,
-        radius_mm=radius_mm,
-        amplitude_scale=fit.bump.scale,
-        scene=scene,
-        least_odds=least_odds,
-    )
-    return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
+
+    def under(number: int, start: FloatArray) -> FieldAnswer:
+        choice = choose_shape(
+            field_window(fit, cosines=number),
+            start,
+            prior=prior,
+            radius_mm=radius_mm,
+            amplitude_scale=fit.bump.scale,
+            scene=scene,
+            least_odds=least_odds,
+        )
+        return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
+
+    full = Scene("rotated")
+    answer = under(cosines or FIELD_COSINES, start_vector(fit, full))
+    if cosines is not None or not answer.detection.log_bayes_factor > 0:
+        return answer
+    wanted = _called_for(answer.choice.plain)
+    if wanted <= FIELD_COSINES:
+        return answer
+    return under(wanted, answer.choice.plain.scene.carried(answer.choice.plain.mode, full))
+
+
+def _called_for(plain: FieldFit) -> int:
+    """Cosines that the fitted bump's narrower width calls for."""
+    sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
+    window = plain.target.window
+    return max(cosines_for(min(sigma_x, sigma_y), axis) for axis in (window.x_mm, window.y_mm))
 
 
 def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: float) -> Detection:
@@ -165,5 +190,6 @@ def _diagnostics(choice: SceneChoice) -> dict[str, object]:
         "noise": "field",
         "rotation_odds": odds.get("rotated"),
         "rotated": choice.fit.rotated,
+        "field_cosines": choice.fit.target.window.cosines,
     }
     return found | choice.fit.target.field_summary(choice.fit.mode)

@@ -21,7 +21,6 @@ from tactile_bayes.posterior.cells import (
 from tactile_bayes.posterior.least_squares import LeastSquaresFit, fit_least_squares, inverse_information
 from tactile_bayes.posterior.noise import ErrorModel, count_weights, error_model
 from tactile_bayes.posterior.target import LogPrior, Target, flat_prior
-from tactile_bayes.presets import FIELD_COSINES
 
 START_WIDTHS_MM = (2.0, 5.0, 10.0)
 LEAST_COVERED_SHARE = 0.6
@@ -55,7 +54,8 @@ class FitOptions:
     start_width_mm
         About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`.
     field_cosines
-        Of the noise field along each axis: more of them are slower and see finer correlation.
+        Of the noise field along each axis: more of them are slower and see finer correlation. None takes as many as the
+        bump's width calls for, see `field.cosines_for`.
     """
 
     background: str = "fixed"
@@ -64,7 +64,7 @@ class FitOptions:
     centre_mm: tuple[float, float] | None = None
     noise: str = "independent"
     start_width_mm: float | None = None
-    field_cosines: int = FIELD_COSINES
+    field_cosines: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -45,7 +45,6 @@ from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
 from tactile_bayes.posterior.rank_tests import RankTest, rank_test, uniform_strays
 from tactile_bayes.posterior.roundness import ShapePrior
 from tactile_bayes.posterior.window import cell_mean_profile
-from tactile_bayes.presets import FIELD_COSINES
 
 HALF_MM = 25.0
 CELL_MM = 1.0
@@ -114,7 +113,7 @@ class MapRanks:
     probability: float | None = None
 
 
-def settings(method: str, seed: int, *, size: str = "", cosines: int = FIELD_COSINES) -> dict[str, object]:
+def settings(method: str, seed: int, *, size: str = "", cosines: int | None = None) -> dict[str, object]:
     """All that the ranks of a map depend on besides its number."""
     return {
         "method": method,
@@ -126,13 +125,13 @@ def settings(method: str, seed: int, *, size: str = "", cosines: int = FIELD_COS
         "lengths_mm": list(LENGTHS_MM),
         "shares": list(SHARES),
         "field": "exponential",
-        "field_cosines": cosines,
+        "field_cosines": cosines or "auto",
         **BumpPrior().as_dict(),
     }
 
 
 def ranks_of_map(
-    index: int, *, method: str, seed: int, calibration: LogQuadratic | None = None, cosines: int = FIELD_COSINES
+    index: int, *, method: str, seed: int, calibration: LogQuadratic | None = None, cosines: int | None = None
 ) -> MapRanks:
     """Draw one map from the prior, estimate it and rank its truth: all random numbers come from seed and index.
 

@@ -19,14 +19,14 @@ from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.methods import Sampled, importance_draws
 from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.scene_choice import LEAST_ODDS
-from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
 ENDS = (0.025, 0.975)
 REFERENCE_POINTS = 16384
 """Points of each of the reference's replicates."""
 ACCURACIES_SD = (0.05, 0.02, 0.01, 0.005)
 STEPS = (150, 600, 2400)
-FIELDS = (12, FIELD_COSINES, 24, 30)
+FIELDS = (12, FIELD_COSINES, 24, FINE_FIELD_COSINES)
 FIELD_ACCURACY_SD = 0.01
 Clock = Callable[[], float]
 Progress = Callable[[int, int], None]
@@ -78,6 +78,8 @@ class Tradeoff:
         Runs that errors and times are means of.
     fields
         Noise fields from coarse to fine.
+    cosines
+        Of the noise field under which the methods ran: what an estimate of this map takes by itself.
     """
 
     measured: tuple[Measured, ...]
@@ -86,6 +88,7 @@ class Tradeoff:
     sd_mm: tuple[float, float]
     runs: int
     fields: tuple[FieldRow, ...] = ()
+    cosines: int = FIELD_COSINES
 
     def advised(self, tolerance_sd: float) -> Measured | None:
         """The cheapest within a tolerance; None where there is none."""
@@ -110,7 +113,7 @@ class MapCase:
 
 
 def map_case(
-    tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior, cosines: int = FIELD_COSINES
+    tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior, cosines: int | None = None
 ) -> MapCase | str:
     """The highest bump's fits, or why there is none."""
     free = FitOptions("free", radius_mm, "off", None, "field")
@@ -216,7 +219,7 @@ def measure(
     sd = np.std(truth, axis=1)
     fields = field_ladder(tactile_map, radius_mm=radius_mm, prior=prior, clock=clock, seed=seed)
     error_sd, sd_mm = long.diagnostics["end_error_sd"], (float(sd[0]), float(sd[1]))
-    return Tradeoff(tuple(found), error_sd, search_s, sd_mm, runs, fields)
+    return Tradeoff(tuple(found), error_sd, search_s, sd_mm, runs, fields, case.fit.target.window.cosines)
 
 
 Run = Callable[[np.random.Generator], tuple[FloatArray, float]]

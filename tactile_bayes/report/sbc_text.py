@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_bayes.posterior.rank_tests import BAND, RankTest, ecdf_band, ecdf_counts
 from tactile_bayes.posterior.sbc import DRAWS, RANKED, MapRanks, Truth, other_rises, rank_tests
-from tactile_bayes.presets import FIELD_COSINES, RESEARCH_USE
+from tactile_bayes.presets import RESEARCH_USE
 
 SCHEMA = "tactile-bayes/sbc/1"
 _COLOURS = ("#1f3b73", "#c8641e")
@@ -23,7 +23,7 @@ SHIFT = 3.0
 
 
 def sbc_document(
-    maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: int = FIELD_COSINES
+    maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: int | None = None
 ) -> dict[str, Any]:
     """Everything found, as data.
 
@@ -37,7 +37,7 @@ def sbc_document(
     return {
         "schema": SCHEMA,
         "method": method,
-        "field_cosines": cosines,
+        "field_cosines": cosines or "auto",
         "seed": seed,
         "maps": len(maps),
         "ranked": len(ranked),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.posterior.tradeoff import FIELD_ACCURACY_SD, Measured, Tradeoff
-from tactile_bayes.presets import FIELD_COSINES, RESEARCH_USE
+from tactile_bayes.presets import RESEARCH_USE
 
 SCHEMA = "tactile-bayes/tradeoff-estimate/1"
 _MARKS = {"optimise": "s", "laplace": "^", "importance": "o", "ensemble": "D"}
@@ -48,7 +48,7 @@ def _field_rows(found: Tradeoff) -> list[str]:
     ]
     note = (
         f"Whole estimates by importance; the same ends, against those of {finest} cosines (Monte-Carlo error "
-        f"{FIELD_ACCURACY_SD:g} SD). {FIELD_COSINES} are the default."
+        f"{FIELD_ACCURACY_SD:g} SD). Of itself an estimate of this map takes {found.cosines}."
     )
     return [head, *rows, note]
 
