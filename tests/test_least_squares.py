@@ -90,3 +90,41 @@ def test_the_jacobian_is_that_of_calculus() -> None:
     ours = numerical_jacobian(lambda t: t[:, :1] * np.exp(t[:, 1:] * x), theta, scale=np.ones(2))
     exact = np.stack([np.exp(-0.7 * x), 1.3 * x * np.exp(-0.7 * x)], axis=1)
     np.testing.assert_allclose(ours, exact, atol=1e-9)
+
+
+def test_patience_ends_a_long_search_where_the_data_no_longer_tell() -> None:
+    """A bump laid over noise alone: without patience steps shrink by a few per cent each, for a hundred and more."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-20.0, 21.0), np.arange(-20.0, 21.0)))
+
+    def predict(theta: np.ndarray) -> np.ndarray:
+        a, u, v, log_x, log_y = (column[:, None] for column in theta.T)
+        return a * np.exp(-0.5 * (((x - u) / np.exp(log_x)) ** 2 + ((y - v) / np.exp(log_y)) ** 2))
+
+    saved, above = [], []
+    for seed in range(12):
+        data = 0.01 * np.random.default_rng(seed).standard_normal(len(x))
+        start, scale = np.array([0.01, 0.0, 0.0, 1.6, 1.6]), np.array([0.02, 1.0, 1.0, 0.3, 0.3])
+        settings = {"data": data, "weight": np.ones(len(x)), "scale": scale}
+        full = fit_least_squares(predict, start, **settings)
+        short = fit_least_squares(predict, start, patience=16, **settings)
+        if short.converged:
+            saved.append(full.iterations - short.iterations)
+            above.append((short.sse - full.sse) / (full.sse / len(x)))
+    assert len(saved) >= 6
+    assert max(saved) > 20
+    assert min(saved) >= 0
+    assert np.median(above) < 0.2
+
+
+def test_patience_changes_nothing_where_the_minimum_is_sharp() -> None:
+    x = np.arange(-20.0, 21.0)
+
+    def predict(theta: np.ndarray) -> np.ndarray:
+        return theta[:, :1] * np.exp(-0.5 * ((x - theta[:, 1:2]) / np.exp(theta[:, 2:])) ** 2)
+
+    data = predict(np.array([[0.3, 1.0, 1.5]]))[0] + 0.003 * np.random.default_rng(1).standard_normal(len(x))
+    settings = {"data": data, "weight": np.ones(len(x)), "scale": np.array([0.3, 1.0, 0.3])}
+    full = fit_least_squares(predict, np.array([0.2, 0.0, 1.0]), **settings)
+    short = fit_least_squares(predict, np.array([0.2, 0.0, 1.0]), patience=16, **settings)
+    assert full.iterations == short.iterations
+    np.testing.assert_array_equal(full.theta, short.theta)

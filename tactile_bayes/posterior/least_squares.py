@@ -12,6 +12,9 @@ from tactile_bayes.geometry import FloatArray
 ModelFunction = Callable[[FloatArray], FloatArray]
 """Maps (m, p) parameter vectors to (m, k) predictions, all m at once."""
 
+SETTLED = 0.01
+"""Of the residual variance: a step that lowers the sum of squares by less moves nothing that the data could tell."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeastSquaresFit:
@@ -77,6 +80,7 @@ def fit_least_squares(
     tolerance: float = 1e-10,
     max_iterations: int = 200,
     abandon: Callable[[FloatArray], bool] | None = None,
+    patience: int | None = None,
 ) -> LeastSquaresFit:
     """Minimise ``sum(weight * (data - model(theta))**2)`` by Levenberg-Marquardt.
 
@@ -92,6 +96,9 @@ def fit_least_squares(
         Stop when the Gauss-Newton step is this small in units of `scale`.
     abandon
         Stop, not converged, at parameters from which no useful minimum can follow.
+    patience
+        After so many iterations a minimum is good enough once a step lowers the sum of squares by less than
+        `SETTLED` of the residual variance. Beside large residuals steps shrink by a few per cent each.
 
     Notes
     -----
@@ -111,6 +118,7 @@ def fit_least_squares(
         trial_sse = float(weight @ trial_residual**2)
         if trial_sse <= sse and np.isfinite(trial_sse):
             small = float(np.abs(step).max()) < tolerance or sse - trial_sse <= 1e-15 * sse
+            small |= patience is not None and iteration > patience and sse - trial_sse <= SETTLED * sse / len(data)
             theta, residual, sse = trial, trial_residual, trial_sse
             jacobian = numerical_jacobian(model, theta, scale=scale)
             damping, grow = max(damping / 5.0, 1e-14), 2.0
