@@ -7,8 +7,8 @@
 correlation (drawn by the covariance's Cholesky factor, not by the model's cosines), of a bump that is no Gaussian (the
 truth is the nearest Gaussian, under the row's errors or by plain squares), and of scans by a simulated head, whose
 truth is what the same estimate says of the same scan without sensor and tracker errors (a size calibration's widths
-mean the same). The last row is the negative control: the model of independent errors without its inflation, on maps
-with a field.
+mean the same). A narrow bump under strong correlated errors calls for a finer field than others. The negative controls:
+the model of independent errors without its inflation, on maps with a field; and the coarse field for the narrow bump.
 
 `sizes`: the whole path. Each mass is scanned three times by the solid model, each scan mapped and sized, alone and
 pooled, with the shipped calibration. `population` draws bodies from the prior that the calibration was learned over,
@@ -43,6 +43,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.fit import FitOptions, fit_bump
+from tactile_bayes.presets import FIELD_COSINES
 
 NOMINAL = 0.9
 AXIS = np.arange(-28.0, 28.5)
@@ -59,7 +60,13 @@ KINDS: dict[str, dict[str, float]] = {
 BY_SQUARES = "the same, nearest by plain squares"
 CONTROL = "control: independent errors assumed, field 3 mm"
 HEADS = {"simulated head": AMPLITUDE, "simulated head, lump of 0.05": 0.05}
-ROWS = (*KINDS, BY_SQUARES, *HEADS, CONTROL)
+NARROW = {
+    "narrow (2 by 2.4 mm), field-dominated, 3 mm": None,
+    "control: the same with 18 cosines": FIELD_COSINES,
+}
+NARROW_SIGMA = (2.0, 2.4)
+NARROW_KIND = {"white": 0.002, "field": 0.03, "length_mm": 3.0}
+ROWS = (*KINDS, BY_SQUARES, *HEADS, CONTROL, *NARROW)
 Row = dict[str, Any]
 
 
@@ -108,12 +115,14 @@ def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
     rng = np.random.default_rng([SEED, index])
     if kind in HEADS:
         tactile_map, truth = _head_map(index, HEADS[kind])
+    elif kind in NARROW:
+        tactile_map, truth = _grid_map(NARROW_KIND, rng, sigma=NARROW_SIGMA)
     else:
         same = {CONTROL: "field 3 mm", BY_SQUARES: "super-Gaussian, exponent 2.5"}
         tactile_map, truth = _grid_map(KINDS[same.get(kind, kind)], rng, by_squares=kind == BY_SQUARES)
     if kind == CONTROL:
         return _held_by_independent(tactile_map, truth)
-    options = EstimateOptions(fit=FitOptions("free", 20.0, "off", None, "field"))
+    options = EstimateOptions(fit=FitOptions("free", 20.0, "off", None, "field", field_cosines=NARROW.get(kind)))
     found = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
     if found.map_posterior is None:
         return None
@@ -141,11 +150,15 @@ def _held_by_independent(tactile_map: TactileMap, truth: tuple[float, float]) ->
 
 
 def _grid_map(
-    kind: dict[str, float], rng: np.random.Generator, *, by_squares: bool = False
+    kind: dict[str, float],
+    rng: np.random.Generator,
+    *,
+    by_squares: bool = False,
+    sigma: tuple[float, float] = SIGMA,
 ) -> tuple[TactileMap, tuple[float, float]]:
     centre = rng.uniform(-2.0, 2.0, 2)
     exponent = kind.get("exponent", 1.0)
-    bump = AMPLITUDE * _cell_means(centre, exponent)
+    bump = AMPLITUDE * _cell_means(centre, exponent, sigma)
     slope = 0.002 * rng.standard_normal(2)
     level = 1.0 + slope[0] * AXIS + slope[1] * AXIS[:, None]
     errors = kind["white"] * rng.standard_normal(bump.shape)
@@ -156,15 +169,15 @@ def _grid_map(
     recipe = MapRecipe("grid", "mean", 1.0)
     tactile_map = TactileMap(level + bump + errors, variance, count, AXIS, AXIS, recipe=recipe, background=1.0)
     if exponent == 1.0:
-        return tactile_map, SIGMA
+        return tactile_map, sigma
     field, length_mm = (0.0, 1.0) if by_squares else (kind["field"], kind["length_mm"])
     return tactile_map, _nearest_widths(exponent, kind["white"], field, length_mm)
 
 
-def _cell_means(centre: FloatArray, exponent: float) -> FloatArray:
+def _cell_means(centre: FloatArray, exponent: float, sigma: tuple[float, float] = SIGMA) -> FloatArray:
     """Of a bump exp(-(r^2/2)^exponent) of unit height, r in widths; 5 by 5 points a cell."""
     fine = (AXIS[:, None] + np.linspace(-0.4, 0.4, 5)).ravel()
-    square = ((fine - centre[0]) / SIGMA[0]) ** 2 + ((fine[:, None] - centre[1]) / SIGMA[1]) ** 2
+    square = ((fine - centre[0]) / sigma[0]) ** 2 + ((fine[:, None] - centre[1]) / sigma[1]) ** 2
     n = len(AXIS)
     return np.asarray(np.exp(-((square / 2) ** exponent)).reshape(n, 5, n, 5).mean(axis=(1, 3)))
 

@@ -141,12 +141,20 @@ def test_outside_the_table_is_said_with_its_range() -> None:
         ({"background": "free"}, "background free (the calibration: fixed)"),
         ({"radius_mm": 12.0}, "fit radius 12 mm (the calibration: 20 mm)"),
         ({"noise": "field"}, "noise field (the calibration: independent)"),
+        ({"flat_field": True}, "flat field on (the calibration: off)"),
     ],
 )
 def test_another_recipe_is_named(changes: dict[str, object], words: str) -> None:
+    same = {"normalise": "mean", "background": "fixed", "radius_mm": 20.0, "noise": "independent", "flat_field": False}
+    recipe = Recipe(flat_field=False)
+    assert recipe.differences(**same) == []
+    assert recipe.differences(**(same | changes)) == [words]
+
+
+def test_a_table_or_a_map_that_does_not_say_differs_from_none() -> None:
     same = {"normalise": "mean", "background": "fixed", "radius_mm": 20.0, "noise": "independent"}
-    assert Recipe().differences(**same) == []
-    assert Recipe().differences(**(same | changes)) == [words]
+    assert Recipe().differences(**same, flat_field=True) == []
+    assert Recipe(flat_field=True).differences(**same, flat_field=None) == []
 
 
 def test_shapes_and_ranges_are_checked() -> None:

@@ -122,7 +122,8 @@ def size(
         return
     rows = read_table(table, "size_table.table.json")
     background = _background(rows, background)
-    recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise)
+    flat_field = rows.columns["flat_field"][0]
+    recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise, flat_field=flat_field)
     rng = np.random.default_rng(seed)
     try:
         lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
@@ -191,7 +192,7 @@ def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
 
     rows = read_table(table, "population.table.json")
     fit = measuring_options().fit
-    recipe = Recipe("mean", fit.background, fit.radius_mm, declared=False, noise=fit.noise)
+    recipe = Recipe("mean", fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False)
     source = "balls in a population of bodies, scanned by the solid model"
     try:
         calibration = learn_log_quadratic(population_table(rows.columns), recipe=recipe, source=source)

@@ -153,7 +153,11 @@ def choose_calibration(
         return path, calibration, ""
     fit = _options(settings, calibration).fit
     differs = calibration.recipe.differences(
-        normalise=tactile_map.recipe.normalise, background=fit.background, radius_mm=fit.radius_mm, noise=fit.noise
+        normalise=tactile_map.recipe.normalise,
+        background=fit.background,
+        radius_mm=fit.radius_mm,
+        noise=fit.noise,
+        flat_field=tactile_map.recipe.flat_field_known,
     )
     if differs or settings.method == "optimise":
         what = "; ".join(differs) or "method optimise knows no noise field"

@@ -28,19 +28,13 @@ def write_log_quadratic(path: Path, calibration: LogQuadratic, *, provenance: Pr
 
 def log_quadratic_document(calibration: LogQuadratic, provenance: Provenance) -> dict[str, Any]:
     """The calibration as plain data, see data_schema/size_quadratic.schema.json."""
-    recipe, balls = calibration.recipe, calibration.round_lumps
+    balls = calibration.round_lumps
     return {
         "schema": SCHEMA,
         "research_use": RESEARCH_USE,
         "form": "log-quadratic",
         "source": calibration.source,
-        "recipe": {
-            "normalise": recipe.normalise,
-            "background": recipe.background,
-            "radius_mm": recipe.radius_mm,
-            "declared": recipe.declared,
-            "noise": recipe.noise,
-        },
+        "recipe": calibration.recipe.as_dict(),
         "parameters": list(PARAMETERS),
         "centre": {"log_amplitude": calibration.centre[0], "log_width": calibration.centre[1]},
         "mean": _numbers(calibration.mean),

@@ -44,6 +44,11 @@ class MapRecipe:
     flat_field: bool = False
     registered: bool = False
 
+    @property
+    def flat_field_known(self) -> bool | None:
+        """`flat_field` of a scan's map; None of an imported grid, which does not say."""
+        return self.flat_field if self.source == "scan" else None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TactileMap:

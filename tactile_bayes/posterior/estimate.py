@@ -250,6 +250,7 @@ def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuad
         background=fit.background,
         radius_mm=fit.radius_mm,
         noise=fit.noise,
+        flat_field=tactile_map.recipe.flat_field_known,
     )
     if differs:
         raise BadDataError(

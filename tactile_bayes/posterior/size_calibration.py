@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -29,6 +29,8 @@ class Recipe:
         ``"independent"`` (least squares) or ``"field"``, as in `FitOptions`.
     declared
         True when somebody said so for a table made elsewhere, False when the program made the maps itself.
+    flat_field
+        Whether the head's own response was taken off, as in `MapRecipe`; None where the table does not say.
     """
 
     normalise: str = "mean"
@@ -36,16 +38,34 @@ class Recipe:
     radius_mm: float = 20.0
     declared: bool = True
     noise: str = "independent"
+    flat_field: bool | None = None
 
-    def differences(self, *, normalise: str, background: str, radius_mm: float, noise: str) -> list[str]:
-        """What differs from another recipe, in words; empty when nothing does."""
+    def differences(
+        self, *, normalise: str, background: str, radius_mm: float, noise: str, flat_field: bool | None = None
+    ) -> list[str]:
+        """What differs from another recipe, in words; empty when nothing does. What is not known does not differ."""
         pairs = [
             ("normalise", self.normalise, normalise),
             ("background", self.background, background),
             ("fit radius", f"{self.radius_mm:g} mm", f"{radius_mm:g} mm"),
             ("noise", self.noise, noise),
         ]
+        if self.flat_field is not None and flat_field is not None:
+            words = {True: "on", False: "off"}
+            pairs.append(("flat field", words[self.flat_field], words[flat_field]))
         return [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
+
+    def __str__(self) -> str:
+        """One line of a report."""
+        parts = [f"normalise {self.normalise}", f"background {self.background}", f"fit radius {self.radius_mm:g} mm"]
+        parts.append(f"noise {self.noise}")
+        if self.flat_field is not None:
+            parts.append(f"flat field {'on' if self.flat_field else 'off'}")
+        return ", ".join(parts)
+
+    def as_dict(self) -> dict[str, object]:
+        """As a calibration's file has it; what is not known is left out."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -57,10 +57,7 @@ def calibration_text(
         lines += _terms(terms, both=both)
     recipe = calibration.recipe
     how = "declared" if recipe.declared else "as the maps were made here"
-    lines.append(
-        f"recipe ({how}): normalise {recipe.normalise}, background {recipe.background}, "
-        f"fit radius {recipe.radius_mm:g} mm, noise {recipe.noise}"
-    )
+    lines.append(f"recipe ({how}): {recipe}")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 

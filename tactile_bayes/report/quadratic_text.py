@@ -38,11 +38,7 @@ def log_quadratic_text(calibration: LogQuadratic) -> str:
     for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
         low, high = calibration.domain[name]
         lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
-    recipe = calibration.recipe
-    lines.append(
-        f"recipe: normalise {recipe.normalise}, background {recipe.background}, "
-        f"fit radius {recipe.radius_mm:g} mm, noise {recipe.noise}"
-    )
+    lines.append(f"recipe: {calibration.recipe}")
     assert len(terms) == len(QUADRATIC)
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
