@@ -32,6 +32,13 @@ def test_a_wide_rise_at_the_edge_is_no_lump_and_the_same_rise_inside_is_one():
     assert inside.status == "estimate"
 
 
+@pytest.mark.parametrize(("x", "status"), [(26.0, "no_estimate"), (20.0, "estimate")])
+def test_a_wide_rise_must_be_seen_on_every_side(x: float, status: str) -> None:
+    """The map ends 1.4 and 2 widths from its centre: 1.6 are asked for."""
+    found = look(bump_map(noise=noise(3), half_mm=40.0, amplitude=0.3, x=x, y=0.0, sigma_x=10.0, sigma_y=10.0))
+    assert found.status == status, found.reason
+
+
 def test_a_lower_lump_is_found_behind_a_rise_at_the_edge():
     both = bump_values(half_mm=40.0, amplitude=0.5, x=36.0, y=0.0, sigma_x=10.0, sigma_y=10.0)
     both += bump_values(half_mm=40.0, amplitude=0.3, x=-12.0, y=3.0, sigma_x=4.0, sigma_y=4.0) - 1.0
