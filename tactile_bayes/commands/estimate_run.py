@@ -144,6 +144,7 @@ def choose_calibration(
     """
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.estimate import recipe_differences
 
     path = size_calibration_path(settings.calibration or DEFAULT)
     if path is None:
@@ -152,13 +153,7 @@ def choose_calibration(
     if settings.calibration is not None:
         return path, calibration, ""
     fit = _options(settings, calibration).fit
-    differs = calibration.recipe.differences(
-        normalise=tactile_map.recipe.normalise,
-        background=fit.background,
-        radius_mm=fit.radius_mm,
-        noise=fit.noise,
-        flat_field=tactile_map.recipe.flat_field_known,
-    )
+    differs = recipe_differences(tactile_map, calibration, fit)
     if differs or settings.method == "optimise":
         what = "; ".join(differs) or "method optimise knows no noise field"
         return None, None, f"the shipped calibration does not fit: {what}; widths only"

@@ -243,15 +243,22 @@ def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: E
     return prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior)
 
 
-def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic, fit: FitOptions) -> None:
-    """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
-    differs = calibration.recipe.differences(
+def recipe_differences(
+    tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic, fit: FitOptions
+) -> list[str]:
+    """What differs between a map with its fit and the calibration's recipe, in words; empty when nothing does."""
+    return calibration.recipe.differences(
         normalise=tactile_map.recipe.normalise,
         background=fit.background,
         radius_mm=fit.radius_mm,
         noise=fit.noise,
         flat_field=tactile_map.recipe.flat_field_known,
     )
+
+
+def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic, fit: FitOptions) -> None:
+    """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
+    differs = recipe_differences(tactile_map, calibration, fit)
     if differs:
         raise BadDataError(
             f"the size calibration was learned by another recipe: {'; '.join(differs)}",

@@ -7,13 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.beside import ribs, rises
+from tactile_bayes.posterior.beside import GRID_ANGLES, ribs, rises
 from tactile_bayes.posterior.field_posterior import FieldFit
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.scene_choice import Fitter, SceneChoice
 from tactile_bayes.posterior.surroundings import Surroundings
-
-ANGLES = 12
 
 
 def ridge_instead(choice: SceneChoice, surroundings: Surroundings) -> FieldFit | None:
@@ -48,9 +46,9 @@ def _starts(choice: SceneChoice, fitter: Fitter, places: FloatArray) -> Iterator
 
 def _through_bump(fit: FieldFit, fitter: Fitter) -> FloatArray:
     """(g, 3) ridges as wide as the bump through its centre, in all directions."""
-    angle = np.pi * np.arange(ANGLES) / ANGLES
+    angle = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
     x, y = (float(fit.scene.column(fit.mode, name)) - m for name, m in zip("xy", fitter.window.middle, strict=True))
-    width = np.full(ANGLES, float(fit.scene.widths(fit.mode)[0]))
+    width = np.full(GRID_ANGLES, float(fit.scene.widths(fit.mode)[0]))
     return np.stack([width, angle, x * np.cos(angle) + y * np.sin(angle)], axis=1)
 
 
