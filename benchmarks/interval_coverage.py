@@ -280,7 +280,8 @@ def report_sizes(rows: list[Row]) -> None:
 def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.log_quadratic import PARAMETERS, LogQuadratic
+    from tactile_bayes.posterior.fat_depth import head_profile
+    from tactile_bayes.posterior.log_quadratic import LogQuadratic
     from tactile_bayes.posterior.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
 
     path = size_calibration_path(DEFAULT)
@@ -288,15 +289,17 @@ def _size_mass(bodies: str, index: int) -> Row:
     calibration = read_size_calibration(path)
     assert isinstance(calibration, LogQuadratic)
     scenes = draw_mass(index, scans=3, seed=SEED) if bodies == "population" else draw_mass_like_trial(index, seed=SEED)
-    known = SizePriors(BetweenMaps(float(np.exp(calibration.mean[PARAMETERS.index("log_exam_sd")])), 0.0))
     lump, shapes, single = scenes[0].solid_lumps[0], [], []
-    for found in _estimates(scenes, calibration):
-        if found is None or found.map_posterior is None or found.size is None:
+    for tactile_map, found in _estimates(scenes, calibration):
+        if tactile_map is None or found is None or found.map_posterior is None or found.size is None:
             shapes.append(None)
             single.append(None)
             continue
         one = found.map_posterior
-        shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad))
+        profile = head_profile(tactile_map.quality)
+        shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad, profile=profile))
+        exam_sd = float(np.exp(calibration.at_fat([profile]).mean[-1]))
+        known = SizePriors(BetweenMaps(exam_sd, 0.0))
         told = pooled_size([shapes[-1]], calibration=calibration, priors=known, rng=np.random.default_rng(index))
         single.append(_intervals(found.size.max_size_mm) | {"known": _intervals(told.max_size_mm)})
     pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))
@@ -309,16 +312,17 @@ def _size_mass(bodies: str, index: int) -> Row:
     }
 
 
-def _estimates(scenes: Sequence[Scene], calibration: Any) -> Iterator[Estimate | None]:
+def _estimates(scenes: Sequence[Scene], calibration: Any) -> Iterator[tuple[TactileMap | None, Estimate | None]]:
     recipe = calibration.recipe
     fit = FitOptions(recipe.background, recipe.radius_mm, "auto", None, recipe.noise)
     for scene in scenes:
         rng = np.random.default_rng([SEED, scene.seed])
         try:
             tactile_map = build_map(simulate(scene, rng=rng).scan)
-            yield estimate_map(tactile_map, calibration=calibration, options=EstimateOptions(fit=fit), rng=rng)
+            options = EstimateOptions(fit=fit)
+            yield tactile_map, estimate_map(tactile_map, calibration=calibration, options=options, rng=rng)
         except TactileBayesError:
-            yield None
+            yield None, None
 
 
 def _intervals(draws: FloatArray) -> dict[str, Any]:

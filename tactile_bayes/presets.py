@@ -25,6 +25,9 @@ CELL_PER_SIGMA: Final = 0.75
 # Radius about the lump's centre inside which the map is fitted, where no size calibration says otherwise.
 FIT_RADIUS_MM: Final = 20.0
 
+# Figures of a map: how pressure is spread over the head where it feels no lump, see `mapping.head_profile`.
+HEAD_PROFILE: Final = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
+
 NORMALISE: Final = ("mean", "gain", "none")
 METHODS: Final = ("optimise", "laplace", "importance", "ensemble")
 NOISE: Final = ("independent", "field")

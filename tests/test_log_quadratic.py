@@ -13,13 +13,8 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_quadratic_json import write_log_quadratic
-from tactile_bayes.posterior.learn_log_quadratic import (
-    PopulationTable,
-    _held,
-    _Regression,
-    learn_log_quadratic,
-    left_out_errors,
-)
+from tactile_bayes.posterior.body_regression import BodyRegression, PopulationTable, held, left_out_errors
+from tactile_bayes.posterior.learn_log_quadratic import learn_log_quadratic
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.size_calibration import Recipe
 
@@ -87,11 +82,11 @@ def test_errors_of_bodies_left_out_are_those_of_refitting():
 def test_intervals_of_bodies_left_out_hold_as_often_as_they_say():
     """Spreads that are right hold nine in ten; half of them hold 59 % (a normal's 0.822 SD each way)."""
     many = learn_log_quadratic(population(bodies=400), recipe=RECIPE)
-    data = _Regression.of(population(bodies=400), many.centre)
+    data = BodyRegression.of(population(bodies=400), many.terms)
     error = left_out_errors(data.mean_terms, data.mean_log_d)
     assert many.fit["left_out_held_percent"] == pytest.approx(90, abs=4)
     halved = many.mean + np.array([0.0] * 6 + [-np.log(2), 0.0, -np.log(2)])
-    assert 100 * _held(data, halved, error) == pytest.approx(59, abs=7)
+    assert 100 * held(data, halved, error) == pytest.approx(59, abs=7)
 
 
 def test_spread_between_bodies_and_between_exams_is_told_apart(learned):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.posterior.log_quadratic import HiddenTerms, LogQuadratic, RoundLumps
+from tactile_bayes.posterior.body_terms import HiddenTerms, RoundLumps
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.pooling import (
     BetweenMaps,
     ShapeDraws,

@@ -74,7 +74,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
 
     from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.posterior.estimate import estimate_map
+    from tactile_bayes.posterior.estimate import calibration_for, estimate_map
 
     tactile_map = read_map(path)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
@@ -96,7 +96,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     if why_none and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none)
     if calibration is not None and estimate.size is not None:
-        words = _calibration_words(settings, calibration)
+        words = _calibration_words(settings, calibration_for(tactile_map, calibration))
         estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
     recorded = {
         "size_calibration": settings.calibration or ("solid (shipped)" if calibration is not None else "none"),
@@ -121,12 +121,12 @@ def _calibration_words(settings: Settings, calibration: SizeCalibration | LogQua
     """Which calibration gave the size, and what it cannot know."""
     from tactile_bayes.files.shipped import DEFAULT, SHIPPED
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
-    from tactile_bayes.report.quadratic_text import unknowns_text
+    from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
 
     name = settings.calibration or DEFAULT
     words = f"Sizes by the {'shipped calibration ' if name in SHIPPED else 'calibration '}{name}"
     if isinstance(calibration, LogQuadratic):
-        words += f" ({calibration.source}); {unknowns_text(calibration.unknowns)}"
+        words += f" ({calibration.source}); {fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
     return words
 
 
@@ -222,6 +222,7 @@ def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     """What pooling needs of a map, with the direction of its axes in the patient where landmarks tell."""
     import math
 
+    from tactile_bayes.posterior.fat_depth import head_profile
     from tactile_bayes.posterior.pooling import ShapeDraws
 
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
@@ -229,5 +230,10 @@ def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
         return None
     angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
     return ShapeDraws.of(
-        posterior.amplitude, posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.angle_rad, turn_rad=angle
+        posterior.amplitude,
+        posterior.sigma_x_mm,
+        posterior.sigma_y_mm,
+        posterior.angle_rad,
+        turn_rad=angle,
+        profile=head_profile(tactile_map.quality),
     )

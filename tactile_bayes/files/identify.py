@@ -171,6 +171,7 @@ def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
             "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
             **{name: document[name] for name in kept},
             "variance_taken_away_by_knowing": calibration.unknowns,
+            **({} if calibration.fat_cubic is None else {"with_depth_of_fat": dict(calibration.fat_cubic.fit)}),
         }
     return {
         "schema": document["schema"],

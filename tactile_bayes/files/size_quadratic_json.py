@@ -11,7 +11,10 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
-from tactile_bayes.posterior.log_quadratic import PARAMETERS, HiddenTerms, LogQuadratic, RoundLumps
+from tactile_bayes.files.size_fat_json import fat_document, parse_fat
+from tactile_bayes.files.size_parts_json import hidden_document, number, numbers, parse_hidden
+from tactile_bayes.posterior.body_terms import RoundLumps
+from tactile_bayes.posterior.log_quadratic import PARAMETERS, QUADRATIC, LogQuadratic
 from tactile_bayes.posterior.size_calibration import Recipe
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -37,18 +40,19 @@ def log_quadratic_document(calibration: LogQuadratic, provenance: Provenance) ->
         "recipe": calibration.recipe.as_dict(),
         "parameters": list(PARAMETERS),
         "centre": {"log_amplitude": calibration.centre[0], "log_width": calibration.centre[1]},
-        "mean": _numbers(calibration.mean),
-        "covariance": _numbers(calibration.covariance),
+        "mean": numbers(calibration.mean),
+        "covariance": numbers(calibration.covariance),
         "round_lumps": {
-            "coefficients": _numbers(balls.coefficients),
-            "body_sd": _number(balls.body_sd),
-            "exam_sd": _number(balls.exam_sd),
+            "coefficients": numbers(balls.coefficients),
+            "body_sd": number(balls.body_sd),
+            "exam_sd": number(balls.exam_sd),
         },
-        "information_inverse": _numbers(calibration.information_inverse),
-        "most_leverage": _number(calibration.most_leverage),
-        "domain": {name: [_number(low), _number(high)] for name, (low, high) in calibration.domain.items()},
-        "hidden": None if calibration.hidden is None else _hidden_document(calibration.hidden),
-        "fit": {name: _number(value) for name, value in calibration.fit.items()},
+        "information_inverse": numbers(calibration.information_inverse),
+        "most_leverage": number(calibration.most_leverage),
+        "domain": {name: [number(low), number(high)] for name, (low, high) in calibration.domain.items()},
+        "hidden": None if calibration.hidden is None else hidden_document(calibration.hidden),
+        "fit": {name: number(value) for name, value in calibration.fit.items()},
+        **({} if calibration.fat_cubic is None else {"fat_cubic": fat_document(calibration.fat_cubic)}),
         "provenance": provenance.as_dict(),
     }
 
@@ -74,40 +78,10 @@ def parse_log_quadratic(document: dict[str, Any], *, path: Path) -> LogQuadratic
             most_leverage=float(document["most_leverage"]),
             domain={name: (float(low), float(high)) for name, (low, high) in document["domain"].items()},
             recipe=Recipe(**document["recipe"]),
-            hidden=_hidden(document["hidden"]),
+            hidden=parse_hidden(document["hidden"], terms=len(QUADRATIC)),
             fit={name: float(value) for name, value in document["fit"].items()},
             source=document["source"],
+            fat_cubic=parse_fat(document["fat_cubic"]) if "fat_cubic" in document else None,
         )
     except BadDataError as error:
         raise error.at(path) from None
-
-
-def _hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
-    return {
-        "names": list(hidden.names),
-        "expected": _numbers(hidden.expected),
-        "covariance": _numbers(hidden.covariance),
-        "with_body": _numbers(hidden.with_body),
-        "body_variance": _number(hidden.body_variance),
-    }
-
-
-def _hidden(document: dict[str, Any] | None) -> HiddenTerms | None:
-    if document is None:
-        return None
-    names, k = tuple(document["names"]), len(document["names"])
-    arrays = [np.asarray(document[name], dtype=np.float64) for name in ("expected", "covariance", "with_body")]
-    if [array.shape for array in arrays] != [(k, 6), (k, k), (k,)]:
-        raise BadDataError("hidden has arrays of other sizes than its names", way_out="learn the calibration anew")
-    expected, covariance, with_body = arrays
-    return HiddenTerms(names, expected, covariance, with_body, float(document["body_variance"]))
-
-
-def _number(value: float) -> float:
-    return float(f"{value:.9g}")
-
-
-def _numbers(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Any]:
-    if values.ndim == 1:
-        return [_number(value) for value in values]
-    return [_numbers(row) for row in values]

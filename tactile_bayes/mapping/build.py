@@ -14,6 +14,7 @@ from tactile_bayes.mapping.convention import check_convention, hint
 from tactile_bayes.mapping.engine import Engine, choose_engine
 from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
+from tactile_bayes.mapping.head_profile import head_profile_figures
 from tactile_bayes.mapping.latency import estimate_latency
 from tactile_bayes.mapping.neighbourhood import local_plane
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
@@ -98,6 +99,7 @@ def build_map(
     figures: dict[str, float] = {}
     late_ms = 0.0 if isinstance(latency_ms, str) else float(latency_ms)
     selections = rules.select(parts, late_ms)
+    figures |= head_profile_figures(selections)
     if flat_field:
         selections = _flattened(selections, rules, late_ms, figures)
     if isinstance(latency_ms, str):

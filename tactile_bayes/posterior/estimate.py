@@ -16,6 +16,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.chain_state import ChainStore
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
+from tactile_bayes.posterior.fat_depth import head_profile
 from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions
 from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
@@ -160,6 +161,7 @@ def estimate_map(
     _check_options(options)
     if calibration is not None:
         check_recipe(tactile_map, calibration, options.fit)
+        calibration = calibration_for(tactile_map, calibration)
     if not tactile_map.covered.any():
         return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place"))
     candidates, seen = search(tactile_map, options)
@@ -241,6 +243,15 @@ def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: E
     if size is not None:
         quantities["max_size_mm"] = size.max_size_mm
     return prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior)
+
+
+def calibration_for(
+    tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic
+) -> SizeCalibration | LogQuadratic:
+    """The calibration for the depth of fat that the map tells, where both know of it."""
+    if not isinstance(calibration, LogQuadratic):
+        return calibration
+    return calibration.at_fat([head_profile(tactile_map.quality)])
 
 
 def recipe_differences(
@@ -349,6 +360,7 @@ def _diagnostics(
         "covered_share": fit.covered_share,
         "coarse_cells": tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(sigma_x, sigma_y),
         "outside_calibration": outside,
+        **({"fat_mm": calibration.fat_mm} if isinstance(calibration, LogQuadratic) else {}),
     }
 
 
@@ -366,4 +378,6 @@ def _left_out(
         notes.append("spread between maps of one mass (15 % in the paper): this is one map")
     if isinstance(calibration, SizeCalibration) and calibration.axes == ("both",):
         notes.append("a difference between the head's axes: the calibration has one width")
+    if isinstance(calibration, LogQuadratic) and calibration.fat_note:
+        notes.append(f"the depth of the fat, which would narrow the size: {calibration.fat_note}")
     return tuple(notes)

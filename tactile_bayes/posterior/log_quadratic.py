@@ -8,80 +8,29 @@ With :math:`u = \ln a - \alpha_0` and :math:`v = p - p_0`, where p is the log of
 B differs from body to body, :math:`N(0, s\,e^{g u})`: what a map does not show (seat, stiffness, moduli). E differs
 from exam to exam of one body. A ball under the oblong head gives an oval map; its half log axis ratio is
 :math:`q_0 = \gamma_0 + \gamma_1 u + \gamma_2 v`, and only what exceeds it says that a lump is not round.
+
+Where the depth F of the fat under the head is known it is of third order, `fat_depth.FatCubic` at that depth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.body_terms import HiddenTerms, RoundLumps
+from tactile_bayes.posterior.fat_depth import ORDER as FAT_ORDER
+from tactile_bayes.posterior.fat_depth import SPREADS, FatCubic
+from tactile_bayes.posterior.monomials import monomials, powers
 from tactile_bayes.posterior.size_calibration import Recipe
 
 QUADRATIC = ("1", "u", "v", "u2", "uv", "v2")
 PARAMETERS = (*QUADRATIC, "log_body_sd", "body_sd_slope", "log_exam_sd")
-LOGGED = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
-"""Properties that enter by their logarithm."""
 MOST_LEVERAGE = 1.0
 """A map is outside the table where its leverage exceeds this multiple of the table's largest."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RoundLumps:
-    """The oval that a ball's map is, and how far single maps stray from it.
-
-    Parameters
-    ----------
-    coefficients : (3,) array
-        Of 1, u and v in q0.
-    body_sd, exam_sd
-        Of the excess q - q0 between bodies, and between exams of one body.
-    """
-
-    coefficients: FloatArray
-    body_sd: float
-    exam_sd: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HiddenTerms:
-    """What goes into B: properties of a body that no map shows, jointly normal with it given the map.
-
-    Parameters
-    ----------
-    names
-        Of k properties; those in `LOGGED` enter by their logarithm.
-    expected : (k, 6) array
-        Coefficients of `QUADRATIC` in what a map leads one to expect of each.
-    covariance : (k, k) array
-        About that.
-    with_body : (k,) array
-        Covariance with B.
-    body_variance
-        Of B in the same table.
-    """
-
-    names: tuple[str, ...]
-    expected: FloatArray
-    covariance: FloatArray
-    with_body: FloatArray
-    body_variance: float
-
-    def share(self, *names: str) -> float:
-        """Share of B's variance that goes when these are known."""
-        at = [self.names.index(name) for name in names]
-        gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
-        return float(np.clip(gain @ self.with_body[at] / self.body_variance, 0.0, 1.0))
-
-    def expected_body(self, known: Mapping[str, float], terms: FloatArray) -> FloatArray:
-        """(...,) mean of B when some are known, for (..., 6) terms of the map."""
-        at = [self.names.index(name) for name in known]
-        gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
-        given = np.array([np.log(v) if name in LOGGED else v for name, v in known.items()])
-        return np.asarray((given - terms @ self.expected[at].T) @ gain)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,10 +42,11 @@ class LogQuadratic:
     centre
         alpha_0 and p_0.
     mean, covariance : (9,), (9, 9) arrays
-        Posterior of `PARAMETERS`, taken as normal.
+        Posterior of `PARAMETERS`, taken as normal; (13,) and (13, 13), with the terms of third order before the
+        spreads, at a known depth.
     round_lumps
         What a ball's map looks like.
-    information_inverse : (6, 6) array
+    information_inverse : (6, 6) or (10, 10) array
         Inverse of X^T X over the table: gives the leverage of a new map.
     most_leverage
         Largest in the table.
@@ -110,6 +60,12 @@ class LogQuadratic:
         Figures of the fit.
     source
         In words: what the table was made of.
+    fat_cubic
+        The same for maps that tell how deep the fat under the head is; None where the table did not.
+    fat_mm
+        Depth F that this calibration is for; None where it is for any.
+    fat_note
+        Why the depth is not used though the calibration could; empty otherwise.
     """
 
     centre: tuple[float, float]
@@ -123,9 +79,12 @@ class LogQuadratic:
     hidden: HiddenTerms | None = None
     fit: Mapping[str, float] = field(default_factory=dict)
     source: str = ""
+    fat_cubic: FatCubic | None = None
+    fat_mm: float | None = None
+    fat_note: str = ""
 
     def __post_init__(self) -> None:
-        k = len(PARAMETERS)
+        k = len(PARAMETERS) if self.fat_mm is None else len(powers(FAT_ORDER)) + SPREADS
         if self.mean.shape != (k,) or self.covariance.shape != (k, k):
             raise BadDataError(
                 f"mean and covariance have shapes {self.mean.shape} and {self.covariance.shape}",
@@ -136,29 +95,62 @@ class LogQuadratic:
         if np.linalg.eigvalsh(self.covariance)[0] < -1e-9 * np.trace(self.covariance):
             raise BadDataError("the covariance has a negative eigenvalue", way_out="learn the calibration anew")
 
+    def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> LogQuadratic:
+        """The calibration for a mass whose maps have these `presets.HEAD_PROFILE`, None for a map without one.
+
+        Where they tell no depth it is this one, with the reason in `fat_note`.
+        """
+        cubic = self.fat_cubic
+        if cubic is None:
+            return self
+        log_depth, why_not = cubic.log_depth(profiles)
+        if log_depth is None:
+            return replace(self, fat_cubic=None, fat_note=why_not)
+        at = cubic.contraction(log_depth)
+        whole = np.block([[at, np.zeros((len(at), SPREADS))], [np.zeros((SPREADS, at.shape[1])), np.eye(SPREADS)]])
+        hidden = cubic.hidden
+        return replace(
+            self,
+            centre=cubic.centre[:2],
+            mean=whole @ cubic.mean,
+            covariance=whole @ cubic.covariance @ whole.T,
+            round_lumps=cubic.round_lumps(log_depth),
+            information_inverse=at @ cubic.information_inverse @ at.T,
+            most_leverage=cubic.most_leverage,
+            hidden=None if hidden is None else replace(hidden, expected=hidden.expected @ at.T),
+            fit=cubic.fit,
+            fat_cubic=None,
+            fat_mm=float(np.exp(log_depth)),
+        )
+
     @property
     def unknowns(self) -> dict[str, float]:
         """Share of the variance between bodies that knowing each property alone would take away."""
         return {} if self.hidden is None else {name: self.hidden.share(name) for name in self.hidden.names}
 
     def terms(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
-        """(..., 6) terms of the quadratic."""
-        return quadratic_terms(log_amplitude - self.centre[0], log_width - self.centre[1])
+        """(..., 6) terms of the quadratic, or (..., 10)."""
+        return monomials((log_amplitude - self.centre[0], log_width - self.centre[1]), self._powers)
+
+    @property
+    def _powers(self) -> tuple[tuple[int, int], ...]:
+        return powers(2 if self.fat_mm is None else FAT_ORDER)
 
     def log_size(self, log_amplitude: FloatArray, log_width: FloatArray, draws: FloatArray | None = None) -> FloatArray:
-        """(...,) ln d without B and E, with the mean coefficients or with (..., 9) draws of them."""
+        """(...,) ln d without B and E, with the mean coefficients or with (..., n) draws of them."""
         coefficients = self.mean if draws is None else draws
-        return np.asarray(np.sum(self.terms(log_amplitude, log_width) * coefficients[..., :6], axis=-1))
+        return np.asarray(np.sum(self.terms(log_amplitude, log_width) * coefficients[..., :-SPREADS], axis=-1))
 
     def width_slope(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) derivative of ln d by p: how much longer an axis is for a wider map."""
-        b = self.mean
-        return np.asarray(b[2] + b[4] * (log_amplitude - self.centre[0]) + 2.0 * b[5] * (log_width - self.centre[1]))
+        b = np.array([j for _, j in self._powers]) * self.mean[:-SPREADS]
+        lower = [(i, max(j - 1, 0)) for i, j in self._powers]
+        return np.asarray(monomials((log_amplitude - self.centre[0], log_width - self.centre[1]), lower) @ b)
 
     def body_sd(self, log_amplitude: FloatArray, draws: FloatArray | None = None) -> FloatArray:
         """(...,) standard deviation of B."""
         p = self.mean if draws is None else draws
-        return np.asarray(np.exp(p[..., 6] + p[..., 7] * (log_amplitude - self.centre[0])))
+        return np.asarray(np.exp(p[..., -3] + p[..., -2] * (log_amplitude - self.centre[0])))
 
     def round_excess(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) q0, the half log axis ratio of a ball's map."""
@@ -166,7 +158,7 @@ class LogQuadratic:
         return np.asarray(c[0] + c[1] * (log_amplitude - self.centre[0]) + c[2] * (log_width - self.centre[1]))
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """(number, 9) draws of `PARAMETERS`."""
+        """(number, n) draws of the parameters."""
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         return np.asarray(self.mean + rng.standard_normal((number, len(self.mean))) @ root.T)
@@ -191,4 +183,4 @@ class LogQuadratic:
 
 def quadratic_terms(u: FloatArray, v: FloatArray) -> FloatArray:
     """(..., 6) terms `QUADRATIC` of centred ln a and p."""
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    return monomials((u, v), powers(2))

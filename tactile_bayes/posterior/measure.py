@@ -13,11 +13,13 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.body_regression import PopulationTable
+from tactile_bayes.posterior.body_terms import LOGGED
 from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+from tactile_bayes.posterior.fat_depth import head_profile
 from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.learn_log_quadratic import PopulationTable
-from tactile_bayes.posterior.log_quadratic import LOGGED
 from tactile_bayes.posterior.pooling import ShapeDraws
+from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import Scan
 
 UNKNOWNS = ("depth_mm", "stiffness_ratio", "seat", "fat_kpa", "gland_ratio", "thickness_mm")
@@ -51,6 +53,9 @@ class MassRow:
         Medians.
     var_log_a ... var_q
         Posterior covariance of ln a, p and q (p and q: half sum and half difference of the logs of the widths).
+    head_profile_x2, head_profile_y2, head_profile_y4
+        How pressure was spread over the head where it felt no lump, see `mapping.head_profile`; None where it always
+        felt one.
     """
 
     body: int
@@ -73,6 +78,9 @@ class MassRow:
     var_p: float | None = None
     cov_p_q: float | None = None
     var_q: float | None = None
+    head_profile_x2: float | None = None
+    head_profile_y2: float | None = None
+    head_profile_y4: float | None = None
 
 
 def measure_mass(scenes: Sequence[Scene], *, body: int, scan: Callable[[Scene], Scan]) -> list[MassRow]:
@@ -105,7 +113,10 @@ def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int) -> MassRow:
     )
     try:
         tactile_map = build_map(scan)
-        return replace(row, mean_kpa=tactile_map.quality["mean_pressure_kpa"], **_measured(tactile_map))
+        quality = tactile_map.quality
+        profile: dict[str, Any] = {name: quality.get(name) for name in HEAD_PROFILE}
+        row = replace(row, mean_kpa=quality["mean_pressure_kpa"], **profile)
+        return replace(row, **_measured(tactile_map))
     except TactileBayesError:
         return row
 
@@ -131,7 +142,10 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
 
 
 def population_table(columns: Mapping[str, Sequence[float | None]]) -> PopulationTable:
-    """The detected rows of a table with the fields of `MassRow`, as the learning needs them."""
+    """The detected rows of a table with the fields of `MassRow`, as the learning needs them.
+
+    Profiles of the head are used where every detected row has one.
+    """
     kept = [i for i, found in enumerate(columns["detected"]) if found]
 
     def column(name: str) -> FloatArray:
@@ -143,6 +157,8 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
     sigma_x, sigma_y = np.log(column("sigma_x_mm")), np.log(column("sigma_y_mm"))
     varied = {name: column(name) for name in UNKNOWNS if name in columns}
     varied = {"depth_mm": column("depth_ratio") * column("d_mm"), **varied}
+    profile = _profiles(columns, kept)
+    boundary = (column("depth_ratio") + column("seat") / 2) * column("d_mm")
     return PopulationTable(
         body=np.array([columns["body"][i] for i in kept]),
         d_mm=column("d_mm"),
@@ -151,4 +167,20 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
         half_log_ratio=(sigma_x - sigma_y) / 2,
         covariance=covariance,
         unknowns={name: np.log(varied[name]) if name in LOGGED else varied[name] for name in UNKNOWNS},
+        profile=profile,
+        log_fat=None if profile is None else np.log(boundary),
     )
+
+
+def _profiles(columns: Mapping[str, Sequence[float | None]], kept: Sequence[int]) -> FloatArray | None:
+    """(n, 3) `presets.HEAD_PROFILE` of the rows kept; None where one of them has none."""
+    if not all(name in columns for name in HEAD_PROFILE):
+        return None
+    found = []
+    for i in kept:
+        quality = {name: value for name in HEAD_PROFILE if (value := columns[name][i]) is not None}
+        one = head_profile(quality)
+        if one is None:
+            return None
+        found.append(one)
+    return np.array(found, dtype=np.float64)

@@ -9,7 +9,7 @@ no map shows of a body, is common to all of them and does not average out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -68,6 +68,8 @@ class ShapeDraws:
         Half log axis ratio along the map's x axis and 45 degrees from it.
     turn_rad
         From the axes that the maps of a mass share to this map's.
+    profile
+        `presets.HEAD_PROFILE` of the map; None where it has none.
     """
 
     log_amplitude: FloatArray
@@ -75,6 +77,7 @@ class ShapeDraws:
     q: FloatArray
     r: FloatArray
     turn_rad: float = 0.0
+    profile: tuple[float, ...] | None = None
 
     @classmethod
     def of(
@@ -85,6 +88,7 @@ class ShapeDraws:
         angle_rad: FloatArray,
         *,
         turn_rad: float = 0.0,
+        profile: tuple[float, ...] | None = None,
     ) -> ShapeDraws:
         """From draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -92,11 +96,12 @@ class ShapeDraws:
         half = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel()
         angle = angle_rad.ravel()
         p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
-        return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad)
+        return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad, profile)
 
     def rows(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> ShapeDraws:
         """Some of the draws."""
-        return ShapeDraws(self.log_amplitude[index], self.log_width[index], self.q[index], self.r[index], self.turn_rad)
+        drawn = {name: getattr(self, name)[index] for name in ("log_amplitude", "log_width", "q", "r")}
+        return replace(self, **drawn)
 
 
 def pooled_size(
@@ -107,7 +112,7 @@ def pooled_size(
     rng: np.random.Generator,
     number: int | None = None,
 ) -> SizePosterior:
-    """Size of a mass from its maps.
+    """Size of a mass from its maps, with the calibration for the depth of fat that they tell.
 
     Parameters
     ----------
@@ -122,6 +127,7 @@ def pooled_size(
         Draws of shape (n,). `figures` holds ``between_map_sd`` (median), ``oval_probability``,
         ``oval_half_log_ratio`` and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
     """
+    calibration = calibration.at_fat([one.profile for one in maps])
     n = len(maps[0].log_amplitude) if number is None else number
     used = [m if number is None and len(maps) == 1 else m.rows(rng.integers(len(m.q), size=n)) for m in maps]
     log_size = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
@@ -184,6 +190,8 @@ class PooledEstimate:
         Places of the maps that lie apart from the rest.
     outside
         How maps lie outside the calibration's table, in words.
+    calibration
+        The one used: for the depth of fat that the maps tell, where they do.
     """
 
     status: str
@@ -192,6 +200,7 @@ class PooledEstimate:
     centres: Mapping[int, float] = field(default_factory=dict)
     outlying: tuple[int, ...] = ()
     outside: tuple[str, ...] = ()
+    calibration: LogQuadratic | None = None
 
 
 def pool_maps(
@@ -209,6 +218,7 @@ def pool_maps(
     if 2 * len(found) < len(shapes) or not found:
         return PooledEstimate("no_estimate", f"a lump was found on {len(found)} of {len(shapes)} maps")
     used = [shape for shape in shapes if shape is not None]
+    calibration = calibration.at_fat([one.profile for one in used])
     size = pooled_size(used, calibration=calibration, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
@@ -222,7 +232,7 @@ def pool_maps(
         outside += [f"map {i + 1}: {text}" for text in calibration.outside(amplitude, width)]
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
     outlying = tuple(found[i] for i in size.outliers)
-    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside))
+    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration)
 
 
 def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> tuple[int, ...]:

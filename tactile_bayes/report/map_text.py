@@ -87,7 +87,7 @@ def _timing(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
 
 
 def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """What shifting the strokes onto each other found, and the head's own response."""
+    """What shifting the strokes onto each other found, the head's own pressure profile and response."""
     quality = tactile_map.quality
     if "strokes" in quality:
         known = f"{quality['strokes_known']:.0f} of {quality['strokes']:.0f} shifted onto each other"
@@ -101,6 +101,10 @@ def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     if "mobility_mm" in quality:
         moved = f"{quality['mobility_mm']:.2f} +- {quality['mobility_sd_mm']:.2f} mm with the head"
         yield "mobility", f"{moved} (a latency left in the poses looks alike)"
+    if "head_profile_frames" in quality:
+        across, along = (quality[f"head_profile_{axis}2"] for axis in "xy")
+        frames = f"from {quality['head_profile_frames']:.0f} frames without a lump"
+        yield "head profile", f"second order {across:+.3f} across, {along:+.3f} along, {frames}"
     if "flat_field_frames" in quality:
         spread = 100 * quality["flat_field_sd"]
         yield (

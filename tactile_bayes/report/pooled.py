@@ -12,7 +12,7 @@ from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.pooling import PooledEstimate
 from tactile_bayes.posterior.quantity import summarise
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.quadratic_text import unknowns_text
+from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
 from tactile_bayes.report.size_text import shape_text, variance_text
 
 SCHEMA = "tactile-bayes/pooled/1"
@@ -34,7 +34,7 @@ def pooled_document(
     names, documents
         Of the maps, with what `estimate` says of each.
     """
-    size = pooled.size
+    size, used = pooled.size, pooled.calibration or calibration
     sizes: dict[str, Any] = {"max_size_mm": None, "min_size_mm": None}
     if size is not None:
         draws = {"max_size_mm": size.max_size_mm, "min_size_mm": size.min_size_mm}
@@ -50,7 +50,8 @@ def pooled_document(
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
-        "unknowns": {name: _round(share) for name, share in calibration.unknowns.items()},
+        "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
+        "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
         "outside_calibration": list(pooled.outside),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
@@ -82,7 +83,7 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines += ["", variance_text(document["variance_share"])]
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} % (median).")
     lines.append(shape_text(figures))
-    lines.append(_unknowns(document["unknowns"]))
+    lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
     lines += [f"Outside the calibration's range: {text}." for text in document["outside_calibration"]]
     if document["reason"]:
         lines.append(f"{document['reason']}.")
@@ -96,8 +97,8 @@ def _map_line(one: Mapping[str, Any]) -> str:
     return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{apart}"
 
 
-def _unknowns(shares: Mapping[str, float]) -> str:
-    text = unknowns_text(shares)
+def _unknowns(shares: Mapping[str, float], fat_mm: float | None) -> str:
+    text = fat_text(fat_mm) + unknowns_text(shares)
     return text[0].upper() + text[1:] + "."
 
 

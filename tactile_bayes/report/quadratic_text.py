@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from tactile_bayes.posterior.fat_depth import FatCubic
 from tactile_bayes.posterior.log_quadratic import QUADRATIC, LogQuadratic
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -30,17 +31,44 @@ def log_quadratic_text(calibration: LogQuadratic) -> str:
         f"between bodies, SD of ln d {np.exp(calibration.mean[6]):.3f} (times e^({calibration.mean[7]:+.2f} u)), "
         f"between exams of a body {np.exp(calibration.mean[8]):.3f}",
         unknowns_text(calibration.unknowns),
-        f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; each body left out in turn: "
-        f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
-        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %"
-        + (f", {fit['left_out_held_percent']:.0f} % in their 90 % interval" if "left_out_held_percent" in fit else ""),
+        f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; {_left_out_text(fit)}",
     ]
     for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
         low, high = calibration.domain[name]
         lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
     lines.append(f"recipe: {calibration.recipe}")
+    if calibration.fat_cubic is not None:
+        lines += _fat_lines(calibration.fat_cubic)
     assert len(terms) == len(QUADRATIC)
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _left_out_text(fit: Mapping[str, float]) -> str:
+    held = f", {fit['left_out_held_percent']:.0f} % in their 90 % interval" if "left_out_held_percent" in fit else ""
+    return (
+        "each body left out in turn: "
+        f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
+        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %{held}"
+    )
+
+
+def _fat_lines(cubic: FatCubic) -> list[str]:
+    """What knowing the depth of the fat, from the pressure over the head, does to all that."""
+    low, high = cubic.fat_mm
+    fit = cubic.fit
+    return [
+        f"for maps that tell the depth of the fat, {low:.3g} to {high:.3g} mm, to {100 * cubic.depth.log_sd:.1f} %: "
+        "ln d as a cubic in u, v and its logarithm",
+        f"between bodies, SD of ln d {fit.get('body_sd', float('nan')):.3f}, "
+        f"between exams of a body {fit.get('exam_sd', float('nan')):.3f}; {_left_out_text(fit)}",
+    ]
+
+
+def fat_text(fat_mm: float | None) -> str:
+    """The depth of fat that the sizes are for, as the beginning of `unknowns_text`; nothing where it is not used."""
+    if fat_mm is None:
+        return ""
+    return f"{fat_mm:.1f} mm of fat under the head, by how its pressure is spread where it feels no lump; "
 
 
 def unknowns_text(unknowns: Mapping[str, float]) -> str:

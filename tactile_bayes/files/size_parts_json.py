@@ -1,0 +1,45 @@
+"""Parts that the documents of log-quadratic calibrations share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.posterior.body_terms import HiddenTerms
+
+
+def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
+    """As plain data."""
+    return {
+        "names": list(hidden.names),
+        "expected": numbers(hidden.expected),
+        "covariance": numbers(hidden.covariance),
+        "with_body": numbers(hidden.with_body),
+        "body_variance": number(hidden.body_variance),
+    }
+
+
+def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms | None:
+    """From plain data; `terms` is how many a map has."""
+    if document is None:
+        return None
+    names, k = tuple(document["names"]), len(document["names"])
+    arrays = [np.asarray(document[name], dtype=np.float64) for name in ("expected", "covariance", "with_body")]
+    if [array.shape for array in arrays] != [(k, terms), (k, k), (k,)]:
+        raise BadDataError("hidden has arrays of other sizes than its names", way_out="learn the calibration anew")
+    expected, covariance, with_body = arrays
+    return HiddenTerms(names, expected, covariance, with_body, float(document["body_variance"]))
+
+
+def number(value: float) -> float:
+    """Nine significant digits of it."""
+    return float(f"{value:.9g}")
+
+
+def numbers(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Any]:
+    """Nested lists of numbers."""
+    if values.ndim == 1:
+        return [number(value) for value in values]
+    return [numbers(row) for row in values]

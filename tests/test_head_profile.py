@@ -1,0 +1,188 @@
+"""How pressure is spread over the head: known profiles, the layered body's own, and another program's scans."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import mapping_scans as scans
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+
+from tactile_bayes.files.arrays_npz import read_arrays
+from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes
+from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
+from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.head_profile import LEAST_FRAMES, ProfileReader, profile_figures
+from tactile_bayes.mapping.poses import poses_at
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+from tactile_bayes.posterior.fat_depth import head_profile
+from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.presets import HEAD_PROFILE
+
+TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
+"""By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""
+
+
+def response(coefficients: np.ndarray, *, rows: int = 16, columns: int = 26) -> np.ndarray:
+    """A profile with given Legendre coefficients, the array's ends at -1 and 1."""
+    x, y = ((2 * np.arange(n) + 1) / n - 1 for n in (rows, columns))
+    return legendre.leggrid2d(x, y, coefficients)
+
+
+def shipped() -> LogQuadratic:
+    path = size_calibration_path(DEFAULT)
+    assert path is not None
+    calibration = read_size_calibration(path)
+    assert isinstance(calibration, LogQuadratic)
+    return calibration
+
+
+def fat_mm(tactile_map: TactileMap) -> float:
+    found = shipped().at_fat([head_profile(tactile_map.quality)]).fat_mm
+    assert found is not None
+    return found
+
+
+@cache
+def scanned(seat: float, *, tilt_deg: float = 2.0, mean_kpa: float = 9.5) -> TactileMap:
+    """A ball of 15 mm, its centre one diameter deep."""
+    lump = SolidLump(d_mm=15.0, depth_ratio=1.0, stiffness_ratio=30.0, seat=seat)
+    scene = Scene(
+        seed=5,
+        duration_s=7.0,
+        frame_rate_hz=60.0,
+        body=SceneBody(),
+        solid_lumps=(lump,),
+        background=Background(mean_kpa=mean_kpa),
+        strokes=Strokes(tilt_deg=tilt_deg),
+        noise=Noise(element_kpa=0.2, tracker_mm=0.3, tracker_deg=0.1, gain_share=0.01),
+    )
+    return build_map(simulate(scene, rng=np.random.default_rng(5)).scan)
+
+
+def read(profile: np.ndarray, good: np.ndarray) -> tuple[np.ndarray, float]:
+    """What is read of one frame of 9 kPa with such a profile: coefficients, and what they leave."""
+    (row,) = ProfileReader.of(good).read(9.0 * profile[good][None], np.array([9.0]))
+    return row[:-1], float(row[-1])
+
+
+def test_known_coefficients_are_found_with_taxels_missing() -> None:
+    true = np.zeros((5, 5))
+    true[0, 0], true[2, 0], true[4, 0], true[0, 2], true[0, 4] = 1.0, -0.12, 0.03, 0.08, -0.05
+    good = np.ones((16, 26), dtype=bool)
+    good[3, 4:9], good[10] = False, False
+    spoilt = np.where(good, response(true), 1.0)
+    found, left = read(spoilt, good)
+    np.testing.assert_allclose(found, [-0.12, 0.08, -0.05], atol=1e-12)
+    assert left < 1e-12
+    # what is left out counts if it is said to be good
+    wrong, left = read(spoilt, np.ones_like(good))
+    assert np.abs(wrong - [-0.12, 0.08, -0.05]).max() > 0.005
+    assert left > 0.01
+
+
+def test_a_tilted_head_has_the_same_figures() -> None:
+    level, tilted = np.zeros((5, 5)), np.zeros((5, 5))
+    level[0, 0] = tilted[0, 0] = 1.0
+    level[2, 0] = tilted[2, 0] = 0.1
+    tilted[1, 0], tilted[0, 1], tilted[1, 1], tilted[2, 2] = 0.2, -0.1, 0.05, 0.02
+    good = np.ones((16, 26), dtype=bool)
+    flat, turned = (read(response(one), good)[0] for one in (level, tilted))
+    np.testing.assert_allclose(flat, turned, atol=1e-12)
+
+
+def test_lumps_are_left_out_also_where_most_frames_feel_one() -> None:
+    """A rise under three frames of four: the mean over all is off, that over the smooth ones is not."""
+    rng, good = np.random.default_rng(1), np.ones((16, 26), dtype=bool)
+    even = np.zeros((5, 5))
+    even[0, 0], even[0, 2] = 1.0, 0.1
+    rows = []
+    for i in range(400):
+        frame = response(even) + 0.02 * rng.standard_normal((16, 26))
+        if i % 4:
+            frame[5:9, 6:10] += 1.0
+        rows.append(ProfileReader.of(good).read(frame[good][None], np.array([1.0])))
+    found = profile_figures(rows)
+    assert found["head_profile_frames"] == pytest.approx(100, abs=5)
+    assert found["head_profile_y2"] == pytest.approx(0.1, abs=0.002)
+    assert abs(np.concatenate(rows).mean(axis=0)[1] - 0.1) > 0.01
+    assert profile_figures(rows[::-1]) == found
+    assert profile_figures(rows[: LEAST_FRAMES - 1]) == {}
+
+
+def test_an_array_of_few_rows_has_no_profile() -> None:
+    reader = ProfileReader.of(np.ones((4, 26), dtype=bool))
+    assert reader.read(np.ones((3, 104)), np.ones(3)).shape == (0, 4)
+
+
+def test_frames_with_a_reading_that_carries_no_pressure_are_left_out() -> None:
+    good, valid = np.ones((16, 26), dtype=bool), np.ones((2, 416), dtype=bool)
+    valid[1, 7] = False
+    assert len(ProfileReader.of(good).read(np.ones((2, 416)), np.ones(2), valid)) == 1
+
+
+def test_a_live_map_has_the_profile_of_the_whole_scan() -> None:
+    scan = scans.make_scan(np.tile(scans.even_centres(), (12, 1)), field=lambda u, v: 1.0 + 1e-4 * (u * u + v))
+    whole = build_map(scan)
+    live = MapAccumulator(MapGrid(whole.plane_from_base), Instrument(scan.head, scan.element_calibration))
+    poses = poses_at(scan.poses, scan.frames.time_s)
+    for i in range(len(scan.frames)):
+        live.add(scan.frames.counts[i : i + 1], poses.part(slice(i, i + 1)))
+    found = live.snapshot().quality
+    assert found["head_profile_frames"] == whole.quality["head_profile_frames"] >= LEAST_FRAMES
+    for name in HEAD_PROFILE:
+        assert found[name] == pytest.approx(whole.quality[name], abs=1e-12)
+
+
+def test_a_map_without_lump_free_frames_has_no_profile() -> None:
+    over_the_lump = build_map(scans.make_scan(scans.strokes(), field=scans.gaussian()))
+    assert not set(HEAD_PROFILE) & set(over_the_lump.quality)
+    assert head_profile(over_the_lump.quality) is None
+
+
+def test_an_even_field_has_a_flat_profile() -> None:
+    found = build_map(scans.make_scan(scans.even_centres(), field=scans.uniform)).quality
+    np.testing.assert_allclose([found[name] for name in HEAD_PROFILE], 0.0, atol=2e-3)
+
+
+def test_the_simulated_bodys_fat_is_found() -> None:
+    """Centred the boundary lies at 15 mm, clear of the gland at 15 + 1.2 * 7.5 = 24 mm."""
+    assert fat_mm(scanned(0.0)) == pytest.approx(15.0, rel=0.05)
+    assert fat_mm(scanned(1.2)) == pytest.approx(24.0, rel=0.05)
+
+
+def test_the_depth_tells_seats_apart_that_the_map_does_not() -> None:
+    """With the profile both sizes are within 12 %; without it the two are told apart by none, and differ by a fifth."""
+    calibration = shipped()
+    fit = FitOptions("free", 20.0, "off", None, "field")
+    options = EstimateOptions(method="laplace", fit=fit)
+    sizes: dict[str, list[float]] = {"with": [], "without": []}
+    for seat in (0.0, 1.2):
+        tactile_map = scanned(seat)
+        bare = {k: v for k, v in tactile_map.quality.items() if k not in HEAD_PROFILE}
+        for name, one in (("with", tactile_map), ("without", replace(tactile_map, quality=bare))):
+            found = estimate_map(one, calibration=calibration, options=options, rng=np.random.default_rng(1))
+            assert found.size is not None
+            sizes[name].append(float(np.median(found.size.max_size_mm)))
+            told = any("depth of the fat" in note for note in found.left_out)
+            assert told == (name == "without")
+            assert (found.diagnostics["fat_mm"] is None) == told
+    assert sizes["with"] == pytest.approx([15.0, 15.0], rel=0.12)
+    assert sizes["without"][1] / sizes["without"][0] > 1.2
+
+
+@pytest.mark.parametrize("name", sorted(TRUE_FAT_MM))
+def test_another_programs_bodies(shared_data: Path, name: str) -> None:
+    """An independent program's scans: the fat within 20 %, which tells 12 mm from 20 and 24."""
+    (path,) = (shared_data / "scans").glob(f"{name}_*.npz")
+    found = fat_mm(build_map(read_arrays(path)))
+    assert found == pytest.approx(TRUE_FAT_MM[name], rel=0.2)
