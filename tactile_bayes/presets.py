@@ -32,6 +32,8 @@ NORMALISE: Final = ("mean", "gain", "none")
 METHODS: Final = ("optimise", "laplace", "importance", "ensemble")
 NOISE: Final = ("independent", "field")
 INTERVAL: Final = 0.95
+# Probability of the intervals of a size calibration that are held against bodies left out.
+HELD: Final = 0.9
 # Along each axis, of a map's noise field. Fewer are faster; what is finer than they resolve counts as independent.
 # A narrow bump gets more than these by itself, up to the second number.
 FIELD_COSINES: Final = 18

@@ -124,10 +124,12 @@ def test_an_array_of_few_rows_has_no_profile() -> None:
     assert reader.read(np.ones((3, 104)), np.ones(3)).shape == (0, 4)
 
 
-def test_frames_with_a_reading_that_carries_no_pressure_are_left_out() -> None:
+def test_frames_without_pressure_or_with_a_reading_that_carries_none_are_left_out() -> None:
     good, valid = np.ones((16, 26), dtype=bool), np.ones((2, 416), dtype=bool)
     valid[1, 7] = False
-    assert len(ProfileReader.of(good).read(np.ones((2, 416)), np.ones(2), valid)) == 1
+    reader = ProfileReader.of(good)
+    assert len(reader.read(np.ones((2, 416)), np.ones(2), valid)) == 1
+    assert np.isfinite(reader.read(np.ones((2, 416)), np.array([0.0, 9.0]))).all()
 
 
 def test_a_live_map_has_the_profile_of_the_whole_scan() -> None:

@@ -96,7 +96,8 @@ def size(
     gives, and how much of its scatter would go if it were known; `estimate` does not use that.
 
     The log-quadratic form, ln d as a quadratic in ln a and ln sigma, tells apart what differs between bodies and
-    between exams of one body. Its table comes from `population`, which made the maps: nothing is declared.
+    between exams of one body. Its table comes from `population`, which made the maps: nothing is declared. From the
+    pressure over the head where it felt no lump it also learns how deep the fat is, and sizes that go with it.
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """

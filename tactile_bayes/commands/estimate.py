@@ -159,7 +159,8 @@ def command(
 
     Every posterior draw of the map's Gaussian (Eq 7) goes through a size calibration with a draw of its coefficients
     and of what no map shows. Where the map shows no lump that can be measured there is no number: the reason is
-    printed and the exit code is 6. With --pool the maps are repeats of one mass, and their spread is learned.
+    printed and the exit code is 6. With --pool the maps are repeats of one mass, and their spread is learned. Where a
+    map tells how deep the fat under the head is, sizes are for that depth; where not, the report says so.
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """

@@ -79,7 +79,8 @@ def command(
     """Build a tactile map from one scan, or one common map from several scans of the same examination.
 
     The plane of the motion is fitted, frames outside the pressure window are left out, the rest are normalised,
-    projected on the plane and averaged in cells. What was left out is printed with its reason.
+    projected on the plane and averaged in cells. What was left out is printed with its reason. From frames that feel
+    no lump it takes how the pressure is spread over the head, which tells `estimate` how deep the fat is.
 
     Example: tactile-bayes map scan.mcap -o map.nc --figure map.png
     """

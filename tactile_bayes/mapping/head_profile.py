@@ -107,9 +107,10 @@ class ProfileReader:
         """
         if not len(self.terms):
             return np.zeros((0, _COLUMNS))
+        whole = level_kpa > 0
         if valid is not None:
-            whole = valid.all(axis=1)
-            pressure_kpa, level_kpa = pressure_kpa[whole], level_kpa[whole]
+            whole &= valid.all(axis=1)
+        pressure_kpa, level_kpa = pressure_kpa[whole], level_kpa[whole]
         ratio = pressure_kpa / level_kpa[:, None]
         found = ratio @ self.solve
         left = np.sqrt(np.square(ratio - found @ self.terms.T).mean(axis=1))

@@ -21,11 +21,10 @@ from scipy.special import ndtri
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.body_terms import HiddenTerms
 from tactile_bayes.posterior.laplace import mode_and_covariance
+from tactile_bayes.presets import HELD
 
 Terms = Callable[[FloatArray, FloatArray], FloatArray]
 """Takes (n,) ln a and p of a table's rows to (n, k) terms."""
-HELD = 0.9
-"""Probability of the intervals that are held against bodies left out."""
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_bayes.posterior.fat_depth import FatCubic
 from tactile_bayes.posterior.log_quadratic import QUADRATIC, LogQuadratic
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.presets import HELD, RESEARCH_USE
 
 UNKNOWN_NAMES = {
     "depth_mm": "the depth",
@@ -44,7 +44,9 @@ def log_quadratic_text(calibration: LogQuadratic) -> str:
 
 
 def _left_out_text(fit: Mapping[str, float]) -> str:
-    held = f", {fit['left_out_held_percent']:.0f} % in their 90 % interval" if "left_out_held_percent" in fit else ""
+    held = ""
+    if "left_out_held_percent" in fit:
+        held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD:g} % interval"
     return (
         "each body left out in turn: "
         f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
