@@ -83,7 +83,7 @@ def test_known_coefficients_are_found_with_taxels_missing() -> None:
     spoilt = np.where(good, response(true), 1.0)
     found, left = read(spoilt, good)
     np.testing.assert_allclose(found, [-0.12, 0.08, -0.05], atol=1e-12)
-    assert left < 1e-12
+    assert left < 1e-7
     # what is left out counts if it is said to be good
     wrong, left = read(spoilt, np.ones_like(good))
     assert np.abs(wrong - [-0.12, 0.08, -0.05]).max() > 0.005

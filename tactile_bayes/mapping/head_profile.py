@@ -70,14 +70,15 @@ class ProfileReader:
 
     Parameters
     ----------
-    terms : (taxels, 9) array
-        Legendre polynomials at the good taxels; no taxel where too few rows or columns have one to tell them apart.
     solve : (taxels, 9) array
-        Takes readings to their coefficients, by least squares.
+        Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares; no taxel where too
+        few rows or columns have one to tell the polynomials apart.
+    gram : (9, 9) array
+        Inner products of the polynomials.
     """
 
-    terms: FloatArray
     solve: FloatArray
+    gram: FloatArray
 
     @classmethod
     def of(cls, good: BoolArray) -> ProfileReader:
@@ -86,7 +87,7 @@ class ProfileReader:
         terms = np.stack([np.outer(across[:, i], along[:, j])[good] for i, j in _ORDERS], axis=1)
         if min(np.count_nonzero(good.any(axis=1)), np.count_nonzero(good.any(axis=0))) <= _HIGHEST:
             terms = terms[:0]
-        return cls(terms, np.ascontiguousarray(np.linalg.pinv(terms).T))
+        return cls(np.ascontiguousarray(np.linalg.pinv(terms).T), terms.T @ terms)
 
     def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray, valid: BoolArray | None = None) -> FloatArray:
         """Coefficients and what they leave of frames.
@@ -105,16 +106,17 @@ class ProfileReader:
         (n, 4) array
             `HEAD_PROFILE`, and the root mean square of what the nine terms leave.
         """
-        if not len(self.terms):
+        if not len(self.solve):
             return np.zeros((0, _COLUMNS))
         whole = level_kpa > 0
         if valid is not None:
             whole &= valid.all(axis=1)
         pressure_kpa, level_kpa = pressure_kpa[whole], level_kpa[whole]
-        ratio = pressure_kpa / level_kpa[:, None]
-        found = ratio @ self.solve
-        left = np.sqrt(np.square(ratio - found @ self.terms.T).mean(axis=1))
-        return np.column_stack([found[:, : len(HEAD_PROFILE)], left])
+        found = pressure_kpa @ self.solve
+        # what is left by Pythagoras: the residual itself would cost as much as the map
+        square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,ij,fj->f", found, self.gram, found)
+        left = np.sqrt(np.maximum(square, 0.0) / len(self.solve))
+        return np.column_stack([found[:, : len(HEAD_PROFILE)], left]) / level_kpa[:, None]
 
 
 def _legendre(taxels: int) -> FloatArray:
