@@ -75,3 +75,21 @@ def test_smoothing_keeps_a_level_and_knows_no_cell_without_data() -> None:
     excess = smoothed_excess(grid_map(values))
     np.testing.assert_allclose(excess[:, :20], 0.25, rtol=1e-12)
     assert np.isneginf(excess[:, 20:]).all()
+
+
+def test_a_rim_of_high_places_does_not_crowd_out_a_lump_inside() -> None:
+    """On deep fat the head's rim presses hardest: a score of maxima round the map, each higher than the lump."""
+    axis = np.arange(-40.0, 41.0)
+    x, y = np.meshgrid(axis, axis)
+    values = 1.0 + 0.1 * np.exp(-((x - 3.0) ** 2 + (y + 2.0) ** 2) / (2 * 5.0**2))
+    for place in np.arange(-36.0, 37.0, 9.0):
+        for u, v in ((place, -40.0), (place, 40.0), (-40.0, place), (40.0, place)):
+            values += 0.3 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 2.0**2))
+    tactile_map = grid_map(values)
+    found = candidate_centres(tactile_map)
+    assert (3.0, -2.0) in found
+    assert sum(max(abs(u), abs(v)) > 35 for u, v in found) == 8
+    # by height alone the first sixteen are all of the rim
+    by_height = candidate_centres(tactile_map, rim_limit=16)
+    assert (3.0, -2.0) not in by_height[:16]
+    assert by_height[:8] == found[:8]

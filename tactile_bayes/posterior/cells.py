@@ -11,6 +11,8 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 
 SMOOTHING_MM = 3.0
 """Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""
+RIM_MM, RIM_SHARE = 6.0, 0.6
+"""A place is at the map's rim where less than the share of the disc of this radius about it is covered."""
 
 
 FEW_READINGS = 0.1
@@ -99,13 +101,16 @@ def value_scale(tactile_map: TactileMap) -> float:
     return scale if scale > 0 else 1.0
 
 
-def candidate_centres(tactile_map: TactileMap, *, limit: int = 16) -> list[tuple[float, float]]:
+def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: int = 8) -> list[tuple[float, float]]:
     """Local maxima of the smoothed map, highest first: where a lump could be.
 
     Parameters
     ----------
     limit
-        At most this many.
+        At most this many inside the map.
+    rim_limit
+        At most this many at its rim, which only the head's own rim has felt: on deep fat that presses hardest, and a
+        score of such places can be higher than the lump.
 
     Returns
     -------
@@ -122,11 +127,16 @@ def candidate_centres(tactile_map: TactileMap, *, limit: int = 16) -> list[tuple
     rows, columns = np.nonzero(peak)
     order = np.argsort(-excess[rows, columns], kind="stable")
     found: list[tuple[float, float]] = []
+    left = {False: limit, True: rim_limit}
     for i in order:
         centre = (float(tactile_map.x_mm[columns[i]]), float(tactile_map.y_mm[rows[i]]))
-        if all(np.hypot(centre[0] - x, centre[1] - y) > 2 * SMOOTHING_MM for x, y in found):
+        if any(np.hypot(centre[0] - x, centre[1] - y) <= 2 * SMOOTHING_MM for x, y in found):
+            continue
+        at_rim = covered_share(tactile_map, centre, radius_mm=RIM_MM) < RIM_SHARE
+        if left[at_rim]:
             found.append(centre)
-        if len(found) == limit:
+            left[at_rim] -= 1
+        if not left[False]:
             break
     return found
 
