@@ -16,6 +16,7 @@ from tactile_bayes.files.schema import check_document
 from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_posterior import read_stated_size
+from tactile_bayes.report.pooled import pooled_text
 
 FAST = ("--method", "laplace")
 
@@ -103,6 +104,15 @@ def test_a_pooled_mass_keeps_its_schema_and_its_maps(pooled: dict, folder: Path)
     assert size["high"] - size["low"] < 0.8 * (alone["high"] - alone["low"])
     assert sum(pooled["variance_share"].values()) == pytest.approx(100.0)
     assert (folder / "size.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_maps_that_do_not_tell_the_depth_of_the_fat_are_pooled_without_and_say_so(pooled: dict) -> None:
+    """The bumps of these maps lie on an even pressure, which no body has."""
+    assert pooled["fat_mm"] is None
+    (left_out,) = pooled["left_out"]
+    assert left_out.startswith("the depth of the fat")
+    assert "Left out: the depth of the fat" in pooled_text(pooled)
+    assert "12.3 mm of fat" in pooled_text(pooled | {"fat_mm": 12.3, "left_out": []})
 
 
 def test_validate_reads_a_pooled_mass_from_json_and_from_draws(pooled: dict, folder: Path) -> None:

@@ -151,6 +151,9 @@ def test_maps_of_a_mass_share_one_depth(learned) -> None:
     pooled = pool_maps(draws, calibration=learned, priors=SizePriors(), rng=rng)
     assert pooled.calibration is not None
     assert pooled.calibration.fat_mm == pytest.approx(np.exp(2.6), rel=0.02)
+    bare = pool_maps([replace(one, profile=None) for one in draws], calibration=learned, priors=SizePriors(), rng=rng)
+    assert bare.calibration is not None
+    assert "no pressure profile" in bare.calibration.fat_note
     expected = float(law(*np.zeros((3, 1)))[0])
     assert np.median(np.log(pooled.size.max_size_mm)) == pytest.approx(expected, abs=0.06)
 
@@ -160,6 +163,17 @@ def test_a_table_without_profiles_or_with_few_bodies_has_no_cubic() -> None:
     assert learn_fat_cubic(replace(full, profile=None, log_fat=None)) is None
     assert learn_fat_cubic(table(60)) is None
     assert learn_fat_cubic(table(90)) is not None
+
+
+def test_maps_without_a_profile_are_left_out_of_the_cubic_only() -> None:
+    full = table()
+    assert full.profile is not None
+    some = full.profile.copy()
+    some[::5] = np.nan
+    learned = learn_log_quadratic(replace(full, profile=some), recipe=RECIPE)
+    assert learned.fit["maps"] == 500
+    assert learned.fat_cubic is not None
+    assert learned.fat_cubic.fit["maps"] == 400
 
 
 def test_figures_that_are_missing_or_cannot_be_are_no_profile() -> None:

@@ -12,7 +12,7 @@ from tactile_bayes.presets import HEAD_PROFILE
 
 
 def fat_document(cubic: FatCubic) -> dict[str, Any]:
-    """As plain data, see ``cubic`` in data_schema/size_quadratic.schema.json."""
+    """As plain data, see ``fat_cubic`` in data_schema/size_quadratic.schema.json."""
     depth, (alpha, p0, w0) = cubic.depth, cubic.centre
     return {
         "depth": {

@@ -14,6 +14,7 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json, load_json
 from tactile_bayes.files.shipped import is_shipped
+from tactile_bayes.files.size_parts_json import number
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.size_calibration import (
     COEFFICIENTS,
@@ -38,7 +39,7 @@ def write_size_calibration(
         "form": "eq6",
         "recipe": calibration.recipe.as_dict(),
         "axes": list(calibration.axes),
-        "residual_correlation": _number(calibration.residual_correlation),
+        "residual_correlation": number(calibration.residual_correlation),
         "x": _axis_document(calibration.x),
         "y": _axis_document(calibration.y),
         **_left_out_document(calibration.left_out),
@@ -79,16 +80,12 @@ def _eq6(document: Any, *, path: Path) -> SizeCalibration:
         raise error.at(path) from None
 
 
-def _number(value: float) -> float:
-    return float(f"{value:.9g}")
-
-
 def _left_out_document(errors: LeftOutErrors | None) -> dict[str, Any]:
     if errors is None:
         return {}
     document = asdict(errors)
     for form in ("eq6", "log_quadratic"):
-        document[form] = {widths: _number(error) for widths, error in document[form].items()}
+        document[form] = {widths: number(error) for widths, error in document[form].items()}
     return {"left_out": document}
 
 
@@ -101,11 +98,11 @@ def _axis_document(axis: AxisCalibration) -> dict[str, Any]:
     return {
         "coefficients": list(COEFFICIENTS),
         "reference_amplitude": axis.reference_amplitude,
-        "domain": {name: [_number(low), _number(high)] for name, (low, high) in axis.domain.items()},
-        "fit": {name: _number(value) for name, value in axis.fit.items()},
-        "mean": [_number(value) for value in axis.draws.mean(axis=0)],
-        "covariance": [[_number(value) for value in row] for row in covariance],
-        "draws": [[_number(value) for value in row] for row in axis.draws],
+        "domain": {name: [number(low), number(high)] for name, (low, high) in axis.domain.items()},
+        "fit": {name: number(value) for name, value in axis.fit.items()},
+        "mean": [number(value) for value in axis.draws.mean(axis=0)],
+        "covariance": [[number(value) for value in row] for row in covariance],
+        "draws": [[number(value) for value in row] for row in axis.draws],
     }
 
 

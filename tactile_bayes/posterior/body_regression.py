@@ -44,7 +44,7 @@ class PopulationTable:
     unknowns
         (n,) arrays of what was varied and no map shows, by name; logarithms of those in `LOGGED`.
     profile : (n, 3) array
-        `presets.HEAD_PROFILE` of each map; None where the table has none.
+        `presets.HEAD_PROFILE` of each map, NaN for a map without; None where no map has it.
     log_fat : (n,) array
         ln of the depth of the fat-gland boundary in mm; None with `profile`.
     """

@@ -20,7 +20,7 @@ from tactile_bayes.posterior.fat_depth import head_profile
 from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions
 from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, fat_left_out, pooled_size
 from tactile_bayes.posterior.search import ROTATION_ODDS, scene_asked, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
@@ -379,5 +379,5 @@ def _left_out(
     if isinstance(calibration, SizeCalibration) and calibration.axes == ("both",):
         notes.append("a difference between the head's axes: the calibration has one width")
     if isinstance(calibration, LogQuadratic) and calibration.fat_note:
-        notes.append(f"the depth of the fat, which would narrow the size: {calibration.fat_note}")
+        notes.append(fat_left_out(calibration.fat_note))
     return tuple(notes)

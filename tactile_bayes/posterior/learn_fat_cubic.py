@@ -14,15 +14,20 @@ _ROUND = [POWERS.index(one) for one in ROUND]
 
 
 def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
-    """The calibration by amplitude, width and depth of fat; None where the table has no profiles or too few bodies.
+    """The calibration by amplitude, width and depth of fat, from the maps with a profile; None for too few bodies.
 
     Raises
     ------
     NotConvergedError
         When the posterior has no mode.
     """
-    if table.profile is None or table.log_fat is None or len(np.unique(table.body)) < LEAST_BODIES:
+    if table.profile is None or table.log_fat is None:
         return None
+    table = table.rows(np.isfinite(table.profile.sum(axis=1)))
+    if len(np.unique(table.body)) < LEAST_BODIES:
+        return None
+    assert table.profile is not None
+    assert table.log_fat is not None
     depth = learn_depth(table.profile, table.log_fat)
     log_depth = depth.log_depth(table.profile)
     alpha, p0, w0 = (round(float(one.mean()), 3) for one in (table.log_amplitude, table.log_width, log_depth))

@@ -144,7 +144,7 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
 def population_table(columns: Mapping[str, Sequence[float | None]]) -> PopulationTable:
     """The detected rows of a table with the fields of `MassRow`, as the learning needs them.
 
-    Profiles of the head are used where every detected row has one.
+    A row without a profile of the head has NaN for it.
     """
     kept = [i for i, found in enumerate(columns["detected"]) if found]
 
@@ -173,14 +173,9 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
 
 
 def _profiles(columns: Mapping[str, Sequence[float | None]], kept: Sequence[int]) -> FloatArray | None:
-    """(n, 3) `presets.HEAD_PROFILE` of the rows kept; None where one of them has none."""
+    """(n, 3) `presets.HEAD_PROFILE` of the rows kept; None where none of them has one."""
     if not all(name in columns for name in HEAD_PROFILE):
         return None
-    found = []
-    for i in kept:
-        quality = {name: value for name in HEAD_PROFILE if (value := columns[name][i]) is not None}
-        one = head_profile(quality)
-        if one is None:
-            return None
-        found.append(one)
-    return np.array(found, dtype=np.float64)
+    rows = [{name: value for name in HEAD_PROFILE if (value := columns[name][i]) is not None} for i in kept]
+    found = [head_profile(row) or (np.nan,) * len(HEAD_PROFILE) for row in rows]
+    return np.array(found, dtype=np.float64) if np.isfinite(found).any() else None

@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import PooledEstimate
+from tactile_bayes.posterior.pooling import PooledEstimate, fat_left_out
 from tactile_bayes.posterior.quantity import summarise
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
@@ -50,6 +50,7 @@ def pooled_document(
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
+        "left_out": [fat_left_out(used.fat_note)] if used.fat_note else [],
         "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
         "outside_calibration": list(pooled.outside),
@@ -85,6 +86,8 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines.append(shape_text(figures))
     lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
     lines += [f"Outside the calibration's range: {text}." for text in document["outside_calibration"]]
+    if document["left_out"]:
+        lines.append(f"Left out: {'; '.join(document['left_out'])}.")
     if document["reason"]:
         lines.append(f"{document['reason']}.")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
