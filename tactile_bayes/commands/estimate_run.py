@@ -79,6 +79,8 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     tactile_map = read_map(path)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
     options = _options(settings, calibration)
+    if calibration is not None:
+        calibration = calibration_for(tactile_map, calibration)
     inputs = {"map": path} | ({"size_calibration": source} if source else {})
     inputs |= {"prior": settings.prior} if settings.prior else {}
     digests = hash_inputs(**inputs)
@@ -96,7 +98,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     if why_none and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none)
     if calibration is not None and estimate.size is not None:
-        words = _calibration_words(settings, calibration_for(tactile_map, calibration))
+        words = _calibration_words(settings, calibration)
         estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
     recorded = {
         "size_calibration": settings.calibration or ("solid (shipped)" if calibration is not None else "none"),

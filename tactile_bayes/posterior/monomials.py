@@ -14,11 +14,6 @@ def powers(order: int) -> tuple[tuple[int, int], ...]:
     return tuple((total - j, j) for total in range(order + 1) for j in range(total + 1))
 
 
-def order_of(terms: int) -> int:
-    """The order of a full polynomial in two variables with so many terms."""
-    return int(np.sqrt(2.0 * terms)) - 1
-
-
 def monomials(values: Sequence[FloatArray], exponents: Sequence[tuple[int, ...]]) -> FloatArray:
     """(..., terms) products of the (...) values' powers."""
     highest = max(max(one) for one in exponents)
