@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import os
 import re
-import socket
 import tempfile
 import zlib
 from collections.abc import Iterator
@@ -55,6 +54,8 @@ def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
 
 def _host() -> str:
     """This computer, in eight letters: directories may be shared with others."""
+    import socket
+
     return f"{zlib.crc32(socket.gethostname().encode()):08x}"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 
 from tactile_bayes.errors import BadDataError
@@ -24,6 +23,8 @@ def read_prior(path: Path | None) -> BumpPrior:
     """
     if path is None:
         return BumpPrior()
+    import tomllib
+
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

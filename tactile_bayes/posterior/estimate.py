@@ -13,7 +13,6 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import Abstention, no_bump, shape_fault, undetected
 from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.chain_state import ChainStore
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
 from tactile_bayes.posterior.fat_depth import head_profile
@@ -28,6 +27,7 @@ from tactile_bayes.posterior.size_calibration import SizeCalibration
 from tactile_bayes.presets import CELL_PER_SIGMA
 
 if TYPE_CHECKING:
+    from tactile_bayes.posterior.chain_state import ChainStore
     from tactile_bayes.posterior.field_estimate import FieldAnswer
     from tactile_bayes.posterior.scene_choice import SceneChoice
 

@@ -6,17 +6,20 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.chain_state import ChainStore
 from tactile_bayes.posterior.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws
 from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.solved import Solved
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.chain_state import ChainStore
 
 LADDER = ("laplace", "importance", "ensemble")
 STEPS_UP = 1
