@@ -34,6 +34,8 @@ PATIENCE = 16
 OUTGROWN = "wider than the window"
 FIT_TOLERANCE = 1e-8
 """Of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
+JOINED = 0.05
+"""So near to a minimum, in the same units, a fit ends in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,18 +242,24 @@ def _best_fit(
     centre: tuple[float, float],
     options: FitOptions,
 ) -> LeastSquaresFit:
-    """The lowest minimum from several starts; one that leaves the window or outgrows it is not followed further.
+    """The lowest minimum from several starts.
 
-    Under a noise field least squares only finds the place, and need not dwell on a rise that is hardly one.
+    One that leaves the window, outgrows it or comes to a minimum that another has found is not followed further. Under
+    a noise field least squares only finds the place, and need not dwell on a rise that is hardly one.
     """
     radius_mm = options.radius_mm
+    fits: list[LeastSquaresFit] = []
+
+    def joins(theta: FloatArray, other: LeastSquaresFit) -> bool:
+        return other.converged and bool((np.abs(theta - other.theta) < JOINED * bump.step_scale).all())
 
     def lost(theta: FloatArray) -> bool:
         away = np.hypot(theta[1] - centre[0], theta[2] - centre[1]) > radius_mm
-        return bool(away or max(bump.widths(theta)[:2]) > 4.0 * radius_mm)
+        outgrown = max(bump.widths(theta)[:2]) > 4.0 * radius_mm
+        return bool(away or outgrown or any(joins(theta, other) for other in fits))
 
-    fits = [
-        fit_least_squares(
+    for begin in starts:
+        fit = fit_least_squares(
             lambda theta: bump.predict(theta, cells),
             begin,
             data=cells.value,
@@ -261,8 +269,7 @@ def _best_fit(
             abandon=lost,
             patience=PATIENCE if options.noise == "field" else None,
         )
-        for begin in starts
-    ]
+        fits.append(fit)
     return min(fits, key=lambda fit: (not fit.converged, fit.sse))
 
 
