@@ -34,6 +34,8 @@ PATIENCE = 16
 OUTGROWN = "wider than the window"
 FIT_TOLERANCE = 1e-8
 """Of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
+PLACE_TOLERANCE = 1e-4
+"""The same where least squares only finds the place: the posterior's mode is sought from there."""
 JOINED = 0.05
 """So near to a minimum, in the same units, a fit ends in it."""
 
@@ -247,7 +249,7 @@ def _best_fit(
     One that leaves the window, outgrows it or comes to a minimum that another has found is not followed further. Under
     a noise field least squares only finds the place, and need not dwell on a rise that is hardly one.
     """
-    radius_mm = options.radius_mm
+    radius_mm, place_only = options.radius_mm, options.noise == "field"
     fits: list[LeastSquaresFit] = []
 
     def joins(theta: FloatArray, other: LeastSquaresFit) -> bool:
@@ -265,9 +267,9 @@ def _best_fit(
             data=cells.value,
             weight=weight,
             scale=bump.step_scale,
-            tolerance=FIT_TOLERANCE,
+            tolerance=PLACE_TOLERANCE if place_only else FIT_TOLERANCE,
             abandon=lost,
-            patience=PATIENCE if options.noise == "field" else None,
+            patience=PATIENCE if place_only else None,
         )
         fits.append(fit)
     return min(fits, key=lambda fit: (not fit.converged, fit.sse))
