@@ -25,7 +25,7 @@ from tactile_bayes.posterior.cells import FitCells
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Whitening
 from tactile_bayes.posterior.linear import FieldColumns, LinearSolution, joined, solve
 from tactile_bayes.posterior.scene import Scene
-from tactile_bayes.posterior.solved import Solution, Solved
+from tactile_bayes.posterior.solved import Solution, Solved, distinct_rows
 from tactile_bayes.posterior.window import Profiles, Projected, Window
 
 BLOCK = 64
@@ -224,8 +224,7 @@ class CollapsedTarget:
 
         Points that `solved` knows are not solved again.
         """
-        unique, back = np.unique(theta, axis=0, return_inverse=True)
-        back = back.reshape(-1)
+        unique, back = distinct_rows(theta)
         amplitude, level, noise = np.empty((len(theta), self.structures)), np.empty(len(theta)), np.empty(len(theta))
         order = np.argsort(back, kind="stable")
         edges = np.searchsorted(back[order], np.arange(0, len(unique) + BLOCK, BLOCK))

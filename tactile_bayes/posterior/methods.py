@@ -16,7 +16,7 @@ from tactile_bayes.posterior.draws import END_ERROR, INDEPENDENT_DRAWS, Paramete
 from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
-from tactile_bayes.posterior.solved import Solved
+from tactile_bayes.posterior.solved import Solved, distinct_rows
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.chain_state import ChainStore
@@ -201,8 +201,8 @@ class Sampled:
         if not len(self.beside):
             return draws
         # a point that was resampled several times moves as one: each new point costs a solution of what is linear
-        points, back = np.unique(draws.flat, axis=0, return_inverse=True)
-        moved = (points + rng.standard_normal(points.shape) @ self.spread.T)[back.reshape(-1)]
+        points, back = distinct_rows(draws.flat)
+        moved = (points + rng.standard_normal(points.shape) @ self.spread.T)[back]
         return replace(draws, theta=self.whole(moved).reshape(*draws.theta.shape[:2], -1))
 
 

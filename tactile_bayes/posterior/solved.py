@@ -55,3 +55,15 @@ class Solved:
             together = (np.concatenate(parts) for parts in zip(*self._solutions, strict=True))
             self._index = theta[order], tuple(one[order] for one in together)
         return self._index
+
+
+def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The distinct rows in order, and for each row its place among them: ``np.unique``, quicker for random points.
+
+    No two of those agree in their first coordinate; where some do, rows are compared as a whole.
+    """
+    _, first, back = np.unique(rows[:, 0], return_index=True, return_inverse=True)
+    if np.array_equal(rows[first[back]], rows):
+        return rows[first], back
+    distinct, back = np.unique(rows, axis=0, return_inverse=True)
+    return distinct, back.reshape(-1)
