@@ -19,7 +19,7 @@ from tactile_bayes.posterior.cells import (
     window_cells,
 )
 from tactile_bayes.posterior.least_squares import LeastSquaresFit, fit_least_squares, inverse_information
-from tactile_bayes.posterior.noise import ErrorModel, count_weights, error_model
+from tactile_bayes.posterior.noise import ErrorModel, count_weights, error_model, independent_errors
 from tactile_bayes.posterior.target import LogPrior, Target, flat_prior
 
 START_WIDTHS_MM = (2.0, 5.0, 10.0)
@@ -82,7 +82,7 @@ class BumpFit:
     bump, cells, weight, fit, errors
         Model, cells of the window, their weights, the minimum, the judged errors.
     covariance : (p, p) array
-        Of the parameters, correlated errors included.
+        Of the parameters, correlated errors included; under a noise field, which has them in the model, not.
     covered_share
         Share of the disc of 1.5 widths about the centre that the map covers.
     """
@@ -203,7 +203,10 @@ def fit_bump(
         weight_variance = float(np.mean(fit.residual**2))
         if settled:
             break
-    errors = error_model(cells, jacobian=fit.jacobian, residual=fit.residual, weight=weight)
+    if options.noise == "field":
+        errors = independent_errors(jacobian=fit.jacobian, residual=fit.residual, weight=weight)
+    else:
+        errors = error_model(cells, jacobian=fit.jacobian, residual=fit.residual, weight=weight)
     # a map without any noise still has the rounding of its numbers
     rounding = 1e-9 * bump.scale + 1e-14 * float(np.abs(cells.value).max())
     errors = replace(errors, noise_sd=max(errors.noise_sd, rounding))

@@ -59,6 +59,13 @@ def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
     return np.asarray(weight / weight.mean())
 
 
+def independent_errors(*, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
+    """The size of errors taken as independent, for fits to a model that itself has their correlation."""
+    k, p = jacobian.shape
+    dof = max(k - p, 1)
+    return ErrorModel(float(np.sqrt(weight @ residual**2 / dof)), 1.0, float(dof))
+
+
 def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
     r"""Judge the errors from a fit's residuals.
 

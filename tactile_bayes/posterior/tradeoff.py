@@ -14,7 +14,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.field_estimate import look, with_neighbours
 from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture, shape_draws
-from tactile_bayes.posterior.fit import BumpFit, FitOptions, find_bump
+from tactile_bayes.posterior.fit import BumpFit, FitOptions, find_bump, fit_bump
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.methods import Sampled, importance_draws
 from tactile_bayes.posterior.optimise import optimise
@@ -125,7 +125,8 @@ def map_case(
     if found.fault or found.fit is None:
         return f"no bump can be measured: {found.fault}"
     answer = look(tactile_map, found.fit, prior=prior, radius_mm=radius_mm, least_odds=LEAST_ODDS, cosines=cosines)
-    return MapCase(found.fit, with_neighbours(answer, tactile_map).choice.fit)
+    judged, _ = fit_bump(tactile_map, found.centre_mm, options=replace(search, noise="independent"))
+    return MapCase(judged or found.fit, with_neighbours(answer, tactile_map).choice.fit)
 
 
 @dataclass(frozen=True, slots=True)
