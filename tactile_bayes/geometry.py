@@ -6,12 +6,11 @@ Frames: `base` (tracker, paper O), `scanhead` (paper S), `plane` (paper P), `pat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.records import dataclass
 
 FloatArray = NDArray[np.float64]
 

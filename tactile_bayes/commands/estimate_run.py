@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
 from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance

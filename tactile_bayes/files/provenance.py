@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 from tactile_bayes import __version__
 from tactile_bayes.files.atomic import sha256
+from tactile_bayes.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
 
 # A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
 FEW_READINGS = 10

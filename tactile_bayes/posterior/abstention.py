@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import trusted
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.fit import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
+from tactile_bayes.records import dataclass
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 CODES = ("empty", "undetected", "unresolved", "window", "prior", "extrapolated", "method")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
 
 LOGGED = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
 """Properties that enter by their logarithm."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.cells import FitCells
+from tactile_bayes.records import dataclass
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.records import dataclass
 
 SMOOTHING_MM = 3.0
 """Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""

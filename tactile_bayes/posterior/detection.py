@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import lgamma, log, pi
 
 import numpy as np
@@ -11,6 +10,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import Bump, BumpPrior
 from tactile_bayes.posterior.cells import FitCells, window_cells
+from tactile_bayes.records import dataclass
 
 LENGTHS_IN_WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
 """Correlation lengths tried for the noise, in widths of the bump under test."""

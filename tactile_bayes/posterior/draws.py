@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
 
 END_ERROR = 2.67
 """Monte-Carlo error of an end of a 95 % interval, in SDs, times the root of the independent draws (normal tails)."""

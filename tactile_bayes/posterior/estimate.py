@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -25,6 +25,7 @@ from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
 from tactile_bayes.posterior.size_calibration import SizeCalibration
 from tactile_bayes.presets import CELL_PER_SIGMA
+from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.chain_state import ChainStore

@@ -9,7 +9,7 @@ u and v. F is found by a quadratic learned over the same bodies; its error is pa
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.body_terms import HiddenTerms, RoundLumps
 from tactile_bayes.posterior.monomials import monomials, powers
 from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.records import dataclass
 
 ORDER = 3
 POWERS = tuple((i, j, k) for k in range(ORDER + 1) for i, j in powers(ORDER - k))

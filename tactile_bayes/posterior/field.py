@@ -12,12 +12,11 @@ Solin & Saerkkae (2020), Statistics and Computing 30:419 (the basis); Rasmussen 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
+from tactile_bayes.records import dataclass
 
 MARGIN = 1.3
 """Width of the rectangle in widths of the window: the field need not be flat where the window ends."""

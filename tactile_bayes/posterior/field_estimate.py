@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from tactile_bayes.posterior.scene_choice import ASKING, SceneChoice, choose_sha
 from tactile_bayes.posterior.solved import Solved
 from tactile_bayes.posterior.surroundings import Surroundings
 from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.records import dataclass
 
 Progress = Callable[[int, int], None]
 

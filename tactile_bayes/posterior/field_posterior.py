@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
@@ -18,6 +16,7 @@ from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.target import finite_differences, stencil
 from tactile_bayes.posterior.window import Window
 from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.records import dataclass
 
 MOST_SETTLINGS = 6
 LEAST_SHARE = 1e-2

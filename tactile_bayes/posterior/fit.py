@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from tactile_bayes.posterior.cells import (
 from tactile_bayes.posterior.least_squares import LeastSquaresFit, fit_least_squares, inverse_information
 from tactile_bayes.posterior.noise import ErrorModel, count_weights, error_model, independent_errors
 from tactile_bayes.posterior.target import LogPrior, Target, flat_prior
+from tactile_bayes.records import dataclass
 
 START_WIDTHS_MM = (2.0, 5.0, 10.0)
 LEAST_COVERED_SHARE = 0.6

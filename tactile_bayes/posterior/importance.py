@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
@@ -12,6 +10,7 @@ from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.laplace import LogDensity
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.sobol import BITS, shifted_sobol
+from tactile_bayes.records import dataclass
 
 STRETCH, WIDE_STRETCH = 0.3, 1.0
 """Bend of the proposal's tails: normal coordinates z become sinh(b z) / b, normal in the middle, log-normal outside.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
 
 ModelFunction = Callable[[FloatArray], FloatArray]
 """Maps (m, p) parameter vectors to (m, k) predictions, all m at once."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import lgamma, log, pi
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.field import Whitening
 from tactile_bayes.posterior.window import Projected
+from tactile_bayes.records import dataclass
 
 FLOOR = 1e-9
 """Share of the data's sum of squares that is noise in any case: 3e-5 of the signal, less than any sensor's steps.

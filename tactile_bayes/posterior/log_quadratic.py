@@ -15,7 +15,7 @@ Where the depth F of the fat under the head is known it is of third order, `fat_
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from tactile_bayes.posterior.fat_depth import ORDER as FAT_ORDER
 from tactile_bayes.posterior.fat_depth import SPREADS, FatCubic
 from tactile_bayes.posterior.monomials import monomials, powers
 from tactile_bayes.posterior.size_calibration import Recipe
+from tactile_bayes.records import dataclass
 
 QUADRATIC = ("1", "u", "v", "u2", "uv", "v2")
 PARAMETERS = (*QUADRATIC, "log_body_sd", "body_sd_slope", "log_exam_sd")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,7 @@ from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.solved import Solved, distinct_rows
+from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.chain_state import ChainStore

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.cells import FitCells
 from tactile_bayes.posterior.least_squares import inverse_information
+from tactile_bayes.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

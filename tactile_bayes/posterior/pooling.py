@@ -9,7 +9,7 @@ no map shows of a body, is common to all of them and does not average out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.roundness import Elongation, ShapePrior, elongation, turned
 from tactile_bayes.posterior.size import SizePosterior
+from tactile_bayes.records import dataclass
 
 OUTLYING = 3.0
 POOLED_DRAWS = 8000

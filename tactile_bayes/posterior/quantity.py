@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
 
 INTERVAL_KIND = "eti"
 

@@ -5,7 +5,7 @@ Or a ridge in the bump's place: what a lump's evidence is held against where a r
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.window import Profiles, Window
+from tactile_bayes.records import dataclass
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 Shape = Literal["round", "ellipse", "rotated", "ridge"]

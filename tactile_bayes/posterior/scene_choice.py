@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.field_posterior import FieldFit, Mixture, fit_scene, newton_mixture
 from tactile_bayes.posterior.scene import Scene, Shape
 from tactile_bayes.posterior.window import Window
+from tactile_bayes.records import dataclass
 
 LEAST_ODDS = 3.0
 """A structure is used when the map favours the scene with it by this factor."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.pareto import smooth_weights
+from tactile_bayes.records import dataclass
 
 WIDER = 2.0
 TAIL = 0.025

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.size_calibration import AxisCalibration, SizeCalibration
+from tactile_bayes.records import dataclass
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
 
 COEFFICIENTS = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
 

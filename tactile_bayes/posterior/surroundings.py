@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.cells import SMOOTHING_MM, smoothed_excess
 from tactile_bayes.posterior.scene import Extra
+from tactile_bayes.records import dataclass
 
 CLEAR_IN_WIDTHS = 2.0
 """Cells nearer to the bump than this many of its widths say nothing of what lies beside it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.least_squares import ModelFunction
 from tactile_bayes.posterior.noise import ErrorModel
 from tactile_bayes.posterior.solved import Solved
+from tactile_bayes.records import dataclass
 
 BLOCK = 64
 """Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""

@@ -6,8 +6,6 @@ of the grid's rows, not of its cells times the cosines. Cells that the map does 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
@@ -15,6 +13,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.cells import FitCells
 from tactile_bayes.posterior.field import Whitening, cosine_profiles, gram_of_cosines, whitening
 from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.records import dataclass
 
 RESOLVED = 3.0
 """Widths above as many cells need no more than a cell's variance."""
