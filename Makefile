@@ -49,13 +49,17 @@ bench-trial: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check statsmodels pingouin
 	$(BIN)/python -m benchmarks.trial
 
-# The size calibrations that come with the program, made again: an hour on two cores for the population's scans.
+# The size calibrations that come with the program, made again: an hour on two cores for each population's scans.
 calibrations: $(VENV)/.installed
 	mkdir -p build
 	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 240 --seed 7 --workers 2 \
-		-o build/population.csv --force
+		--normalise gain -o build/population.csv --force
+	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 240 --seed 7 --workers 2 \
+		--normalise mean -o build/population_mean.csv --force
 	$(BIN)/tactile-bayes calibrate size build/population.csv --form log-quadratic \
 		-o tactile_bayes/calibrations/solid.json --force
+	$(BIN)/tactile-bayes calibrate size build/population_mean.csv --form log-quadratic \
+		-o tactile_bayes/calibrations/solid_mean.json --force
 	$(BIN)/tactile-bayes study -o build/paper_grid.csv --force
 	$(BIN)/tactile-bayes calibrate size build/paper_grid.csv --fit-radius-mm 48 --least-stiffness-ratio 8 \
 		-o tactile_bayes/calibrations/plane_strain.json --force

@@ -6,9 +6,11 @@
 `widths`: sigma_x and sigma_y of maps with a known bump under independent errors, under fields with exponential
 correlation (drawn by the covariance's Cholesky factor, not by the model's cosines), of a bump that is no Gaussian (the
 truth is the nearest Gaussian, under the row's errors or by plain squares), and of scans by a simulated head, whose
-truth is what the same estimate says of the same scan without sensor and tracker errors (a size calibration's widths
-mean the same). A narrow bump under strong correlated errors calls for a finer field than others. The negative controls:
-the model of independent errors without its inflation, on maps with a field; and the coarse field for the narrow bump.
+truth is the bump's own. Where frames were divided by their means, a map's bump has other widths than the field's, and
+the truth is what the same estimate says of the same scan without sensor and tracker errors. A narrow bump under strong
+correlated errors calls for a finer field than others. The negative controls: the model of independent errors without
+its inflation, on maps with a field; the coarse field for the narrow bump; and the head's maps without their figures of
+the frames' places.
 
 `sizes`: the whole path. Each mass is scanned three times by the solid model, each scan mapped and sized, alone and
 pooled, with the shipped calibration. `population` draws bodies from the prior that the calibration was learned over,
@@ -43,7 +45,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.fit import FitOptions, fit_bump
-from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
 
 NOMINAL = 0.9
 AXIS = np.arange(-28.0, 28.5)
@@ -59,7 +61,9 @@ KINDS: dict[str, dict[str, float]] = {
 }
 BY_SQUARES = "the same, nearest by plain squares"
 CONTROL = "control: independent errors assumed, field 3 mm"
-HEADS = {"simulated head": AMPLITUDE, "simulated head, lump of 0.05": 0.05}
+UNTOLD = "control: the frames' places taken for exact"
+MEANS = "simulated head, frames divided by their means"
+HEADS = {"simulated head": AMPLITUDE, "simulated head, lump of 0.05": 0.05, UNTOLD: AMPLITUDE, MEANS: AMPLITUDE}
 NARROW = {
     "narrow (2 by 2.4 mm), field-dominated, 3 mm": None,
     "control: the same with 18 cosines": FIELD_COSINES,
@@ -114,7 +118,7 @@ def widths(run: Callable[..., Iterable[Any]], maps: int, rows: Iterable[int]) ->
 def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
     rng = np.random.default_rng([SEED, index])
     if kind in HEADS:
-        tactile_map, truth = _head_map(index, HEADS[kind])
+        tactile_map, truth = _head_map(index, kind)
     elif kind in NARROW:
         tactile_map, truth = _grid_map(NARROW_KIND, rng, sigma=NARROW_SIGMA)
     else:
@@ -217,8 +221,8 @@ def _factor(length_mm: float) -> FloatArray:
     return np.linalg.cholesky(np.exp(-away / length_mm) + 1e-10 * np.eye(len(x)))
 
 
-def _head_map(index: int, amplitude: float) -> tuple[TactileMap, tuple[float, float]]:
-    """A scan's map, and the widths of the same scan's map without errors."""
+def _head_map(index: int, kind: str) -> tuple[TactileMap, tuple[float, float]]:
+    """A scan's map, and the bump's widths, or those that the same scan's map shows without errors."""
     rng = np.random.default_rng([SEED, index, 1])
     noise = Noise(
         element_kpa=float(rng.uniform(0.05, 0.3)),
@@ -227,12 +231,18 @@ def _head_map(index: int, amplitude: float) -> tuple[TactileMap, tuple[float, fl
         gain_share=float(rng.uniform(0.002, 0.02)),
     )
     x, y = rng.uniform(-3.0, 3.0, 2)
-    lump = Lump(x_mm=float(x), y_mm=float(y), amplitude=amplitude, sigma_x_mm=SIGMA[0], sigma_y_mm=SIGMA[1])
+    lump = Lump(x_mm=float(x), y_mm=float(y), amplitude=HEADS[kind], sigma_x_mm=SIGMA[0], sigma_y_mm=SIGMA[1])
     scene = Scene(seed=index, frame_rate_hz=100.0, lumps=(lump,), noise=noise, strokes=Strokes(yaw_deg=0.0))
     clean = replace(scene, noise=Noise(0.0, 0.0, 0.0, 0.0, 0.0), tracker=Tracker())
-    noisy, exact = (
-        build_map(simulate(one, rng=np.random.default_rng([SEED, index, 2])).scan) for one in (scene, clean)
-    )
+
+    def mapped(scene: Scene, normalise: str) -> TactileMap:
+        return build_map(simulate(scene, rng=np.random.default_rng([SEED, index, 2])).scan, normalise=normalise)
+
+    if kind != MEANS:
+        found = mapped(scene, "gain")
+        told = {name: value for name, value in found.quality.items() if name not in POSE_NOISE}
+        return (replace(found, quality=told) if kind == UNTOLD else found), SIGMA
+    noisy, exact = mapped(scene, "mean"), mapped(clean, "mean")
     options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
     truth = estimate_map(exact, calibration=None, options=options, rng=rng).map_posterior
     assert truth is not None

@@ -28,7 +28,13 @@ FIT_RADIUS_MM: Final = 20.0
 # Figures of a map: how pressure is spread over the head where it feels no lump, see `mapping.head_profile`.
 HEAD_PROFILE: Final = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
 
+# Figures of a map: SD of a frame's place along the plane's axes and the sides of the array there, mm, and how many
+# frames felt a cell for each reading in it, see `mapping.pose_noise`.
+POSE_NOISE: Final = ("pose_noise_x_mm", "pose_noise_y_mm", "frame_side_x_mm", "frame_side_y_mm", "frames_per_reading")
+
 NORMALISE: Final = ("mean", "gain", "none")
+# See docs/decisions/0065; the paper divides by the mean.
+DEFAULT_NORMALISE: Final = "gain"
 METHODS: Final = ("optimise", "laplace", "importance", "ensemble")
 NOISE: Final = ("independent", "field")
 INTERVAL: Final = 0.95

@@ -49,7 +49,7 @@ def test_scans_become_the_map_the_function_builds(folder, run_cli):
     assert header["provenance"]["settings"] == {
         "cell_mm": 1.0,
         "pressure_window_kpa": [5.0, 14.0],
-        "normalise": "mean",
+        "normalise": "gain",
         "latency_ms": 0.0,
         "plane_radius_mm": "all",
         "flat_field": False,

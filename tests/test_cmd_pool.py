@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         sigma = (4.0, 4.0) if i < 3 else (9.0, 9.0)
         tactile_map = bump_map(noise=noise, amplitude=0.3, sigma_x=sigma[0], sigma_y=sigma[1])
         write_map(place / f"mass{i + 1}.nc", tactile_map, provenance=MADE)
+        if i == 0:
+            solved = replace(tactile_map, recipe=replace(tactile_map.recipe, normalise="gain"))
+            write_map(place / "gain1.nc", solved, provenance=MADE)
     flat = grid_map(np.ones((41, 41)) + 0.01 * rng.standard_normal((41, 41)), background=None, normalise="none")
     write_map(place / "plain.nc", flat, provenance=MADE)
     return place
@@ -64,10 +68,22 @@ def test_without_a_word_the_shipped_calibration_is_used_and_named(folder: Path) 
     done = run_here("estimate", "mass1.nc", *FAST, cwd=folder)
     assert done.returncode == 0
     assert "largest size" in done.stdout
-    assert "shipped calibration solid" in done.stdout
+    assert "shipped calibration solid-mean" in done.stdout
     document = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)
-    assert document["provenance"]["settings"]["size_calibration"] == "solid (shipped)"
+    assert document["provenance"]["settings"]["size_calibration"] == "solid-mean (shipped)"
     assert document["max_size_mm"]["median"] > 0
+
+
+def test_maps_normalised_each_way_have_a_calibration_and_are_not_pooled_together(folder: Path) -> None:
+    done = run_here("estimate", "gain1.nc", *FAST, "--json", cwd=folder)
+    settings = json.loads(done.stdout)["provenance"]["settings"]
+    assert settings["size_calibration"] == "solid (shipped)"
+    refused = run_here("estimate", "gain1.nc", *FAST, "--size-calibration", "solid-mean", cwd=folder)
+    assert refused.returncode == 3
+    assert "normalise gain (the calibration: mean)" in refused.stderr
+    mixed = run_here("estimate", "gain1.nc", "mass1.nc", "mass2.nc", "--pool", *FAST, cwd=folder)
+    assert mixed.returncode == 3
+    assert "normalised in several ways (gain, mean)" in mixed.stderr
 
 
 def test_a_finer_noise_field_is_recorded_and_hardly_moves_a_clear_lump(folder: Path) -> None:
@@ -90,7 +106,9 @@ def test_none_gives_widths_and_a_map_made_otherwise_says_why_it_has_no_size(fold
     assert "no size calibration was given" in done.stdout
     other = run_here("estimate", "mass1.nc", *FAST, "--fit-radius-mm", "15", cwd=folder)
     assert "the shipped calibration does not fit: fit radius 15 mm" in other.stdout
-    asked = run_here("estimate", "mass1.nc", *FAST, "--fit-radius-mm", "15", "--size-calibration", "solid", cwd=folder)
+    asked = run_here(
+        "estimate", "mass1.nc", *FAST, "--fit-radius-mm", "15", "--size-calibration", "solid-mean", cwd=folder
+    )
     assert asked.returncode == 3
     assert "another recipe" in asked.stderr
 

@@ -89,6 +89,24 @@ def test_what_the_table_fixes_cannot_be_declared(table: Path, tmp_path: Path, ar
     assert not (tmp_path / "x.json").exists()
 
 
+@pytest.mark.parametrize("way", ["gain", "mean", ""])
+def test_a_calibration_keeps_how_its_maps_were_normalised(tmp_path: Path, way: str) -> None:
+    rows = [replace(row(body, exam), normalise=way) for body in range(40) for exam in range(2)]
+    (tmp_path / "t.csv").write_text(population.table_text(rows))
+    done = run_here("calibrate", "size", "t.csv", "--form", "log-quadratic", "-o", "s.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert read_size_calibration(tmp_path / "s.json").recipe.normalise == (way or "mean")
+
+
+def test_maps_normalised_in_several_ways_teach_nothing(tmp_path: Path) -> None:
+    rows = [replace(row(body, exam), normalise=("mean", "gain")[exam]) for body in range(40) for exam in range(2)]
+    (tmp_path / "t.csv").write_text(population.table_text(rows))
+    done = run_here("calibrate", "size", "t.csv", "--form", "log-quadratic", "-o", "s.json", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "t.csv: its maps were normalised in several ways (gain, mean)" in done.stderr
+    assert not (tmp_path / "s.json").exists()
+
+
 def test_a_table_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("d_mm,amplitude,sigma_x_mm\n10,0.3,4\n")
     done = run_here("calibrate", "size", "t.csv", "--form", "log-quadratic", "-o", "x.json", cwd=tmp_path)

@@ -10,6 +10,7 @@ from posterior_maps import bump_map, bump_values, grid_map
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior import search
+from tactile_bayes.posterior.cells import levelled
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.fit import FitOptions
 
@@ -71,3 +72,40 @@ def test_a_lump_beside_a_rib_is_found_from_close_by(monkeypatch: pytest.MonkeyPa
     # the control: from afar least squares grows over both
     monkeypatch.setattr(search, "_close_search", lambda *_: None)
     assert look(beside_a_rib(0.3), rotation="auto").status == "no_estimate"
+
+
+SIDES = {"pose_noise_x_mm": 0.0, "pose_noise_y_mm": 0.0, "frame_side_x_mm": 24.0, "frame_side_y_mm": 39.0}
+SIDES |= {"frames_per_reading": 2.25}
+
+
+def on_a_dome(normalise: str, quality: dict[str, float]) -> TactileMap:
+    """A small lump on a wide rise, as of a stiff layer nearer to the skin."""
+    dome = bump_values(half_mm=40.0, amplitude=0.2, x=0.0, y=0.0, sigma_x=30.0, sigma_y=30.0)
+    lump = bump_values(half_mm=40.0, amplitude=0.15, x=3.0, y=-2.0, sigma_x=2.5, sigma_y=2.5, level=0.0)
+    return replace(grid_map(dome + lump + 0.3 * noise(5), normalise=normalise), quality=quality)
+
+
+def test_a_small_lump_on_a_wide_rise_is_found_on_the_levelled_map() -> None:
+    found = look(on_a_dome("gain", SIDES))
+    assert found.status == "estimate", found.reason
+    assert found.map_posterior is not None
+    assert np.median(found.map_posterior.sigma_x_mm) == pytest.approx(2.5, rel=0.1)
+    assert np.median(found.map_posterior.amplitude) == pytest.approx(0.15, rel=0.1)
+    # the control: where the array's size is not told, least squares grows over the dome
+    assert look(on_a_dome("gain", {})).status == "no_estimate"
+
+
+def test_levelling_is_what_dividing_by_the_mean_does_and_only_for_maps_that_lack_it() -> None:
+    """Of a plain level nothing is taken; of a lump the mean over two arrays' overlap, which is a triangle."""
+    flat = replace(bump_map(half_mm=40.0, amplitude=0.0), quality=SIDES)
+    flat = replace(flat, recipe=replace(flat.recipe, normalise="gain"))
+    np.testing.assert_allclose(levelled(flat).mean, 1.0)
+    lump = on_a_dome("gain", SIDES)
+    found = lump.mean - levelled(lump).mean
+    x, y = np.meshgrid(lump.x_mm, lump.y_mm)
+    for column, row in ((40, 40), (10, 55)):
+        weight = np.clip(1 - np.abs(x - lump.x_mm[column]) / 24.0, 0, None)
+        weight *= np.clip(1 - np.abs(y - lump.y_mm[row]) / 39.0, 0, None)
+        assert found[row, column] == pytest.approx(float(np.average(lump.mean - 1.0, weights=weight)), rel=1e-6)
+    for other in (on_a_dome("mean", SIDES), on_a_dome("gain", {})):
+        assert levelled(other) is other

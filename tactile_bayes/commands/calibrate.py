@@ -193,7 +193,9 @@ def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
 
     rows = read_table(table, "population.table.json")
     fit = measuring_options().fit
-    recipe = Recipe("mean", fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False)
+    recipe = Recipe(
+        _normalise_of(rows, table), fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False
+    )
     source = "balls in a population of bodies, scanned by the solid model"
     try:
         calibration = learn_log_quadratic(population_table(rows.columns), recipe=recipe, source=source)
@@ -203,6 +205,20 @@ def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table))
     write_log_quadratic(output, calibration, provenance=provenance, force=force)
     return log_quadratic_text(calibration)
+
+
+def _normalise_of(rows: Table, path: Path) -> str:
+    """How the maps of a table of `population` were normalised; by the mean in tables that do not say."""
+    from tactile_bayes.errors import BadDataError
+
+    found = {str(value or "mean") for value in rows.columns.get("normalise", ["mean"])}
+    if len(found) > 1:
+        raise BadDataError(
+            f"its maps were normalised in several ways ({', '.join(sorted(found))})",
+            way_out="learn from the rows of one way",
+            path=str(path),
+        )
+    return found.pop()
 
 
 @command.command("array")

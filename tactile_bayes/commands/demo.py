@@ -44,7 +44,8 @@ def command(ctx: click.Context, output: Path, method: str, force: bool) -> None:
     _prepare(output, force=force)
     scan, table, trial, excision = (output / name for name in EMBEDDED[:4])
     tactile_map, size = output / "map.nc", output / "size.json"
-    _step(ctx, map.command, "map", scans=(scan,), output=tactile_map, force=force)
+    # as the phantoms' maps were made
+    _step(ctx, map.command, "map", scans=(scan,), output=tactile_map, normalise="mean", force=force)
     _step(ctx, calibrate.size, "calibrate size", table=table, output=size, force=force)
     results = {"output": output / "posterior.nc", "figure": output / "size.png", "map_figure": output / "map.png"}
     _step(

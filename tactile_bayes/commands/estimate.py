@@ -26,9 +26,9 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--size-calibration",
-    metavar="solid|plane-strain|none|SIZE.json",
-    help="From widths to sizes: one that comes with the program (solid, if nothing is said), yours, or none: "
-    "widths only.",
+    metavar="solid|solid-mean|plane-strain|none|SIZE.json",
+    help="From widths to sizes: one that comes with the program (if nothing is said solid, or solid-mean for maps of "
+    "frames divided by their means), yours, or none: widths only.",
 )
 @click.option(
     "--method",

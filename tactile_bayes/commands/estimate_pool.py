@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
 
 if TYPE_CHECKING:
     from tactile_bayes.commands.estimate_run import Answer, Settings
@@ -33,7 +33,7 @@ def estimate_pool(
     from tactile_bayes.commands.estimate_run import size_priors
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.schema import check_document, dump_json
-    from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
+    from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.posterior.pooling import pool_maps
     from tactile_bayes.report.pooled import pooled_document, pooled_text
 
@@ -42,7 +42,7 @@ def estimate_pool(
         click.echo(answer.text, err=True)
     if failed:
         return failed[0].exit_code
-    path = size_calibration_path(settings.calibration or DEFAULT)
+    path = size_calibration_path(settings.calibration or _shipped_for(answers))
     calibration = _log_quadratic(path)
     assert path is not None
     digests = hash_inputs(**{f"map_{i + 1}": one for i, one in enumerate(maps)}, size_calibration=path)
@@ -71,6 +71,19 @@ def estimate_pool(
         _write(pooled, settings, output, figure, provenance=provenance, force=force)
     click.echo(dump_json(document) if as_json else pooled_text(document), nl=False)
     return EXIT_DONE if pooled.size is not None else EXIT_NO_ESTIMATE
+
+
+def _shipped_for(answers: list[Answer]) -> str:
+    """The shipped calibration for maps that were all normalised one way."""
+    from tactile_bayes.files.shipped import default_for
+
+    ways = sorted({answer.normalise for answer in answers})
+    if len(ways) > 1:
+        raise BadDataError(
+            f"the maps were normalised in several ways ({', '.join(ways)})",
+            way_out="pool maps made by one recipe: make the others again with `map`",
+        )
+    return default_for(ways[0])
 
 
 def _log_quadratic(path: Path | None) -> LogQuadratic:

@@ -50,13 +50,14 @@ class Settings:
 class Answer:
     """What one map came to: its JSON object and its text, or an error with its exit code.
 
-    `shape` holds what pooling needs of a map on which a lump was found.
+    `shape` holds what pooling needs of a map on which a lump was found, `normalise` how the map's frames were.
     """
 
     document: dict[str, Any] | None
     text: str
     exit_code: int
     shape: ShapeDraws | None = None
+    normalise: str = ""
 
 
 def answer_map(path: Path, *, settings: Settings) -> Answer:
@@ -75,9 +76,11 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
 
     from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.shipped import default_for
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
 
     tactile_map = read_map(path)
+    shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
     options = _options(settings, calibration)
     if calibration is not None:
@@ -99,10 +102,10 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     if why_none and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none)
     if calibration is not None and estimate.size is not None:
-        words = _calibration_words(settings, calibration)
+        words = _calibration_words(settings.calibration or shipped, calibration)
         estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
     recorded = {
-        "size_calibration": settings.calibration or ("solid (shipped)" if calibration is not None else "none"),
+        "size_calibration": settings.calibration or (f"{shipped} (shipped)" if calibration is not None else "none"),
         "method": settings.method,
         "interval": settings.interval,
         "background": options.fit.background,
@@ -120,13 +123,12 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     return tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed)
 
 
-def _calibration_words(settings: Settings, calibration: SizeCalibration | LogQuadratic) -> str:
+def _calibration_words(name: str, calibration: SizeCalibration | LogQuadratic) -> str:
     """Which calibration gave the size, and what it cannot know."""
-    from tactile_bayes.files.shipped import DEFAULT, SHIPPED
+    from tactile_bayes.files.shipped import SHIPPED
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
     from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
 
-    name = settings.calibration or DEFAULT
     words = f"Sizes by the {'shipped calibration ' if name in SHIPPED else 'calibration '}{name}"
     if isinstance(calibration, LogQuadratic):
         words += f" ({calibration.source}); {fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
@@ -145,11 +147,11 @@ def choose_calibration(
     reason
         Why the shipped one was not used; empty when it was, or when the user decided.
     """
-    from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
+    from tactile_bayes.files.shipped import default_for, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.posterior.estimate import recipe_differences
 
-    path = size_calibration_path(settings.calibration or DEFAULT)
+    path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
     if path is None:
         return None, None, ""
     calibration = read_size_calibration(path)
@@ -218,7 +220,7 @@ def answer_of(tactile_map: TactileMap, estimate: Estimate, provenance: Provenanc
     )
     text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
-    return Answer(document, text, exit_code, _shape(tactile_map, estimate))
+    return Answer(document, text, exit_code, _shape(tactile_map, estimate), tactile_map.recipe.normalise)
 
 
 def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:

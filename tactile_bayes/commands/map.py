@@ -11,7 +11,7 @@ import click
 
 from tactile_bayes.commands.number_or import NumberOr
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.presets import CELL_MM, NORMALISE, PRESSURE_WINDOW_KPA
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
@@ -35,9 +35,9 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "--normalise",
     type=click.Choice(NORMALISE),
-    default="mean",
+    default=DEFAULT_NORMALISE,
     show_default=True,
-    help="mean: divide a frame by its mean (the paper); gain: solve for one gain a frame; none: keep kPa.",
+    help="gain: solve for one gain a frame; mean: divide a frame by its mean (the paper); none: keep kPa.",
 )
 @click.option(
     "--latency-ms",

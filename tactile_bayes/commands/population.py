@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.presets import DEFAULT_NORMALISE
+
 if TYPE_CHECKING:
     from tactile_bayes.posterior.measure import MassRow
 
@@ -24,12 +26,27 @@ _FILE = click.Path(path_type=Path)
     help="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
 )
 @click.option("--scans", type=click.IntRange(min=1), default=2, show_default=True, help="Exams of each.")
+@click.option(
+    "--normalise",
+    type=click.Choice(["gain", "mean"]),
+    default=DEFAULT_NORMALISE,
+    show_default=True,
+    help="Of the maps, as `map` has it; sizes are told of maps made the same way.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True, help="Of the random numbers.")
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
 @click.option("--scheduler", metavar="ADDR", help="Send the masses to a dask scheduler (extra [cluster]).")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
 def command(
-    output: Path, masses: int, centred: int, scans: int, seed: int, workers: int, scheduler: str | None, force: bool
+    output: Path,
+    masses: int,
+    centred: int,
+    scans: int,
+    normalise: str,
+    seed: int,
+    workers: int,
+    scheduler: str | None,
+    force: bool,
 ) -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from.
 
@@ -54,6 +71,7 @@ def command(
         "scans": scans,
         "seed": seed,
         "first_centred": masses if centred else None,
+        "normalise": normalise,
         **as_settings(BodyPrior(), ExamPrior()),
     }
     kept = output.with_name(f"{output.name}.unfinished")
@@ -63,7 +81,7 @@ def command(
         progress_bar("masses") as progress,
     ):
         outcomes = run_batch(
-            partial(rows_of_mass, scans=scans, seed=seed, first_centred=masses),
+            partial(rows_of_mass, scans=scans, seed=seed, first_centred=masses, normalise=normalise),
             range(masses + centred),
             key=str,
             executor=executor,
@@ -82,7 +100,9 @@ def command(
     click.echo(RESEARCH_USE)
 
 
-def rows_of_mass(index: int, *, scans: int, seed: int, first_centred: int) -> list[MassRow]:
+def rows_of_mass(
+    index: int, *, scans: int, seed: int, first_centred: int, normalise: str = DEFAULT_NORMALISE
+) -> list[MassRow]:
     """The rows of one mass, in whichever process."""
     import numpy as np
 
@@ -94,7 +114,10 @@ def rows_of_mass(index: int, *, scans: int, seed: int, first_centred: int) -> li
     bodies = on_the_boundary(BodyPrior()) if index >= first_centred else BodyPrior()
     scenes = draw_mass(index, scans=scans, seed=seed, bodies=bodies)
     return measure_mass(
-        scenes, body=index, scan=lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan
+        scenes,
+        body=index,
+        scan=lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan,
+        normalise=normalise,
     )
 
 
@@ -125,4 +148,4 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, bool):
         return "true" if value else "false"
-    return str(value) if isinstance(value, int) else f"{value:.8g}"
+    return str(value) if isinstance(value, int | str) else f"{value:.8g}"

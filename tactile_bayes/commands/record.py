@@ -63,10 +63,10 @@ _CODE = "A code, not a name."
 )
 @click.option(
     "--size-calibration",
-    default="solid",
+    default="solid-mean",
     show_default=True,
-    metavar="solid|plane-strain|none|SIZE.json",
-    help="For the live view's size estimate.",
+    metavar="solid-mean|plane-strain|none|SIZE.json",
+    help="For the live view's size estimate; its frames are divided by their means.",
 )
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @click.pass_context

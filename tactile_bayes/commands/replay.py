@@ -23,10 +23,10 @@ _FILE = click.Path(path_type=Path)
 @click.option("--serve", metavar="HOST:PORT", help="Show it to a browser here, with a tone.")
 @click.option(
     "--size-calibration",
-    default="solid",
+    default="solid-mean",
     show_default=True,
-    metavar="solid|plane-strain|none|SIZE.json",
-    help="For the live view's size estimate.",
+    metavar="solid-mean|plane-strain|none|SIZE.json",
+    help="For the live view's size estimate; its frames are divided by their means.",
 )
 @click.option("--speed", type=click.FloatRange(0.01, 100.0), default=1.0, show_default=True, help="Times the own rate.")
 @click.option("--force", is_flag=True, help="Overwrite the output.")

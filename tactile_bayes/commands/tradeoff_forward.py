@@ -21,7 +21,7 @@ LEARNED = "learned"
 @click.argument("scene", required=False, metavar="[SCENE.toml]", type=_FILE)
 @click.option(
     "--size-calibration",
-    metavar="solid|plane-strain|learned|SIZE.json",
+    metavar="solid-mean|plane-strain|learned|SIZE.json",
     help="For the sizes: one that comes with the program, yours, or Eq 6 learned on the spot; "
     "if nothing is said, each model's own.",
 )
@@ -105,7 +105,9 @@ def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, r
     from tactile_bayes.forward.tradeoff import PLANE, SOLID, measure, settings_of
     from tactile_bayes.report.tradeoff_text import TradeoffReport
 
-    rules = {model: _rule(case, model, calibration or model) for model in (PLANE, SOLID)}
+    # a raster's frames are divided by their means
+    own = {PLANE: "plane-strain", SOLID: "solid-mean"}
+    rules = {model: _rule(case, model, calibration or own[model]) for model in (PLANE, SOLID)}
     found: list[Measured] = []
     settings = settings_of(case)
     measure(case, settings[0], fit=fit_line, raster_fit=fit_raster, clock=time.process_time)  # imports cost nothing

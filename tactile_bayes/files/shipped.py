@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-SHIPPED: Final = {"solid": "solid.json", "plane-strain": "plane_strain.json"}
+SHIPPED: Final = {"solid": "solid.json", "solid-mean": "solid_mean.json", "plane-strain": "plane_strain.json"}
 DEFAULT: Final = "solid"
 NONE: Final = "none"
 _FOLDER = Path(__file__).resolve().parents[1] / "calibrations"
@@ -14,6 +14,11 @@ _FOLDER = Path(__file__).resolve().parents[1] / "calibrations"
 def is_shipped(path: Path) -> bool:
     """Whether a file came with the program; the tests hold those against their schemas, once for all."""
     return path.parent == _FOLDER
+
+
+def default_for(normalise: str) -> str:
+    """The name of the calibration for maps so normalised, where nothing is said."""
+    return "solid-mean" if normalise == "mean" else DEFAULT
 
 
 def size_calibration_path(name: str) -> Path | None:

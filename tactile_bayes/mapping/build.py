@@ -18,13 +18,14 @@ from tactile_bayes.mapping.head_profile import head_profile_figures
 from tactile_bayes.mapping.latency import estimate_latency
 from tactile_bayes.mapping.neighbourhood import local_plane
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
+from tactile_bayes.mapping.pose_noise import pose_noise_figures
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.quality import cell_figures, frame_figures, plane_figures, stroke_figures
 from tactile_bayes.mapping.shared_frames import shared_frame_figures
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.mapping.timing import timing_figures
-from tactile_bayes.presets import CELL_MM, NORMALISE, PRESSURE_WINDOW_KPA
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import Scan
 
 # Landmarks of one examination further apart than this (mm) mean that the patient or the tracker was moved.
@@ -39,7 +40,7 @@ def build_map(
     *,
     cell_mm: float = CELL_MM,
     pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA,
-    normalise: str = "mean",
+    normalise: str = DEFAULT_NORMALISE,
     latency_ms: float | str = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
     plane_radius_mm: float | str | None = None,
@@ -230,6 +231,7 @@ def _as_map(
         **frame_figures(selections),
         **timing_figures(scans),
         **plane_figures(selections, plane),
+        **pose_noise_figures(selections, plane, cell_mm=recipe.cell_mm),
         **cell_figures(sums),
         **spread,
         **figures,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.presets import POSE_NOISE
 from tactile_bayes.records import dataclass
 
 SMOOTHING_MM = 3.0
@@ -16,6 +19,33 @@ RIM_MM, RIM_SHARE = 6.0, 0.6
 
 FEW_READINGS = 0.1
 """A cell with a smaller share of the median count is left out of the fit."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNoise:
+    """Errors of the frames' places, one error a frame: `presets.POSE_NOISE` of a map.
+
+    Parameters
+    ----------
+    sd_mm
+        SD of a frame's place along x and y: bumps are that much wider on the map.
+    side_mm
+        Sides of the array along x and y: cells closer together than these share frames, and with them errors.
+    frames_per_reading
+        Frames that felt a cell, over the readings in it.
+    """
+
+    sd_mm: tuple[float, float]
+    side_mm: tuple[float, float]
+    frames_per_reading: float
+
+    @classmethod
+    def of(cls, tactile_map: TactileMap) -> PoseNoise | None:
+        """Of a map; None where it has not all the figures."""
+        figures = [float(tactile_map.quality.get(name, np.nan)) for name in POSE_NOISE]
+        if not (np.isfinite(figures).all() and min(figures[:2]) >= 0 and min(figures[2:]) > 0):
+            return None
+        return cls((figures[0], figures[1]), (figures[2], figures[3]), figures[4])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +62,8 @@ class FitCells:
         Where the cells lie in the map's grid.
     cell_mm
         Side of a cell.
+    pose_noise
+        Of the frames; None where the map does not tell.
     """
 
     x_mm: FloatArray
@@ -42,6 +74,7 @@ class FitCells:
     row: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
     column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
     cell_mm: float
+    pose_noise: PoseNoise | None = None
 
     def __len__(self) -> int:
         return len(self.value)
@@ -74,6 +107,7 @@ def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, rad
         row=row,
         column=column,
         cell_mm=tactile_map.recipe.cell_mm,
+        pose_noise=PoseNoise.of(tactile_map),
     )
 
 
@@ -150,6 +184,27 @@ def smoothed_excess(tactile_map: TactileMap, *, width_mm: float = SMOOTHING_MM) 
     bottom = _smooth(weight, width_mm / cell)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(covered & (bottom > 0), top / bottom, -np.inf)
+
+
+def levelled(tactile_map: TactileMap) -> TactileMap:
+    """The map less its mean over the places of the array that feel a cell, as frames divided by their means show it.
+
+    A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain a frame needs it.
+    """
+    noise = PoseNoise.of(tactile_map)
+    if tactile_map.recipe.normalise != "gain" or noise is None:
+        return tactile_map
+    covered = trusted(tactile_map)
+    excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
+    across, along = overlap(tactile_map.x_mm, noise.side_mm[0]), overlap(tactile_map.y_mm, noise.side_mm[1])
+    around = (along @ excess @ across) / np.maximum(along @ covered @ across, 1.0)
+    return replace(tactile_map, mean=np.where(covered, tactile_map.mean - around, tactile_map.mean))
+
+
+def overlap(axis_mm: FloatArray, side_mm: float) -> FloatArray:
+    """(n, n) share that two intervals of one side about points of an axis have in common."""
+    away: FloatArray = np.abs(np.subtract.outer(axis_mm, axis_mm))
+    return np.clip(1.0 - away / side_mm, 0.0, None)
 
 
 def _smooth(array: FloatArray, width_cells: float) -> FloatArray:

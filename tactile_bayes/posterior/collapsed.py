@@ -55,6 +55,8 @@ class CollapsedTarget:
         Bounds of the widths, and of the centre about the window's middle.
     amplitude_scale
         Unit of the amplitudes' prior, see `cells.value_scale`.
+    departure : (k, n) array
+        Further fixed columns, see `posterior.departure`; None for none.
     """
 
     def __init__(
@@ -66,15 +68,17 @@ class CollapsedTarget:
         widest_mm: float,
         radius_mm: float,
         amplitude_scale: float = 1.0,
+        departure: FloatArray | None = None,
     ) -> None:
-        self.window, self.scene, self.prior = window, scene, prior
+        self.window, self.scene, self.prior, self.departure = window, scene, prior, departure
         self.widest_mm, self.radius_mm = widest_mm, radius_mm
         self.amplitude_scale = amplitude_scale
         self.amplitude_sd = prior.amplitude_sd * amplitude_scale
         # without its mean, a large level does not cost the digits that the bump is in
         self._mean = float(np.mean(window.cells.value))
         centred = window.cells.value - self._mean
-        self._plain = np.concatenate([linear_columns(window.cells, tilt=scene.tilt), centred[None]])
+        fixed = [linear_columns(window.cells, tilt=scene.tilt)] + ([] if departure is None else [departure])
+        self._plain = np.concatenate([*fixed, centred[None]])
         scaled = self._plain / window.variance
         self._weighted_plain = window.on_grid(scaled)
         self._plain_gram = self._plain @ scaled.T
@@ -91,6 +95,7 @@ class CollapsedTarget:
             widest_mm=self.widest_mm,
             radius_mm=self.radius_mm,
             amplitude_scale=self.amplitude_scale,
+            departure=self.departure,
         )
 
     @property
@@ -265,11 +270,11 @@ class CollapsedTarget:
         """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
         evidence, solution = self._solve(theta[None])
         weight = evidence[0] - np.logaddexp.reduce(evidence[0])
-        slope = solution.level_slope[0][:, :, 1:]
-        mean = solution.level[:, 1:] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
+        slope = solution.level_slope[0][:, :, 1:3]
+        mean = solution.level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
         spread = np.einsum("hvc,hvw,hwd->hcd", slope, np.linalg.inv(solution.power[0]), slope)
         tau2 = solution.sum_of_squares[0] / self.dof
-        covariance = tau2[:, None, None] * (solution.level_covariance[:, 1:, 1:] + spread)
+        covariance = tau2[:, None, None] * (solution.level_covariance[:, 1:3, 1:3] + spread)
         square = np.einsum("hc,hcd,hd->h", mean, np.linalg.inv(covariance), mean)
         at_zero = -0.5 * (square + np.linalg.slogdet(covariance)[1]) - np.log(2.0 * np.pi)
         prior = -np.log(2.0 * np.pi * (self.prior.tilt_sd * self.amplitude_scale) ** 2)
@@ -280,6 +285,17 @@ class CollapsedTarget:
         evidence, solution = self._solve(theta[None])
         weight = np.exp(evidence[0] - np.logaddexp.reduce(evidence[0]))
         return float(weight @ solution.amplitude[0, :, 0])
+
+    def products(self, one: FloatArray, other: FloatArray, theta: FloatArray) -> FloatArray:
+        """(v, w) inner products of (v, n) and (w, n) cell values under the noise field likeliest at one shape."""
+        best = int(np.argmax(self.by_field(theta[None])[0]))
+        columns, share = [(one, h) for one in self.fields for h in range(len(one.shares))][best]
+        first, second = (
+            self.window.project(Profiles(grid=self.window.on_grid(vectors)), self._weighted_plain).low
+            @ columns.field.turn
+            for vectors in (one, other)
+        )
+        return np.asarray((one / self.window.variance) @ other.T - (first * columns.weight[:, share]) @ second.T)
 
     def gains(self, templates: Profiles, theta: FloatArray) -> FloatArray:
         """(m,) log evidence of the scene at `theta` with each template added, over that without; -inf for a dent.

@@ -13,12 +13,14 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.beside import WANTED, add_beside
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import trusted
+from tactile_bayes.posterior.departure import ask_departure
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.field import cosines_for
 from tactile_bayes.posterior.field_posterior import FieldFit, field_window, shape_draws, start_vector
 from tactile_bayes.posterior.fit import BumpFit
 from tactile_bayes.posterior.methods import MethodOptions, draw_scene
+from tactile_bayes.posterior.pose_spread import pose_covariance
 from tactile_bayes.posterior.ridge import ridge_instead, ridge_text
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.scene_choice import ASKING, SceneChoice, choose_shape
@@ -125,15 +127,15 @@ def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
 def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: str = "auto") -> FieldAnswer:
     """The same with a second structure where the map asks for one, the lump weighed against a ridge where one rises.
 
-    Only scenes that ask what lies beside the lump are weighed so: without a rib in the model a lump beside one would
-    lose to it.
+    A bump alone is asked whether it is a Gaussian. Only scenes that ask what lies beside the lump are weighed so:
+    without a rib in the model a lump beside one would lose to it.
     """
     if scene not in ASKING:
-        return answer
+        return replace(answer, choice=ask_departure(answer.choice))
     surroundings = Surroundings.of(tactile_map)
     choice = add_beside(answer.choice, surroundings, scene=scene)
     ridge = ridge_instead(choice, surroundings)
-    found = replace(answer, choice=choice)
+    found = replace(answer, choice=ask_departure(choice))
     if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
         return found
     log_factor = choice.fit.log_evidence - ridge.log_evidence - _searched(choice.plain, tactile_map)
@@ -170,7 +172,8 @@ def draw(
 
 
 def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved) -> dict[str, FloatArray]:
-    theta, shape = draws.theta, draws.theta.shape[:2]
+    shape = draws.theta.shape[:2]
+    theta = draws.theta + _displaced(fit, shape, rng)
     sigma_x, sigma_y, angle = shape_draws(fit, theta)
     amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
     return {
@@ -183,6 +186,13 @@ def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, s
         "background": level.reshape(shape),
         "noise_sd": noise_sd.reshape(shape),
     }
+
+
+def _displaced(fit: FieldFit, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+    """(chain, draw, p) what errors of the frames' places add to draws."""
+    values, vectors = np.linalg.eigh(pose_covariance(fit))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(rng.standard_normal((*shape, len(values))) @ root.T)
 
 
 def _diagnostics(choice: SceneChoice) -> dict[str, object]:

@@ -117,7 +117,14 @@ def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:
 
 
 def fit_scene(
-    window: Window, scene: Scene, start: FloatArray, *, prior: BumpPrior, radius_mm: float, amplitude_scale: float = 1.0
+    window: Window,
+    scene: Scene,
+    start: FloatArray,
+    *,
+    prior: BumpPrior,
+    radius_mm: float,
+    amplitude_scale: float = 1.0,
+    departure: FloatArray | None = None,
 ) -> FieldFit:
     """Find the mode; the fields that matter and the mode are settled in turn, because each depends on the other.
 
@@ -125,6 +132,8 @@ def fit_scene(
     ----------
     start : (p,) array
         The scene's parameters, for example from least squares.
+    departure
+        As `CollapsedTarget`'s.
 
     Raises
     ------
@@ -138,6 +147,7 @@ def fit_scene(
         widest_mm=WIDEST_IN_RADII * radius_mm,
         radius_mm=radius_mm,
         amplitude_scale=amplitude_scale,
+        departure=departure,
     )
     target.settle_fields(start)
     mode, covariance, _ = mode_and_covariance(target, start, scale=scene.steps)

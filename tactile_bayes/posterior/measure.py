@@ -19,7 +19,7 @@ from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
 from tactile_bayes.posterior.fat_depth import head_profile
 from tactile_bayes.posterior.fit import FitOptions
 from tactile_bayes.posterior.pooling import ShapeDraws
-from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
 from tactile_bayes.scan import Scan
 
 UNKNOWNS = ("depth_mm", "stiffness_ratio", "seat", "fat_kpa", "gland_ratio", "thickness_mm")
@@ -56,6 +56,8 @@ class MassRow:
     head_profile_x2, head_profile_y2, head_profile_y4
         How pressure was spread over the head where it felt no lump, see `mapping.head_profile`; None where it always
         felt one.
+    normalise
+        How the map's frames were, see `MapRecipe`.
     """
 
     body: int
@@ -81,9 +83,12 @@ class MassRow:
     head_profile_x2: float | None = None
     head_profile_y2: float | None = None
     head_profile_y4: float | None = None
+    normalise: str = "mean"
 
 
-def measure_mass(scenes: Sequence[Scene], *, body: int, scan: Callable[[Scene], Scan]) -> list[MassRow]:
+def measure_mass(
+    scenes: Sequence[Scene], *, body: int, scan: Callable[[Scene], Scan], normalise: str = DEFAULT_NORMALISE
+) -> list[MassRow]:
     """The rows of one mass: each scene scanned, mapped and fitted as a patient's.
 
     Parameters
@@ -92,11 +97,13 @@ def measure_mass(scenes: Sequence[Scene], *, body: int, scan: Callable[[Scene], 
         Exams of one lump in one body, see `forward.population.draw_mass`.
     scan
         Makes the scan of a scene.
+    normalise
+        As `build_map`'s.
     """
-    return [measure_exam(scene, scan(scene), body=body, exam=i) for i, scene in enumerate(scenes)]
+    return [measure_exam(scene, scan(scene), body=body, exam=i, normalise=normalise) for i, scene in enumerate(scenes)]
 
 
-def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int) -> MassRow:
+def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> MassRow:
     """The row of one exam; a map that cannot be built or shows no lump has none of the measured columns."""
     lump, tissue = scene.solid_lumps[0], scene.body
     assert tissue is not None
@@ -110,9 +117,10 @@ def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int) -> MassRow:
         tissue.fat_kpa,
         tissue.gland_ratio,
         tissue.thickness_mm,
+        normalise=normalise,
     )
     try:
-        tactile_map = build_map(scan)
+        tactile_map = build_map(scan, normalise=normalise)
         quality = tactile_map.quality
         profile: dict[str, Any] = {name: quality.get(name) for name in HEAD_PROFILE}
         row = replace(row, mean_kpa=quality["mean_pressure_kpa"], **profile)

@@ -28,7 +28,8 @@ class Structure:
     Parameters
     ----------
     name
-        ``"ellipse"`` (against round), ``"rotated"``, ``"tilt"``, ``"second lump"``, ``"rib"``.
+        ``"ellipse"`` (against round), ``"rotated"``, ``"tilt"``, ``"second lump"``, ``"rib"``, ``"departure"`` (from a
+        Gaussian).
     odds
         Bayes factor of the scene with it against the scene without; an upper bound where `bound`.
     supported
@@ -41,7 +42,7 @@ class Structure:
         By how many posterior SDs the median of ln sigma_x and ln sigma_y would change, had it been decided the other
         way; None where that was not fitted.
     place
-        Where it lies, in words; empty when it has no place.
+        Where it lies or what it is like, in words; empty when there is nothing to say.
     """
 
     name: str
@@ -133,12 +134,13 @@ class Fitter:
     prior: BumpPrior
     radius_mm: float
     amplitude_scale: float
+    departure: FloatArray | None = None
 
     @classmethod
     def of(cls, fit: FieldFit) -> Fitter:
         """As another fit was made."""
         target = fit.target
-        return cls(target.window, target.prior, target.radius_mm, target.amplitude_scale)
+        return cls(target.window, target.prior, target.radius_mm, target.amplitude_scale, target.departure)
 
     def fit(self, scene: Scene, start: FloatArray) -> FieldFit:
         """As `fit_scene`."""
@@ -149,6 +151,7 @@ class Fitter:
             prior=self.prior,
             radius_mm=self.radius_mm,
             amplitude_scale=self.amplitude_scale,
+            departure=self.departure,
         )
 
     def fit_or_none(self, scene: Scene, start: FloatArray) -> FieldFit | None:

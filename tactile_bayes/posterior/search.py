@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import numpy as np
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import missing_strokes
-from tactile_bayes.posterior.cells import covered_share
+from tactile_bayes.posterior.cells import covered_share, levelled, window_cells
 from tactile_bayes.posterior.detection import Detection, detect
 from tactile_bayes.posterior.fit import (
     LEAST_COVERED_SHARE,
@@ -54,7 +55,7 @@ def search(
     tried: list[Candidate] = []
     first: tuple[Candidate, Detection | FieldAnswer] | None = None
     looks = 0
-    for candidate in fitted_candidates(tactile_map, _search_options(tactile_map, options.fit)):
+    for candidate in _places(tactile_map, options):
         tried.append(candidate)
         if candidate.fault or candidate.fit is None:
             continue
@@ -80,6 +81,26 @@ def search(
     return (*(one for one in tried if one.centre_mm != first[0].centre_mm), first[0]), first[1]
 
 
+def _places(tactile_map: TactileMap, options: EstimateOptions) -> Iterator[Candidate]:
+    """The places a map offers, highest first, fitted as they are asked for."""
+    settings = _search_options(tactile_map, options.fit)
+    if options.fit.noise != "field":
+        yield from fitted_candidates(tactile_map, settings)
+        return
+    found_on = levelled(tactile_map)
+    for one in fitted_candidates(found_on, settings):
+        if found_on is tactile_map or one.fit is None:
+            yield one
+        else:
+            yield replace(one, fit=_with_cells_of(tactile_map, one.fit, settings))
+
+
+def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: FitOptions) -> BumpFit:
+    """A fit to the levelled map with the map's own cells: under a noise field least squares is only a start."""
+    centre = (float(fit.theta[1]), float(fit.theta[2]))
+    return replace(fit, cells=window_cells(tactile_map, centre, radius_mm=settings.radius_mm))
+
+
 def _close_search(
     tactile_map: TactileMap, tried: list[Candidate], options: EstimateOptions
 ) -> tuple[tuple[Candidate, ...], FieldAnswer] | None:
@@ -87,13 +108,14 @@ def _close_search(
 
     Beside a rib least squares grows over both. The posterior has errors that can be a rib, and asks for one after.
     """
-    looks, settings = 0, _search_options(tactile_map, options.fit)
+    looks, settings, found_on = 0, _search_options(tactile_map, options.fit), levelled(tactile_map)
     for i, candidate in enumerate(tried):
         if candidate.fit is not None and not candidate.fault.startswith(OUTGROWN):
             continue
-        fit, fault = fit_close(tactile_map, candidate.centre_mm, options=settings)
+        fit, fault = fit_close(found_on, candidate.centre_mm, options=settings)
         if fit is None or fault:
             continue
+        fit = _with_cells_of(tactile_map, fit, settings)
         seen, fault = _look(tactile_map, fit, options)
         if isinstance(seen, Detection) or fault:
             continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,13 +12,14 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.field_estimate import look, with_neighbours
+from tactile_bayes.posterior.estimate import EstimateOptions
+from tactile_bayes.posterior.field_estimate import FieldAnswer
 from tactile_bayes.posterior.field_posterior import FieldFit, laplace_mixture, shape_draws
-from tactile_bayes.posterior.fit import BumpFit, FitOptions, find_bump, fit_bump
+from tactile_bayes.posterior.fit import BumpFit, FitOptions, fit_bump
 from tactile_bayes.posterior.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.methods import Sampled, importance_draws
 from tactile_bayes.posterior.optimise import optimise
-from tactile_bayes.posterior.scene_choice import LEAST_ODDS
+from tactile_bayes.posterior.search import search
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
 ENDS = (0.025, 0.975)
@@ -116,17 +117,16 @@ def map_case(
     tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior, cosines: int | None = None
 ) -> MapCase | str:
     """The highest bump's fits, or why there is none."""
-    free = FitOptions("free", radius_mm, "off", None, "field")
-    search = replace(free, background="fixed") if tactile_map.background is not None else free
-    candidates = find_bump(tactile_map, search)
+    fit = FitOptions("free", radius_mm, "auto", noise="field", field_cosines=cosines)
+    candidates, seen = search(tactile_map, EstimateOptions(fit=fit, prior=prior))
     if not candidates:
         return "nothing rises above the background"
     found = candidates[-1]
-    if found.fault or found.fit is None:
+    if not isinstance(seen, FieldAnswer) or found.fit is None:
         return f"no bump can be measured: {found.fault}"
-    answer = look(tactile_map, found.fit, prior=prior, radius_mm=radius_mm, least_odds=LEAST_ODDS, cosines=cosines)
-    judged, _ = fit_bump(tactile_map, found.centre_mm, options=replace(search, noise="independent"))
-    return MapCase(judged or found.fit, with_neighbours(answer, tactile_map).choice.fit)
+    printed = FitOptions("free" if tactile_map.background is None else "fixed", radius_mm, "off")
+    judged, _ = fit_bump(tactile_map, found.centre_mm, options=printed)
+    return MapCase(judged or found.fit, seen.choice.fit)
 
 
 @dataclass(frozen=True, slots=True)

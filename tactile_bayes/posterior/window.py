@@ -86,6 +86,10 @@ class Window:
         grid[..., self._row, self._column] = values
         return grid
 
+    def of_cells(self, grid: FloatArray) -> FloatArray:
+        """(..., k) cell values of (..., ny, nx) grids."""
+        return np.asarray(grid[..., self._row, self._column])
+
     def field(self, length_mm: float) -> Whitening:
         """The noise field of one correlation length."""
         if length_mm not in self._fields:
@@ -132,16 +136,20 @@ class Window:
     def bumps(
         self, x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, r: FloatArray | None
     ) -> Profiles:
-        """Cell means of (m,) Gaussians of unit height; along the grid's axes when r is None."""
-        cell = self.cells.cell_mm
+        """Cell means of (m,) Gaussians of unit height, blurred; along the grid's axes when r is None."""
+        cell, noise = self.cells.cell_mm, self.cells.pose_noise
+        blur_x, blur_y = (0.0, 0.0) if noise is None else noise.sd_mm
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if r is None:
-                columns = cell_mean_profile(self.x_mm - x_mm[:, None], sigma_mm=np.exp(p + q), cell_mm=cell)
-                rows = cell_mean_profile(self.y_mm - y_mm[:, None], sigma_mm=np.exp(p - q), cell_mm=cell)
+                columns = blurred_profile(self.x_mm - x_mm[:, None], np.exp(p + q), blur_mm=blur_x, cell_mm=cell)
+                rows = blurred_profile(self.y_mm - y_mm[:, None], np.exp(p - q), blur_mm=blur_y, cell_mm=cell)
                 return Profiles(rows, columns)
             covariance = covariance_from_log_widths(p, q, r)
+            blurred = covariance + np.diag([blur_x**2, blur_y**2])
+            lower = np.sqrt(np.linalg.det(covariance) / np.linalg.det(blurred))
             across, along = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
-            return Profiles(grid=turned_gaussians(across, along, covariance_mm2=covariance, cell_mm=cell))
+            grid = turned_gaussians(across, along, covariance_mm2=blurred, cell_mm=cell)
+            return Profiles(grid=lower[:, None, None] * grid)
 
     def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> Profiles:
         """Straight ridges of unit height, Gaussian across, `offset_mm` from `middle` in direction `angle_rad`."""
@@ -181,6 +189,12 @@ def turned_gaussians(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: Floa
     np.exp(square, out=square)
     square *= np.sqrt(np.clip(narrow, 0.0, None) / det)[:, None, None]
     return square
+
+
+def blurred_profile(distance_mm: FloatArray, sigma_mm: FloatArray, *, blur_mm: float, cell_mm: float) -> FloatArray:
+    """`cell_mean_profile` of Gaussians that were of unit height before they were blurred with this SD."""
+    wide = np.hypot(sigma_mm, blur_mm)
+    return (sigma_mm / wide)[:, None] * cell_mean_profile(distance_mm, sigma_mm=wide, cell_mm=cell_mm)
 
 
 def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> FloatArray:

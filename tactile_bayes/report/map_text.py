@@ -10,7 +10,7 @@ from tactile_bayes.mapping.advice import advise_cell
 from tactile_bayes.mapping.convention import CONVENTIONS
 from tactile_bayes.mapping.shared_frames import LEAST_SHARE
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
-from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE
+from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE
 
 # A strip of the plane narrower than the head itself shows no lump's flanks.
 _LOW_COVERAGE = 0.5
@@ -101,6 +101,9 @@ def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     if "mobility_mm" in quality:
         moved = f"{quality['mobility_mm']:.2f} +- {quality['mobility_sd_mm']:.2f} mm with the head"
         yield "mobility", f"{moved} (a latency left in the poses looks alike)"
+    if POSE_NOISE[0] in quality:
+        across, along = (quality[name] for name in POSE_NOISE[:2])
+        yield "frames' places", f"known to {across:.2f} by {along:.2f} mm (SD a frame, by its neighbours)"
     if "head_profile_frames" in quality:
         across, along = (quality[f"head_profile_{axis}2"] for axis in "xy")
         frames = f"from {quality['head_profile_frames']:.0f} frames without a lump"

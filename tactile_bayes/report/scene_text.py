@@ -16,6 +16,7 @@ ASKED = {
     "tilt": "a sloping level",
     "second lump": "a second lump",
     "rib": "a rib",
+    "departure": "a departure from a Gaussian",
 }
 BUMP = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a turned ellipse"}
 LEAST_SHIFT_SD = 0.005
