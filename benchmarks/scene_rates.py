@@ -1,9 +1,9 @@
 """How often each structure of a scene is reported, true or not: ``python -m benchmarks.scene_rates``.
 
 Prints the table of docs/decisions/0055. Every map goes the whole way through `estimate_map`. A structure is found where
-the report says that the map supports it (`Structure.supported`): odds above 3 for an ellipse, a rotation or a tilt;
-above 10, and a rise of 5 % of the lump's amplitude, for a second lump or a rib. Oval is an ellipse or a rotation. A
-lump is found where a size is given; a map without a size is one on which nothing was found.
+the report says that the map supports it (`Structure.supported`): odds above 3 for an ellipse, a rotation, a tilt or a
+departure from a Gaussian; above 10, and a rise of 5 % of the lump's amplitude, for a second lump or a rib. Oval is an
+ellipse or a rotation. A lump is found where a size is given; a map without a size is one on which nothing was found.
 
 Lumps have an amplitude of 0.3 and sigma 5 mm (geometric mean). Errors are 0.01 from cell to cell and a field of 0.01
 with a correlation length of 1.5 to 12 mm, a thirtieth of the amplitude each; or as large and long as `sbc` draws them.
@@ -34,7 +34,7 @@ AMPLITUDE, SIGMA_MM, NOISE_SD = 0.3, 5.0, 0.01
 RATIO = 1.33
 SLOPE = 0.03
 """Of the level over half a window: a tenth of the amplitude."""
-COLUMNS = ("lump", "oval", "ellipse", "rotated", "tilt", "second lump", "rib")
+COLUMNS = ("lump", "oval", "ellipse", "rotated", "tilt", "second lump", "rib", "departure")
 Draw = Callable[[np.random.Generator], FloatArray]
 
 
@@ -100,6 +100,13 @@ def two_ribs(rng: np.random.Generator) -> FloatArray:
     return np.asarray(heights[0] * ridge(first, angle) + heights[1] * ridge(first + apart, angle))
 
 
+def flatter(rng: np.random.Generator) -> FloatArray:
+    """A round lump with an exponent of 2.5 for a Gaussian's 2, at the cells' centres."""
+    x, y = rng.uniform(-4.0, 4.0, 2)
+    square = ((AXIS - x) ** 2 + (AXIS[:, None] - y) ** 2) / SIGMA_MM**2
+    return np.asarray(AMPLITUDE * np.exp(-((square / 2.0) ** 1.25)))
+
+
 def flat(_: np.random.Generator) -> FloatArray:
     """Nothing."""
     return np.zeros((len(AXIS), len(AXIS)))
@@ -115,6 +122,7 @@ ROWS = (
     Truths("round and a rib", lambda rng: bump(rng) + rib(rng), ("lump", "rib")),
     Truths("a rib and no lump", rib_anywhere, ("rib",)),
     Truths("two ribs and no lump", two_ribs, ("rib",)),
+    Truths("round, flatter than a Gaussian", flatter, ("lump", "departure")),
 )
 
 
