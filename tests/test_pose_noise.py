@@ -66,7 +66,9 @@ def test_what_the_tracker_was_given_is_found(tracker_mm: float, tracker_deg: flo
     true = np.sqrt((tracker_mm**2 + (np.radians(tracker_deg) * 55.0) ** 2) * 2 / 3)
     assert found["pose_noise_x_mm"] == pytest.approx(true, rel=0.12)
     assert found["pose_noise_y_mm"] == pytest.approx(true, rel=0.12)
-    assert (found["frame_side_x_mm"], found["frame_side_y_mm"], found["frames_per_reading"]) == (24.0, 39.0, 2.25)
+    assert (found["frame_side_x_mm"], found["frame_side_y_mm"]) == (24.0, 39.0)
+    # five frames take 1, .8, .8, .8, .8, .8 of six poses and have .68 of a pose's variance; cells 1 mm, taxels 1.5
+    assert found["frames_per_reading"] == pytest.approx(5 * 0.68 / (1 + 5 * 0.64) * 1.5**2, rel=0.01)
 
 
 def test_motion_is_no_noise() -> None:
@@ -85,8 +87,20 @@ def test_a_cubic_path_leaves_nothing_at_uneven_times_and_noise_is_weighed() -> N
 
 def test_a_frame_on_a_pose_has_its_noise_and_one_between_two_has_half() -> None:
     poses_s = np.arange(10.0)
-    assert _interpolation(np.array([2.0, 5.0]), poses_s) == 1.0
-    assert _interpolation(np.array([2.5, 5.5]), poses_s) == 0.5
+    assert _interpolation(np.array([2.0, 5.0]), poses_s) == (1.0, 2.0)
+    assert _interpolation(np.array([2.5, 5.5]), poses_s) == (0.5, 2.0)
+
+
+def test_frames_between_the_same_poses_share_their_errors() -> None:
+    """Against the variance of the mean by simulated errors; twice the same frames are no more than once."""
+    rng = np.random.default_rng(6)
+    poses_s, frames_s = np.arange(0.0, 1.0, 1 / 120), np.arange(0.005, 0.99, 0.01)
+    factor, independent = _interpolation(frames_s, poses_s)
+    errors = rng.standard_normal((20000, len(poses_s)))
+    means = np.array([np.interp(frames_s, poses_s, one).mean() for one in errors])
+    assert np.var(means) == pytest.approx(factor / independent, rel=0.05)
+    assert independent < 0.9 * len(frames_s)
+    assert _interpolation(np.repeat(frames_s, 2), poses_s) == pytest.approx((factor, independent))
 
 
 def test_a_head_that_jumps_or_few_poses_tell_nothing() -> None:
@@ -204,3 +218,17 @@ def test_widths_of_scans_with_only_the_trackers_errors_scatter_as_told() -> None
     assert total > chi2.ppf(0.0005, 24)
     assert float(np.sum(error**2 / (predicted / 4))) > chi2.ppf(0.9995, 24)
     assert abs(np.mean(error)) < 0.002
+
+
+def test_frames_that_are_there_twice_leave_the_spread() -> None:
+    whole = scan(0.6)
+    frames = whole.frames
+    later = np.repeat(frames.time_s, 2) + np.tile([0.0, 1e-6], len(frames.time_s))
+    doubled = replace(frames, time_s=later, counts=np.repeat(frames.counts, 2, axis=0))
+    once, twice = build_map(whole), build_map(replace(whole, frames=doubled))
+    assert twice.count.sum() == pytest.approx(2 * once.count.sum(), rel=0.01)
+    first, second = (np.diag(pose_covariance(fit_of(estimated(one)))) for one in (once, twice))
+    np.testing.assert_allclose(np.sqrt(second), np.sqrt(first), rtol=0.05)
+    # the control: by the readings alone each frame's error would count twice, and the SD would be 0.7 of it
+    naive = replace(twice, quality=twice.quality | {"frames_per_reading": once.quality["frames_per_reading"]})
+    assert np.sqrt(np.diag(pose_covariance(fit_of(estimated(naive)))) / first).max() < 0.75

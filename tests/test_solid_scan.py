@@ -221,7 +221,7 @@ def test_the_map_of_a_ball_is_the_other_programs() -> None:
     """15 mm, h/d 1, centred, 100 times as stiff: amplitude .30, sigma 5.1 and 4.0 mm in a scan of the other program."""
     scene = dataclasses.replace(SHORT, duration_s=7.0, strokes=Strokes(tilt_deg=0.1), background=Background())
     made = simulate(scene, rng=np.random.default_rng(1))
-    fit = find_bump(build_map(made.scan), FitOptions())[-1].fit
+    fit = find_bump(build_map(made.scan, normalise="mean"), FitOptions())[-1].fit
     assert fit is not None
     sigma_x, sigma_y, _ = fit.widths()
     assert fit.theta[0] == pytest.approx(0.30, abs=0.01)

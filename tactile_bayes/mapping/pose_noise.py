@@ -7,6 +7,7 @@ neighbouring poses do not share can be told from the head's motion, and only tho
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,30 +30,52 @@ def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, ce
 
     The noise is what a pose departs by from the cubic through the two poses before and the two after it.
     """
-    found = [(one, part.used.sum()) for part in selections if (one := _frame_variance(part, plane)) is not None]
+    found = [one for part in selections if (one := _Places.of(part, plane)) is not None]
     if not found:
         return {}
-    variance = np.average([one for one, _ in found], axis=0, weights=[frames for _, frames in found])
+    frames = np.array([one.frames for one in found])
+    variance = np.average([one.variance for one in found], axis=0, weights=frames)
     if variance.max() > MOST_MM**2:
         return {}
     head = selections[0].scan.head
     sides = [taxels * head.pitch_mm for taxels in head.shape]
-    figures = [*np.sqrt(variance), *sides, (head.pitch_mm / cell_mm) ** 2]
+    independent = sum(one.independent for one in found) / float(frames.sum())
+    figures = [*np.sqrt(variance), *sides, (head.pitch_mm / cell_mm) ** 2 * independent]
     return {name: float(f"{value:.4g}") for name, value in zip(POSE_NOISE, figures, strict=True)}
 
 
-def _frame_variance(part: SelectedFrames, plane: Plane) -> FloatArray | None:
-    """(2,) variance of a used frame's place along the plane's axes; None where there are too few poses."""
-    frames_s = part.scan.frames.time_s[part.used]
-    poses = distinct_poses(part.scan.poses)
-    if len(poses) < LEAST_POSES or not len(frames_s):
-        return None
-    lever = inverse(part.scan.head.scanhead_from_tracker)[:3, 3]
-    apex = poses.position_mm + rotation_from_quaternion(poses.quaternion_wxyz) @ lever
-    departure, weight = _departures(poses.time_s, apply(plane.plane_from_base, apex)[:, :2])
-    square = np.sort(departure**2 / weight[:, None], axis=0)
-    noise = square[: int(KEPT * len(square))].mean(axis=0) / _INNER_SQUARE
-    return np.asarray(noise * _interpolation(frames_s, poses.time_s))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Errors of the places of a scan's used frames.
+
+    Parameters
+    ----------
+    variance : (2,) array
+        Of a frame's place along the plane's axes, mm^2.
+    frames
+        Used ones.
+    independent
+        Frames with errors of their own whose mean would be known as well: those between two poses share theirs.
+    """
+
+    variance: FloatArray
+    frames: int
+    independent: float
+
+    @classmethod
+    def of(cls, part: SelectedFrames, plane: Plane) -> _Places | None:
+        """Of one scan; None where there are too few poses."""
+        frames_s = part.scan.frames.time_s[part.used]
+        poses = distinct_poses(part.scan.poses)
+        if len(poses) < LEAST_POSES or not len(frames_s):
+            return None
+        lever = inverse(part.scan.head.scanhead_from_tracker)[:3, 3]
+        apex = poses.position_mm + rotation_from_quaternion(poses.quaternion_wxyz) @ lever
+        departure, weight = _departures(poses.time_s, apply(plane.plane_from_base, apex)[:, :2])
+        square = np.sort(departure**2 / weight[:, None], axis=0)
+        noise = square[: int(KEPT * len(square))].mean(axis=0) / _INNER_SQUARE
+        factor, independent = _interpolation(frames_s, poses.time_s)
+        return cls(noise * factor, len(frames_s), independent)
 
 
 def _departures(time_s: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -70,7 +93,14 @@ def _departures(time_s: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, F
     return departure, variance
 
 
-def _interpolation(frames_s: FloatArray, poses_s: FloatArray) -> float:
-    """Mean variance of linear interpolation between independent poses at the frames' times, over a pose's."""
-    share = np.interp(frames_s, poses_s, np.arange(len(poses_s))) % 1.0
-    return float(np.mean(share**2 + (1.0 - share) ** 2))
+def _interpolation(frames_s: FloatArray, poses_s: FloatArray) -> tuple[float, float]:
+    """Variance of linear interpolation between independent poses at the frames' times, over a pose's, on average.
+
+    And how many independent frames of that variance have a mean of the same variance as these have.
+    """
+    place = np.interp(frames_s, poses_s, np.arange(len(poses_s)))
+    before = np.minimum(place.astype(np.int64), len(poses_s) - 2)
+    share = place - before
+    factor = float(np.mean(share**2 + (1.0 - share) ** 2))
+    taken = np.bincount(before, 1.0 - share, len(poses_s)) + np.bincount(before + 1, share, len(poses_s))
+    return factor, float(len(frames_s) ** 2 * factor / np.sum(taken**2))

@@ -32,7 +32,7 @@ class PoseNoise:
     side_mm
         Sides of the array along x and y: cells closer together than these share frames, and with them errors.
     frames_per_reading
-        Frames that felt a cell, over the readings in it.
+        Frames with an error of their own that felt a cell, over the readings in it.
     """
 
     sd_mm: tuple[float, float]
