@@ -29,6 +29,7 @@ from tactile_bayes.posterior.pose_spread import pose_covariance
 from tactile_bayes.posterior.tangent import tangent_columns
 from tactile_bayes.posterior.window import Window
 from tactile_bayes.presets import POSE_NOISE
+from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scan import Scan, TrackerPoses
 
@@ -196,6 +197,24 @@ def test_the_spread_is_that_of_the_whole_covariance() -> None:
     found, dense = pose_covariance(fit), dense_covariance(fit, told)
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(dense)), rtol=0.03)
     assert np.corrcoef(found.ravel(), dense.ravel())[0, 1] > 0.999
+
+
+def test_the_report_says_what_they_make_of_the_widths_or_that_they_are_left_out() -> None:
+    tactile_map = build_map(scan(0.6))
+    found = estimated(tactile_map)
+    share = found.diagnostics["places_share"]
+    assert isinstance(share, float)
+    posterior = found.map_posterior
+    assert posterior is not None
+    spread = np.var([np.log(posterior.sigma_x_mm), np.log(posterior.sigma_y_mm)], axis=(1, 2)).sum()
+    added = np.diag(pose_covariance(fit_of(found)))[:2].sum()
+    assert share == pytest.approx(added / spread, rel=0.15)
+    assert f"{100 * share:.0f} % is errors of the frames' places" in estimate_text(found, tactile_map, probability=0.95)
+    untold = {name: value for name, value in tactile_map.quality.items() if name not in POSE_NOISE}
+    without = replace(tactile_map, quality=untold)
+    text = estimate_text(estimated(without), without, probability=0.95)
+    assert "Left out: errors of the frames' places and their blur" in text
+    assert "of the widths" not in text
 
 
 def test_a_map_that_does_not_tell_adds_nothing() -> None:

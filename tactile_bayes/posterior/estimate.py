@@ -216,7 +216,7 @@ def estimate_map(
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
-        left_out=_left_out(options, calibration, diagnostics),
+        left_out=_left_out(tactile_map, options, calibration, diagnostics),
         scene=scene,
         sensitivity=_sensitivity(posterior, size, options),
     )
@@ -366,9 +366,14 @@ def _diagnostics(
 
 
 def _left_out(
-    options: EstimateOptions, calibration: SizeCalibration | LogQuadratic | None, diagnostics: Mapping[str, object]
+    tactile_map: TactileMap,
+    options: EstimateOptions,
+    calibration: SizeCalibration | LogQuadratic | None,
+    diagnostics: Mapping[str, object],
 ) -> tuple[str, ...]:
     notes = []
+    if tactile_map.recipe.source == "scan" and diagnostics.get("places_share") is None:
+        notes.append("errors of the frames' places and their blur")
     odds = diagnostics["rotation_odds"]
     if odds is not None and not diagnostics["rotated"] and options.fit.noise != "field":
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")

@@ -167,13 +167,18 @@ def draw(
     detection = answer.detection
     if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
         detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
+    places = pose_covariance(choice.fit)
     figures = _diagnostics(choice) | ({"passed_over": list(passed_over)} if passed_over else {})
-    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng, solved), figures)
+    figures["places_share"] = _places_share(choice.fit, places)
+    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
 
 
-def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved) -> dict[str, FloatArray]:
+def _posterior(
+    fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved, places: FloatArray
+) -> dict[str, FloatArray]:
+    """Draws by name, with what errors of the frames' places add to them."""
     shape = draws.theta.shape[:2]
-    theta = draws.theta + _displaced(fit, shape, rng)
+    theta = draws.theta + _displaced(places, shape, rng)
     sigma_x, sigma_y, angle = shape_draws(fit, theta)
     amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
     return {
@@ -188,11 +193,20 @@ def _posterior(fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, s
     }
 
 
-def _displaced(fit: FieldFit, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
-    """(chain, draw, p) what errors of the frames' places add to draws."""
-    values, vectors = np.linalg.eigh(pose_covariance(fit))
+def _displaced(places: FloatArray, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+    """(chain, draw, p) draws of a covariance."""
+    values, vectors = np.linalg.eigh(places)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(rng.standard_normal((*shape, len(values))) @ root.T)
+
+
+def _places_share(fit: FieldFit, places: FloatArray) -> float | None:
+    """Share of the variance of the log widths that errors of the frames' places make; None where they are not told."""
+    if fit.target.window.cells.pose_noise is None:
+        return None
+    widths = [fit.scene.names.index(name) for name in ("u", "v") if name in fit.scene.names]
+    added = float(np.diag(places)[widths].sum())
+    return added / (added + float(np.diag(fit.covariance)[widths].sum()))
 
 
 def _diagnostics(choice: SceneChoice) -> dict[str, object]:

@@ -90,6 +90,8 @@ def _findings(estimate: Estimate) -> list[str]:
             lines.append(f"{words}.")
         if estimate.size.invalid:
             lines.append(f"{estimate.size.invalid} draws gave no size and were left out.")
+    if isinstance(share := estimate.diagnostics.get("places_share"), float):
+        lines.append(f"Of the variance of the widths {100 * share:.0f} % is errors of the frames' places.")
     lines += [f"Passed over: {text}." for text in _texts(estimate.diagnostics.get("passed_over"))]
     return [*lines, method_line(estimate.draws)] if estimate.draws is not None else lines
 

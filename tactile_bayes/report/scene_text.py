@@ -28,15 +28,17 @@ def scene_lines(choice: SceneChoice) -> list[str]:
     names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}" for one in beside)]
     lines = [f"Scene: {' and '.join(names)}, the simplest that the map supports."]
     for one in beside:
-        lines.append(
-            f"{ASKED[one.name].capitalize()} is in the model (odds {odds_text(one)}){_change(one, 'without')}."
-        )
+        lines.append(f"{_sentence(ASKED[one.name])} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
     kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
     lines += [f"Kept open: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]
     out = [
         f"{ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'with')}" for one in choice.structures if not one.used
     ]
     return [*lines, f"Not in the model: {'; '.join(out)}."] if out else lines
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def odds_text(one: Structure) -> str:
