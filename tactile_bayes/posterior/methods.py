@@ -289,7 +289,9 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
     target = fit.target
     digest = hashlib.sha256()
     cells = target.window.cells
-    for values in (cells.x_mm, cells.y_mm, cells.value, cells.count, target.window.variance, fit.mode, fit.covariance):
+    arrays = [cells.x_mm, cells.y_mm, cells.value, cells.count, target.window.variance, fit.mode, fit.covariance]
+    arrays += [] if target.departure is None else [target.departure]
+    for values in arrays:
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
     said = {
         "scene": asdict(fit.scene),
@@ -298,6 +300,7 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
         "bounds": [target.widest_mm, target.radius_mm],
         "fields": target.chosen_fields(),
         "cosines": target.window.cosines,
+        "pose_noise": None if cells.pose_noise is None else asdict(cells.pose_noise),
         "settings": settings,
         "rng": str(rng.bit_generator.state),
     }
