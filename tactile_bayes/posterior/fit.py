@@ -223,15 +223,10 @@ def fit_close(
 ) -> tuple[BumpFit | None, str]:
     """Where to begin beside something that pulls the bump away: least squares in a window of `CLOSE_IN_RADII`.
 
-    The ellipse may turn, so that a ridge shows as one. The cells are those of the whole window: under a noise field
-    least squares is only a start.
+    The ellipse may turn, so that a ridge shows as one.
     """
     near = replace(options, radius_mm=CLOSE_IN_RADII * options.radius_mm, rotation="on")
-    fit, fault = fit_bump(tactile_map, centre_mm, options=near)
-    if fit is None or fault:
-        return None, fault
-    centre = (float(fit.theta[1]), float(fit.theta[2]))
-    return replace(fit, cells=window_cells(tactile_map, centre, radius_mm=options.radius_mm)), ""
+    return fit_bump(tactile_map, centre_mm, options=near)
 
 
 def _bump(tactile_map: TactileMap, options: FitOptions, *, rotated: bool) -> Bump:

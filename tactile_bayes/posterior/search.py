@@ -96,7 +96,10 @@ def _places(tactile_map: TactileMap, options: EstimateOptions) -> Iterator[Candi
 
 
 def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: FitOptions) -> BumpFit:
-    """A fit to the levelled map with the map's own cells: under a noise field least squares is only a start."""
+    """A fit to the levelled map, or in a smaller window, with the map's cells of the whole window.
+
+    Under a noise field least squares is only a start.
+    """
     centre = (float(fit.theta[1]), float(fit.theta[2]))
     return replace(fit, cells=window_cells(tactile_map, centre, radius_mm=settings.radius_mm))
 

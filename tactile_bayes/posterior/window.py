@@ -149,7 +149,8 @@ class Window:
             lower = np.sqrt(np.linalg.det(covariance) / np.linalg.det(blurred))
             across, along = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
             grid = turned_gaussians(across, along, covariance_mm2=blurred, cell_mm=cell)
-            return Profiles(grid=lower[:, None, None] * grid)
+            grid *= lower[:, None, None]
+            return Profiles(grid=grid)
 
     def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> Profiles:
         """Straight ridges of unit height, Gaussian across, `offset_mm` from `middle` in direction `angle_rad`."""
