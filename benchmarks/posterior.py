@@ -214,7 +214,7 @@ def _in_jax(fit: Any) -> Callable[[Any], Any]:
             squares = one.rest() - along_data**2 / power + one.floor
             variance = target.amplitude_sd**2 + squares / dof / power
             prior = jnp.log(variance) + (along_data / power) ** 2 / variance
-            parts.append(-0.5 * (one.log_det + jnp.log(power) + prior) - 0.5 * dof * jnp.log(squares))
+            parts.append(one.log_prior - 0.5 * (one.log_det + jnp.log(power) + prior + dof * jnp.log(squares)))
         p, q = 0.5 * (theta[0] + theta[1]), 0.5 * (theta[0] - theta[1])
         widths = ((p - jnp.log(target.prior.width_median_mm)) / target.prior.log_width_sd) ** 2
         widths += (q / target.prior.log_ratio_sd) ** 2

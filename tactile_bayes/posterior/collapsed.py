@@ -14,30 +14,30 @@ the last factor is approximate: the prior is taken at the mean noise scale. Fiel
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import pairwise
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import FitCells
-from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Whitening
-from tactile_bayes.posterior.linear import FieldColumns, LinearSolution, joined, solve
+from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Whitening, no_field
+from tactile_bayes.posterior.linear import FieldColumns, Inner, LinearSolution, joined, solve
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.solved import Solution, Solved, distinct_rows
+from tactile_bayes.posterior.spanned import LEAST_BUMPS, Spanned
 from tactile_bayes.posterior.window import Profiles, Projected, Window
 
 BLOCK = 128
 """Shapes solved at a time: fewer spend their time on calls, more leave the processor's cache."""
-DRAWN = 64
-"""Shapes whose draws are made at a time: another number would make other draws of equal random numbers."""
 NEGLIGIBLE = 1e-3
-"""Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for."""
-FADED = np.log(1e-4)
-"""Shorter lengths are not looked at once one's best evidence lies this far below the best of all."""
-LOG_FIELD_PRIOR = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
+"""Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
+Once a length has as little, and less than the one before it, shorter ones are not looked at."""
+SPANNED = 2048
+"""As many share a basis where they can, see `posterior.spanned`."""
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+WithEvidence = tuple[FloatArray, LinearSolution]
+"""Log of the fields' prior times the evidence (m, h), and what is linear."""
 
 
 class CollapsedTarget:
@@ -83,6 +83,7 @@ class CollapsedTarget:
         self._weighted_plain = window.on_grid(scaled)
         self._plain_gram = self._plain @ scaled.T
         self._plain_low = window.project(Profiles(grid=window.on_grid(self._plain)), self._weighted_plain).low
+        self._lengths: dict[float, FieldColumns] = {}
         self._fields: list[FieldColumns] | None = None
         self._made_up = 0.0
 
@@ -122,7 +123,7 @@ class CollapsedTarget:
     def fields(self) -> list[FieldColumns]:
         """The noise fields of the mixture, a length each with its shares; all of them until they are settled."""
         if self._fields is None:
-            self._fields = [self._under_length(self.window.field(length)) for length in LENGTHS_MM]
+            self._fields = list(self._from_the_longest())
         return self._fields
 
     def __call__(self, theta: FloatArray) -> FloatArray:
@@ -133,19 +134,16 @@ class CollapsedTarget:
         """The same, with what `draw_linear` needs at these points kept in `solved`."""
         solution = self.conditional(theta)
         solved.add(theta, solution)
-        return self._mixed(theta, solution[0] + LOG_FIELD_PRIOR + self._made_up)
+        return self._mixed(theta, solution[0] + self._made_up)
 
     def _mixed(self, theta: FloatArray, by_field: FloatArray) -> FloatArray:
         total = np.logaddexp.reduce(by_field, axis=1) + self.log_prior(theta)
         return np.where(np.isfinite(total), total, -np.inf)
 
     def by_field(self, theta: FloatArray) -> FloatArray:
-        """(m, fields) log evidence of each field times the field's prior; the shape's prior left out."""
-        parts = []
-        for i in range(0, len(theta), BLOCK):
-            projected, cross = self._project(self.scene.templates(theta[i : i + BLOCK], self.window))
-            parts.append(np.concatenate([self._under(projected, cross, one)[0] for one in self.fields], axis=1))
-        return np.concatenate(parts) + LOG_FIELD_PRIOR + self._made_up
+        """(m, fields) log of each field's prior times its evidence; the shape's prior left out."""
+        parts = [np.concatenate([one for one, _ in part], axis=1) for part in self._parts(theta)]
+        return np.concatenate(parts) + self._made_up
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
         """(m,) log prior of the shape; -inf outside the window and where the bump is wider than it."""
@@ -171,7 +169,7 @@ class CollapsedTarget:
         total = float(np.logaddexp.reduce(evidence))
         kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in found]
         self._fields = [
-            self._under_length(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
+            self._columns(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
             for columns, keep in kept
             if keep.any()
         ]
@@ -187,20 +185,31 @@ class CollapsedTarget:
         """Log evidence of level and tilt alone under all fields, on the scale of the log density."""
         dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
         found = self._walk(lambda columns: columns.null_evidence(dof=dof))
-        return float(np.logaddexp.reduce(np.concatenate([one for _, one in found])) + LOG_FIELD_PRIOR)
+        return float(np.logaddexp.reduce(np.concatenate([one for _, one in found])))
 
     def _walk(self, evidence: Callable[[FieldColumns], FloatArray]) -> list[tuple[FieldColumns, FloatArray]]:
-        """Evidence of the fields from the longest down, until they have faded."""
+        """Evidence of no field, then of the lengths from the longest down, until they have faded."""
         found: list[tuple[FieldColumns, FloatArray]] = []
-        best = -np.inf
-        for length in sorted(LENGTHS_MM, reverse=True):
-            columns = self._under_length(self.window.field(length))
+        best = before = -np.inf
+        for columns in self._from_the_longest():
             one = evidence(columns)
             found.append((columns, one))
-            if one.max() < best + FADED:
+            if one.max() < min(before, best + np.log(NEGLIGIBLE)):
                 break
             best = max(best, float(one.max()))
+            before = float(one.max()) if columns.shares[0] > 0 else -np.inf
         return found
+
+    def _from_the_longest(self) -> Iterator[FieldColumns]:
+        """No field, and each length with every share; a length is worked out when it is come to."""
+        shares = np.array(SHARES)
+        for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
+            chosen = shares[(shares > 0) == (length > 0)]
+            if length not in self._lengths and len(chosen):
+                field = self.window.field(length) if length else no_field(self.window.cosines)
+                self._lengths[length] = self._columns(field, chosen)
+            if len(chosen):
+                yield self._lengths[length]
 
     def field_summary(self, theta: FloatArray) -> dict[str, float]:
         """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
@@ -216,12 +225,12 @@ class CollapsedTarget:
         Returns
         -------
         evidence, amplitude, power, slope, squares
-            Log evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power (m, h, v, v), by how much
-            the level falls with each (m, h, v), and the sum of squares (m, h).
+            Log of prior times evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power
+            (m, h, v, v), by how much the level falls with each (m, h, v), and the sum of squares (m, h).
         """
         parts = []
-        for i in range(0, len(theta), BLOCK):
-            evidence, one = self._solve(theta[i : i + BLOCK])
+        for part in self._parts(theta):
+            evidence, one = _side_by_side(part)
             parts.append((evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares))
         return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
@@ -233,23 +242,14 @@ class CollapsedTarget:
         Points that `solved` knows are not solved again.
         """
         unique, back = distinct_rows(theta)
-        amplitude, level, noise = np.empty((len(theta), self.structures)), np.empty(len(theta)), np.empty(len(theta))
-        order = np.argsort(back, kind="stable")
-        edges = np.searchsorted(back[order], np.arange(0, len(unique) + DRAWN, DRAWN))
+        evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
         at_zero, level_variance = self._levels()
-        for i, (first, last) in enumerate(pairwise(edges)):
-            rows = order[first:last]
-            points = unique[i * DRAWN : (i + 1) * DRAWN]
-            evidence, centre, power, slope, squares = (solved or self.conditional)(points)
-            of = back[rows] - i * DRAWN
-            h = choose(evidence[of], rng)
-            tau2 = squares[of, h] / rng.chisquare(self.dof, size=len(rows))
-            a = self._draw_amplitudes(centre[of, h], power[of, h], tau2, rng)
-            about = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(rows))
-            amplitude[rows] = a
-            level[rows] = at_zero[h] - np.sum(slope[of, h] * a, axis=1) + about
-            noise[rows] = np.sqrt(tau2 * self.window.variance.mean())
-        return amplitude, level, noise
+        h = choose(evidence[back], rng)
+        tau2 = squares[back, h] / rng.chisquare(self.dof, size=len(theta))
+        amplitude = self._draw_amplitudes(centre[back, h], power[back, h], tau2, rng)
+        about = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(theta))
+        level = at_zero[h] - np.sum(slope[back, h] * amplitude, axis=1) + about
+        return amplitude, level, np.sqrt(tau2 * self.window.variance.mean())
 
     def _levels(self) -> tuple[FloatArray, FloatArray]:
         """(h,) levels at amplitudes of 0 under each field, and their variances over tau^2."""
@@ -262,9 +262,13 @@ class CollapsedTarget:
     ) -> FloatArray:
         """(m, v) draws given the noise scale: the flat prior's normal times the amplitudes' own."""
         data = power / tau2[:, None, None]
+        normal = rng.standard_normal((*centre.shape, 1))
+        if self.structures == 1:
+            precision = data[:, 0] + 1.0 / self.amplitude_sd**2
+            return np.asarray(data[:, 0] * centre / precision + normal[:, 0] / np.sqrt(precision))
         covariance = np.linalg.inv(data + np.eye(self.structures) / self.amplitude_sd**2)
         mean = (covariance @ (data @ centre[..., None]))[..., 0]
-        return np.asarray(mean + (np.linalg.cholesky(covariance) @ rng.standard_normal((*mean.shape, 1)))[..., 0])
+        return np.asarray(mean + (np.linalg.cholesky(covariance) @ normal)[..., 0])
 
     def tilt_log_odds(self, theta: FloatArray) -> float:
         """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
@@ -303,37 +307,65 @@ class CollapsedTarget:
         Fields are those settled; the scene has one structure.
         """
         (bump,) = self.scene.templates(theta[None], self.window)
-        alone, _ = self._project([bump])
-        base = np.concatenate([self._under(alone, None, columns)[0][0] for columns in self.fields])
-        beside, _ = self._project([templates])
-        cross = self.window.product(bump, templates)
-        number = len(beside[0].square)
-        both = [Projected(*(np.repeat(v, number, axis=0) for v in (alone[0].low, alone[0].plain, alone[0].square)))]
-        with_it = [
-            solve(both + beside, cross, columns, dof=self.dof - 1, amplitude_sd=self.amplitude_sd)[0]
-            for columns in self.fields
-        ]
-        return np.asarray(np.logaddexp.reduce(np.concatenate(with_it, axis=1), axis=1) - np.logaddexp.reduce(base))
+        (alone,), _ = self._project([bump])
+        (beside,), _ = self._project([templates])
+        product = self.window.product(bump, templates)
+        base, with_it = [], []
+        for columns in self.fields:
+            one, other = Inner.of(alone, columns), Inner.of(beside, columns)
+            base.append(self._found([one], None, columns)[0][0])
+            cross = one.product(other, product, columns)
+            both = [one.repeated(len(product)), other]
+            with_it.append(solve(both, cross, columns, dof=self.dof - 1, amplitude_sd=self.amplitude_sd)[0])
+        gained = np.logaddexp.reduce(np.concatenate(with_it, axis=1), axis=1)
+        return np.asarray(gained - np.logaddexp.reduce(np.concatenate(base)))
 
-    def _under_length(self, field: Whitening, shares: FloatArray | None = None) -> FieldColumns:
-        """Level, tilt and data under one length's field."""
-        chosen = np.array(SHARES) if shares is None else shares
-        return FieldColumns.of(field, chosen, plain_low=self._plain_low, plain_gram=self._plain_gram)
+    def _columns(self, field: Whitening, shares: FloatArray) -> FieldColumns:
+        """Level, tilt and data under shares of one length's field; without a field the lengths are one."""
+        log_prior = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
+        if not shares.any():
+            log_prior += float(np.log(len(LENGTHS_MM)))
+        return FieldColumns.of(
+            field, shares, log_prior=log_prior, plain_low=self._plain_low, plain_gram=self._plain_gram
+        )
 
     def _project(self, templates: list[Profiles]) -> tuple[list[Projected], FloatArray | None]:
         projected = [self.window.project(one, self._weighted_plain) for one in templates]
         return projected, self.window.product(*templates) if len(templates) == 2 else None
 
-    def _under(
-        self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns
-    ) -> tuple[FloatArray, LinearSolution]:
-        return solve(projected, cross, columns, dof=self.dof, amplitude_sd=self.amplitude_sd)
+    def _parts(self, theta: FloatArray) -> Iterator[list[WithEvidence]]:
+        """Blocks of (m, p) vectors, each solved under every length; many at once where they share a basis."""
+        size = SPANNED if self.scene.separable else BLOCK
+        for i in range(0, len(theta), size):
+            points = theta[i : i + size]
+            spanned = self._spanned(points) if self.scene.separable and len(points) >= LEAST_BUMPS else None
+            if spanned is not None:
+                yield [self._found([spanned.inner(columns)], None, columns) for columns in self.fields]
+                continue
+            for j in range(0, len(points), BLOCK):
+                projected, cross = self._project(self.scene.templates(points[j : j + BLOCK], self.window))
+                yield [self._under(projected, cross, columns) for columns in self.fields]
 
-    def _solve(self, theta: FloatArray) -> tuple[FloatArray, LinearSolution]:
-        """Log evidence (m, fields) and the conditional solutions."""
+    def _spanned(self, theta: FloatArray) -> Spanned | None:
+        (bumps,) = self.scene.templates(theta, self.window)
+        return Spanned.of(bumps, self.window, self._weighted_plain)
+
+    def _under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> WithEvidence:
+        inner = [Inner.of(one, columns) for one in projected]
+        return self._found(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
+
+    def _found(self, inner: list[Inner], cross: FloatArray | None, columns: FieldColumns) -> WithEvidence:
+        return solve(inner, cross, columns, dof=self.dof, amplitude_sd=self.amplitude_sd)
+
+    def _solve(self, theta: FloatArray) -> WithEvidence:
+        """All fields' evidence and solutions at a few vectors."""
         projected, cross = self._project(self.scene.templates(theta, self.window))
-        found = [self._under(projected, cross, columns) for columns in self.fields]
-        return np.concatenate([one for one, _ in found], axis=1), joined([solution for _, solution in found])
+        return _side_by_side([self._under(projected, cross, columns) for columns in self.fields])
+
+
+def _side_by_side(found: list[WithEvidence]) -> WithEvidence:
+    """All fields, from those of each length."""
+    return np.concatenate([one for one, _ in found], axis=1), joined([solution for _, solution in found])
 
 
 def independent_variance(cells: FitCells) -> FloatArray:

@@ -62,6 +62,11 @@ class Whitening:
         return np.asarray(np.log1p(np.asarray(share)[..., None] * self.eigenvalues).sum(axis=-1))
 
 
+def no_field(cosines: int) -> Whitening:
+    """The share of 0, which is the same for every length: no directions."""
+    return Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines**2, 0)), np.zeros(0))
+
+
 def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tuple[FloatArray, FloatArray]:
     """Cosines along one axis, and their squared angular frequencies.
 

@@ -12,7 +12,7 @@ from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.sobol import BITS, shifted_sobol
 from tactile_bayes.records import dataclass
 
-STRETCH, WIDE_STRETCH = 0.3, 1.0
+STRETCH, WIDE_STRETCH = 0.45, 0.8
 """Bend of the proposal's tails: normal coordinates z become sinh(b z) / b, normal in the middle, log-normal outside.
 
 The wide one is for densities with tails like a t: from a few thousand points it needs a quarter of the narrow one's."""

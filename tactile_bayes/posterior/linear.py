@@ -53,6 +53,8 @@ class FieldColumns:
     field
         The length.
     shares : (h,) array
+    log_prior
+        Log prior probability of each share.
     weight : (k, h) array
         Of the squared projections that the field takes away, a column a share.
     plain : (k, h * (c + 1)) array
@@ -69,6 +71,7 @@ class FieldColumns:
 
     field: Whitening
     shares: FloatArray
+    log_prior: float
     weight: FloatArray
     plain: FloatArray
     gram: FloatArray
@@ -77,7 +80,9 @@ class FieldColumns:
     floor: float
 
     @classmethod
-    def of(cls, field: Whitening, shares: FloatArray, *, plain_low: FloatArray, plain_gram: FloatArray) -> FieldColumns:
+    def of(
+        cls, field: Whitening, shares: FloatArray, *, log_prior: float, plain_low: FloatArray, plain_gram: FloatArray
+    ) -> FieldColumns:
         """From (c + 1, cosines^2) projections and (c + 1, c + 1) products of the fixed columns and the data."""
         low = plain_low @ field.turn
         weight = field.shrinkage(shares)
@@ -89,7 +94,7 @@ class FieldColumns:
         plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
         log_det = field.log_determinant(shares) + volume
         floor = FLOOR * float(plain_gram[c, c]) + 1e-300
-        return cls(field, shares, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor)
+        return cls(field, shares, log_prior, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor)
 
     def rest(self) -> FloatArray:
         """(h,) sum of squares that the fixed columns leave."""
@@ -98,22 +103,55 @@ class FieldColumns:
         return np.asarray(self.gram[:, c, c] - np.einsum("hc,hcd,hd->h", right, self.inverse, right))
 
     def null_evidence(self, *, dof: int) -> FloatArray:
-        """(h,) log evidence of the fixed columns alone."""
-        return (
-            -0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * (np.maximum(self.rest(), 0.0) + self.floor))
-        )
+        """(h,) log of the prior times the evidence of the fixed columns alone."""
+        squares = np.maximum(self.rest(), 0.0) + self.floor
+        return self.log_prior - 0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * squares)
 
 
-def solve(
-    projected: list[Projected], cross: FloatArray | None, columns: FieldColumns, *, dof: int, amplitude_sd: float
-) -> tuple[FloatArray, LinearSolution]:
-    """Log evidence (m, h) and the solutions of one or two structures under one length's field.
+@dataclass(frozen=True, slots=True, eq=False)
+class Inner:
+    """Inner products of m templates under one length's field and its h shares.
 
     Parameters
     ----------
-    projected
+    plain : (m, h, c + 1) array
+        With the fixed columns and the data.
+    square : (m, h) array
+        With themselves.
+    low : (m, k) array
+        Projections on the field's directions; none where templates are never held against others.
+    """
+
+    plain: FloatArray
+    square: FloatArray
+    low: FloatArray
+
+    @classmethod
+    def of(cls, projected: Projected, columns: FieldColumns) -> Inner:
+        """From products that know no field."""
+        low = projected.low @ columns.field.turn
+        taken = (low @ columns.plain).reshape(len(low), len(columns.shares), -1)
+        return cls(projected.plain[:, None, :] - taken, projected.square[:, None] - low**2 @ columns.weight, low)
+
+    def repeated(self, number: int) -> Inner:
+        """The same templates so many times each."""
+        return Inner(*(np.repeat(one, number, axis=0) for one in (self.plain, self.square, self.low)))
+
+    def product(self, other: Inner, product: FloatArray, columns: FieldColumns) -> FloatArray:
+        """(m, h) with other templates, from their (m,) products without the field."""
+        return np.asarray(product[:, None] - (self.low * other.low) @ columns.weight)
+
+
+def solve(
+    inner: list[Inner], cross: FloatArray | None, columns: FieldColumns, *, dof: int, amplitude_sd: float
+) -> tuple[FloatArray, LinearSolution]:
+    """Log of the fields' prior times the evidence (m, h), and the solutions of one or two structures, under one length.
+
+    Parameters
+    ----------
+    inner
         Of each structure's (m,) templates.
-    cross : (m,) array
+    cross : (m, h) array
         Products of the two structures' templates; None when there is one.
     dof
         Cells minus linear parameters.
@@ -121,30 +159,25 @@ def solve(
         Of the normal prior on each amplitude.
     """
     c = columns.inverse.shape[1]
-    h = len(columns.log_det)
-    low = [one.low @ columns.field.turn for one in projected]
-    plain = [
-        one.plain[:, None, :] - (z @ columns.plain).reshape(len(z), h, c + 1)
-        for one, z in zip(projected, low, strict=True)
-    ]
+    plain = [one.plain for one in inner]
     to_level = [np.matmul(one[:, :, None, :c], columns.inverse)[:, :, 0] for one in plain]
     right = columns.gram[:, :c, c]
     along = [one[:, :, c] - np.sum(t * right, axis=2) for one, t in zip(plain, to_level, strict=True)]
 
     def power(i: int, j: int, product: FloatArray) -> FloatArray:
-        shared = (low[i] * low[j]) @ columns.weight
-        return np.asarray(product[:, None] - shared - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
+        return np.asarray(product - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
 
     rest, floor = columns.rest(), columns.floor
     # a template that the window hardly has, beyond its rim or between its cells, leaves the prior as it is
     least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / amplitude_sd**2
-    diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(projected)]
+    diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(inner)]
     if cross is None:
         found = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=amplitude_sd)
     else:
         found = _two(along, diagonal, power(0, 1, cross), rest, floor, dof=dof, amplitude_sd=amplitude_sd)
     log_factor, amplitude, matrix, squares = found
-    evidence = -0.5 * columns.log_det + log_factor + lgamma(dof / 2) - 0.5 * dof * (log(pi) + np.log(squares))
+    constant = columns.log_prior - 0.5 * columns.log_det + lgamma(dof / 2) - 0.5 * dof * log(pi)
+    evidence = constant + log_factor - 0.5 * dof * np.log(squares)
     # a dent is no lump: only rises have density
     evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
     level = np.einsum("hcd,hd->hc", columns.inverse, right)

@@ -101,6 +101,11 @@ class Scene:
             values["u"] = p
         return np.array([values[name] for name in other.names])
 
+    @property
+    def separable(self) -> bool:
+        """Whether there is only a bump along the grid's axes: the product of a profile along each."""
+        return self.shape in ("round", "ellipse") and not self.extra
+
     def templates(self, theta: FloatArray, window: Window) -> list[Profiles]:
         """The bump, and the second structure if there is one, of (m, p) vectors."""
         p, q, r = self.widths(theta)
