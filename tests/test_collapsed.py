@@ -74,7 +74,7 @@ def test_products_of_cosines_are_their_dense_products() -> None:
     window = Window(cells, independent_variance(cells))
     basis, _ = dense_basis(window)
     exact = basis.T @ (basis / window.variance[:, None])
-    found = gram_of_cosines(window.x_mm, window.y_mm, weight=window.weight)
+    found = gram_of_cosines(window._along, window._across, weight=window.weight)
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
 
 

@@ -15,6 +15,7 @@ the last factor is approximate: the prior is taken at the mean noise scale. Fiel
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 
 import numpy as np
 
@@ -88,7 +89,11 @@ class CollapsedTarget:
         self._made_up = 0.0
 
     def of_scene(self, scene: Scene) -> CollapsedTarget:
-        """The same window and priors with another scene."""
+        """The same window and priors with another scene, fields not settled."""
+        if scene.tilt == self.scene.tilt:
+            other = copy(self)
+            other.scene, other._fields, other._made_up = scene, None, 0.0
+            return other
         return CollapsedTarget(
             self.window,
             scene,

@@ -100,30 +100,19 @@ def _phase(axis_mm: FloatArray) -> tuple[FloatArray, float]:
     return (axis_mm - middle) / side + 0.5, side
 
 
-def gram_of_cosines(
-    x_mm: FloatArray, y_mm: FloatArray, *, weight: FloatArray, cosines: int = FIELD_COSINES
-) -> FloatArray:
+def gram_of_cosines(along: FloatArray, across: FloatArray, *, weight: FloatArray) -> FloatArray:
     """Inner products of the plane's cosines under (ny, nx) weights: (cosines^2, cosines^2), y's order counted first.
 
-    A product of two cosines is half the sum of the cosines of the sum and the difference: all products come from the
-    weights' own transform.
+    Parameters
+    ----------
+    along, across : (ny, cosines), (nx, cosines) arrays
+        As from `cosine_profiles`.
     """
-    order = np.arange(2 * cosines - 1)
-    along = np.cos(np.pi * order * _phase(y_mm)[0][:, None])
-    across = np.cos(np.pi * order * _phase(x_mm)[0][:, None])
-    transform = along.T @ weight @ across
-    i = np.arange(cosines)
-    total, apart = i[:, None] + i, np.abs(i[:, None] - i)
-    scale = np.where(i > 0, np.sqrt(2.0), 1.0)
-    pair = 0.25 * (
-        transform[total][..., total]
-        + transform[total][..., apart]
-        + transform[apart][..., total]
-        + transform[apart][..., apart]
-    )
+    pairs = [(one[:, :, None] * one[:, None, :]).reshape(len(one), -1) for one in (along, across)]
+    cosines = along.shape[1]
     # axes: y, y', x, x'
-    pair *= (scale[:, None] * scale)[:, :, None, None] * (scale[:, None] * scale)
-    return np.asarray(pair.transpose(0, 2, 1, 3).reshape(cosines**2, cosines**2))
+    products = (pairs[0].T @ weight @ pairs[1]).reshape(cosines, cosines, cosines, cosines)
+    return np.asarray(products.transpose(0, 2, 1, 3).reshape(cosines**2, cosines**2))
 
 
 def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:

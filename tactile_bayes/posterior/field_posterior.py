@@ -11,7 +11,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.collapsed import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
 from tactile_bayes.posterior.fit import WIDEST_IN_RADII, BumpFit
-from tactile_bayes.posterior.laplace import mode_and_covariance
+from tactile_bayes.posterior.laplace import find_mode, mode_and_covariance
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.target import finite_differences, stencil
 from tactile_bayes.posterior.window import Window
@@ -19,6 +19,8 @@ from tactile_bayes.presets import FIELD_COSINES
 from tactile_bayes.records import dataclass
 
 MOST_SETTLINGS = 6
+ROUGH, FINE = 0.3, 1e-3
+"""Of the last Newton step, in `Scene.steps`: under the start's fields, which are not the mode's; then under those."""
 LEAST_SHARE = 1e-2
 """Fields with a smaller share of the posterior have no Gaussian of their own."""
 
@@ -150,11 +152,12 @@ def fit_scene(
         departure=departure,
     )
     target.settle_fields(start)
-    mode, covariance, _ = mode_and_covariance(target, start, scale=scene.steps)
+    mode, _ = find_mode(target, start, scale=scene.steps, tolerance=ROUGH)
+    target.settle_fields(mode)
     for _ in range(MOST_SETTLINGS):
+        mode, covariance, _ = mode_and_covariance(target, mode, scale=scene.steps, tolerance=FINE)
         if not target.settle_fields(mode):
             break
-        mode, covariance, _ = mode_and_covariance(target, mode, scale=scene.steps)
     if not np.isfinite(target(mode[None])[0]):
         raise NotConvergedError("the posterior has no density at the fitted bump: there is no rise under this noise")
     mixture = gaussian_mixture(target, mode, covariance)

@@ -23,7 +23,9 @@ from tactile_bayes.posterior.noise import ErrorModel, count_weights, error_model
 from tactile_bayes.posterior.target import LogPrior, Target, flat_prior
 from tactile_bayes.records import dataclass
 
-START_WIDTHS_MM = (2.0, 5.0, 10.0)
+START_WIDTHS_MM = (5.0, 2.0, 10.0)
+CLEAR = 0.8
+"""Share of a window's sum of squares: a bump that explains as much is the place, whatever other minima there are."""
 LEAST_COVERED_SHARE = 0.6
 LEAST_WIDTH_IN_CELLS = 0.5
 WIDEST_IN_RADII = 0.75
@@ -35,7 +37,7 @@ PATIENCE = 16
 OUTGROWN = "wider than the window"
 FIT_TOLERANCE = 1e-8
 """Of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
-PLACE_TOLERANCE = 1e-4
+PLACE_TOLERANCE = 1e-2
 """The same where least squares only finds the place: the posterior's mode is sought from there."""
 JOINED = 0.05
 """So near to a minimum, in the same units, a fit ends in it."""
@@ -246,7 +248,8 @@ def _best_fit(
     """The lowest minimum from several starts.
 
     One that leaves the window, outgrows it or comes to a minimum that another has found is not followed further. Under
-    a noise field least squares only finds the place, and need not dwell on a rise that is hardly one.
+    a noise field least squares only finds the place: it need not dwell on a rise that is hardly one, nor look for
+    another minimum beside one that is `CLEAR`.
     """
     radius_mm, place_only = options.radius_mm, options.noise == "field"
     fits: list[LeastSquaresFit] = []
@@ -271,7 +274,15 @@ def _best_fit(
             patience=PATIENCE if place_only else None,
         )
         fits.append(fit)
+        if place_only and fit.converged and fit.sse < (1.0 - CLEAR) * _about_mean(cells.value, weight):
+            break
     return min(fits, key=lambda fit: (not fit.converged, fit.sse))
+
+
+def _about_mean(values: FloatArray, weight: FloatArray) -> float:
+    """Weighted sum of squares about the weighted mean."""
+    mean = float(weight @ values) / float(weight.sum())
+    return float(weight @ (values - mean) ** 2)
 
 
 def _start(

@@ -36,7 +36,7 @@ def laplace(
 
 
 def mode_and_covariance(
-    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, max_steps: int = 100
+    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4, max_steps: int = 100
 ) -> tuple[FloatArray, FloatArray, int]:
     """Mode of a log density by damped Newton steps, and the inverse of its negative Hessian there.
 
@@ -46,6 +46,8 @@ def mode_and_covariance(
         Vectorised: (m, p) to (m,).
     start, scale : (p,) arrays
         Where to begin, and about one posterior standard deviation of each parameter.
+    tolerance
+        See `find_mode`.
 
     Returns
     -------
@@ -59,6 +61,20 @@ def mode_and_covariance(
     NotConvergedError
         When no mode is found or the curvature there is not that of a maximum.
     """
+    mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance, max_steps=max_steps)
+    return mode, _covariance(log_density, mode, scale=scale), taken
+
+
+def find_mode(
+    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4, max_steps: int = 100
+) -> tuple[FloatArray, int]:
+    """As `mode_and_covariance`, without the curvature.
+
+    Parameters
+    ----------
+    tolerance
+        Of the last step taken, in units of `scale`. A mode is nearer than that: steps shrink as their squares.
+    """
     theta = np.array(start, dtype=np.float64)
     value = float(log_density(theta[None])[0])
     damping = 1e-8
@@ -67,12 +83,13 @@ def mode_and_covariance(
         step = scale * _newton_step(gradient * scale, -hessian * np.outer(scale, scale), damping)
         trial = theta + step
         trial_value = float(log_density(trial[None])[0])
+        small = np.abs(step / scale).max() < tolerance
         if trial_value >= value:
             gained, theta, value, damping = trial_value - value, trial, trial_value, max(damping / 10, 1e-8)
-            if gained < 1e-9 and np.abs(step / scale).max() < 1e-4:
-                return theta, _covariance(log_density, theta, scale=scale), taken
-        elif np.abs(step / scale).max() < 1e-4:
-            return theta, _covariance(log_density, theta, scale=scale), taken
+            if small and gained < tolerance**2:
+                return theta, taken
+        elif small:
+            return theta, taken
         else:
             damping = max(damping * 10, 1e-4)
     raise NotConvergedError(f"no posterior mode found in {max_steps} Newton steps; try --method ensemble")

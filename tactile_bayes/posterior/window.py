@@ -94,7 +94,7 @@ class Window:
         """The noise field of one correlation length."""
         if length_mm not in self._fields:
             if self._gram is None:
-                self._gram = gram_of_cosines(self.x_mm, self.y_mm, weight=self.weight, cosines=self.cosines)
+                self._gram = gram_of_cosines(self._along, self._across, weight=self.weight)
             frequency2 = (self._frequency_y[:, None] + self._frequency_x[None, :]).ravel()
             self._fields[length_mm] = whitening(self._gram, frequency2, length_mm=length_mm)
         return self._fields[length_mm]
