@@ -159,6 +159,32 @@ def test_dropping_idle_directions_changes_nothing_that_matters() -> None:
     assert sum(len(one.weight) for one in target.fields) < 0.8 * directions
 
 
+@pytest.mark.parametrize("scene", [TURNED, Scene("ellipse", tilt=False), Scene("ellipse", extra="rib")])
+def test_another_scene_of_the_same_window_is_as_made_anew(scene: Scene) -> None:
+    cells = cells_of(noise(2, field=0.01))
+    settled = target_of(cells, scene=STRAIGHT)
+    settled.settle_fields(START[:4])
+    theta = np.concatenate([TURNED.carried(START, scene), [0.7, 5.0, 1.0]])[None, : len(scene.names)]
+    derived, anew = settled.of_scene(scene), target_of(cells, scene=scene)
+    np.testing.assert_array_equal(derived.by_field(theta), anew.by_field(theta))
+    assert derived.settle_fields(theta[0])
+    anew.settle_fields(theta[0])
+    np.testing.assert_array_equal(derived(theta), anew(theta))
+    assert settled.chosen_fields() != []
+
+
+def test_independent_errors_are_one_hypothesis() -> None:
+    """Four lengths with the share 0 are the same errors: one field of the mixture, with the prior of four."""
+    target = target_of(cells_of(noise(3)), scene=STRAIGHT)
+    target.settle_fields(START[:4])
+    assert [shares for _, shares in target.chosen_fields()].count((0.0,)) == 1
+    summary = target.field_summary(START[:4])
+    assert summary["field_share"] < 0.05
+    correlated = target_of(cells_of(noise(3, white=0.002, field=0.02)), scene=STRAIGHT)
+    correlated.settle_fields(START[:4])
+    assert (0.0,) not in [shares for _, shares in correlated.chosen_fields()]
+
+
 def test_a_level_and_a_tilt_do_not_matter() -> None:
     cells = cells_of(noise(2))
     plain = fitted(cells)

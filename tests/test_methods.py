@@ -15,7 +15,7 @@ from tactile_bayes.posterior.draws import ParameterDraws, student_draws
 from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
+from tactile_bayes.posterior.laplace import find_mode, laplace, mode_and_covariance
 from tactile_bayes.posterior.noise import ErrorModel
 from tactile_bayes.posterior.optimise import optimise
 from tactile_bayes.posterior.target import Target, flat_prior, numerical_gradient_and_hessian
@@ -258,3 +258,16 @@ def test_one_seed_gives_the_same_draws_and_another_does_not(method: str) -> None
     assert other is not None
     np.testing.assert_array_equal(first.theta, again.draws.theta)
     assert not np.array_equal(first.theta, other.theta)
+
+
+@pytest.mark.parametrize("tolerance", [0.3, 1e-2])
+def test_a_mode_is_nearer_than_the_last_step(tolerance: float) -> None:
+    """A density with a bent ridge, whose mode is at (1, 1), where differences tell it to 0.002."""
+
+    def log_density(theta: np.ndarray) -> np.ndarray:
+        return -(20.0 * (theta[:, 1] - theta[:, 0] ** 2) ** 2) - (1.0 - theta[:, 0]) ** 2
+
+    scale = np.full(2, 0.2)
+    found, steps = find_mode(log_density, np.array([-0.5, 0.5]), scale=scale, tolerance=tolerance)
+    assert np.abs((found - 1.0) / scale).max() < tolerance
+    assert steps < find_mode(log_density, np.array([-0.5, 0.5]), scale=scale, tolerance=1e-8)[1]

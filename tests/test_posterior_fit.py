@@ -12,6 +12,7 @@ from posterior_maps import TRUTH, bump_map, bump_values, grid_map
 from scipy.special import erf
 
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior import fit as fit_module
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.fit import BumpFit, FitOptions, find_bump, fit_bump, rotation_odds
 
@@ -155,3 +156,24 @@ def test_a_turned_ellipse_asks_for_its_rotation_and_a_straight_one_does_not() ->
     odds = [rotation_odds(m, fitted(m), options=options, prior=BumpPrior())[0] for m in (straight, turned)]
     assert odds[0] < 1 / 3
     assert odds[1] > 1e6
+
+
+@pytest.mark.parametrize(
+    ("errors", "noise", "widths"), [(0.003, "field", 1), (0.3, "field", 3), (0.003, "independent", 3)]
+)
+def test_other_widths_are_tried_where_one_does_not_explain_the_window(
+    errors: float, noise: str, widths: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And always where least squares is the answer, not only a place to begin."""
+    starts: list[np.ndarray] = []
+    original = fit_module.fit_least_squares
+
+    def counted(model: object, begin: np.ndarray, **settings: object) -> object:
+        starts.append(begin)
+        return original(model, begin, **settings)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(fit_module, "fit_least_squares", counted)
+    values = bump_values() + errors * np.random.default_rng(2).standard_normal((51, 51))
+    fit_bump(grid_map(values), (1.0, -1.0), options=FitOptions(rotation="off", noise=noise))
+    tried = {round(float(np.exp(start[3])), 6) for start in starts}
+    assert len(tried & set(fit_module.START_WIDTHS_MM)) == widths

@@ -9,7 +9,7 @@ import pytest
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior import beside
-from tactile_bayes.posterior.beside import add_beside
+from tactile_bayes.posterior.beside import add_beside, rising_ribs
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import window_cells
 from tactile_bayes.posterior.collapsed import independent_variance
@@ -46,7 +46,8 @@ def choose(values: np.ndarray, *, scene: str = "auto", width: float = 5.0, r: fl
     start = np.array([np.log(width), np.log(width), 1.0, -1.0, r])
     window = Window(cells, independent_variance(cells))
     choice = choose_shape(window, start, prior=BumpPrior(), radius_mm=RADIUS, scene=scene)
-    return add_beside(choice, Surroundings.of(tactile_map), scene=scene)
+    surroundings = Surroundings.of(tactile_map)
+    return add_beside(choice, surroundings, ridges=rising_ribs(choice.plain, surroundings), scene=scene)
 
 
 def asked(choice: SceneChoice, name: str) -> Structure:

@@ -35,26 +35,33 @@ GRID_ANGLES = 12
 WANTED: dict[str, Extra] = {"second-lump": "second lump", "rib": "rib"}
 
 
-def add_beside(choice: SceneChoice, surroundings: Surroundings, *, scene: str = "auto") -> SceneChoice:
+def add_beside(
+    choice: SceneChoice, surroundings: Surroundings, *, ridges: FloatArray, scene: str = "auto"
+) -> SceneChoice:
     """Ask for a second lump or a rib beside the bump; the draws have it where the map asks for it, or `scene` does.
 
-    It must stand out on the map by `LEAST_RISE` of the bump's amplitude, see `Surroundings.rise`. What is not found is
-    not in the fit, even if it was asked for.
+    `ridges` are where a rib can be: `rising_ribs`. What is found must stand out on the map by `LEAST_RISE` of the
+    bump's amplitude, see `Surroundings.rise`. What is not found is not in the fit, even if it was asked for.
     """
     if scene not in ASKING:
         return choice
-    fit, beside = _beside_questions(Fitter.of(choice.plain), choice.plain, surroundings, scene)
+    fit, beside = _beside_questions(Fitter.of(choice.plain), choice.plain, surroundings, ridges, scene)
     found = choice if fit is choice.plain else asked_again(choice, fit)
     return replace(found, structures=(*found.structures, *beside))
 
 
 def _beside_questions(
-    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, scene: str
+    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: str
 ) -> tuple[FieldFit, list[Structure]]:
     """A second lump and a rib, each against the scene without; the likelier of those that the map asks for."""
-    extras: tuple[Extra, ...] = ("second lump", "rib")
+    lumps = second_lumps(plain, fitter)
+    places: dict[Extra, FloatArray] = {
+        "second lump": lumps[rises(plain, surroundings, "second lump", lumps)],
+        "rib": ridges,
+    }
     fits = {
-        extra: _fit_beside(fitter, plain, surroundings, extra, forced=WANTED.get(scene) == extra) for extra in extras
+        extra: _fit_beside(fitter, plain, surroundings, extra, rising, forced=WANTED.get(scene) == extra)
+        for extra, rising in places.items()
     }
     asked = [extra for extra, (fit, log_odds, _) in fits.items() if fit is not None and log_odds > np.log(SECOND_ODDS)]
     likeliest: Extra = max(asked, key=lambda extra: fits[extra][1]) if asked else ""
@@ -72,11 +79,11 @@ def _beside_questions(
 
 
 def _fit_beside(
-    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, extra: Extra, *, forced: bool
+    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, extra: Extra, rising: FloatArray, *, forced: bool
 ) -> tuple[FieldFit | None, float, bool]:
     """The fit with a second structure, its log odds, and whether these are only a bound (then there is no fit)."""
     scene = replace(plain.scene, extra=extra)
-    starts, bound = _starts(fitter, plain, surroundings, extra)
+    starts, bound = _starts(plain, extra, rising)
     if not starts or (bound < np.log(LEAST_ODDS) and not forced):
         return None, min(bound, 0.0), True
     fits = [fit for start in starts if (fit := fitter.fit_or_none(scene, start)) is not None]
@@ -87,12 +94,8 @@ def _fit_beside(
     return best, best.log_evidence - plain.log_evidence, False
 
 
-def _starts(
-    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, extra: Extra
-) -> tuple[list[FloatArray], float]:
+def _starts(plain: FieldFit, extra: Extra, rising: FloatArray) -> tuple[list[FloatArray], float]:
     """Where to look for the mode with a second structure, and a bound on the log evidence gained there."""
-    grid = second_lumps(plain, fitter) if extra == "second lump" else ribs(fitter)
-    rising = grid[rises(plain, surroundings, extra, grid)]
     gains = _gains(plain, rising, extra)
     best = int(np.argmax(gains))
     starts, bound = [np.concatenate([plain.mode, one]) for one in rising[best : best + 1]], float(gains[best])
@@ -153,6 +156,12 @@ def ribs(fitter: Fitter) -> FloatArray:
     angles = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
     grids = np.meshgrid(angles, offsets, np.log(GRID_WIDTHS_MM), indexing="ij")
     return np.stack([v.ravel() for v in grids], axis=1)
+
+
+def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:
+    """(g, 3) those of `ribs` along which the map rises beside a bump."""
+    places = ribs(Fitter.of(plain))
+    return np.asarray(places[rises(plain, surroundings, "rib", places)])
 
 
 def _gains(plain: FieldFit, grid: FloatArray, extra: Extra) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.beside import WANTED, add_beside
+from tactile_bayes.posterior.beside import WANTED, add_beside, rising_ribs
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.cells import trusted
 from tactile_bayes.posterior.departure import ask_departure
@@ -133,8 +133,9 @@ def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: str 
     if scene not in ASKING:
         return replace(answer, choice=ask_departure(answer.choice))
     surroundings = Surroundings.of(tactile_map)
-    choice = add_beside(answer.choice, surroundings, scene=scene)
-    ridge = ridge_instead(choice, surroundings)
+    ridges = rising_ribs(answer.choice.plain, surroundings)
+    choice = add_beside(answer.choice, surroundings, ridges=ridges, scene=scene)
+    ridge = ridge_instead(choice, ridges)
     found = replace(answer, choice=ask_departure(choice))
     if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
         return found

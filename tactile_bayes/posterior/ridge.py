@@ -7,28 +7,29 @@ from collections.abc import Iterator
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.beside import GRID_ANGLES, ribs, rises
+from tactile_bayes.posterior.beside import GRID_ANGLES
 from tactile_bayes.posterior.field_posterior import FieldFit
 from tactile_bayes.posterior.scene import Scene
 from tactile_bayes.posterior.scene_choice import Fitter, SceneChoice
-from tactile_bayes.posterior.surroundings import Surroundings
 
 
-def ridge_instead(choice: SceneChoice, surroundings: Surroundings) -> FieldFit | None:
+def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
     """The likeliest scene with a ridge in the bump's place, alone or beside what the choice has there.
+
+    Parameters
+    ----------
+    ridges : (g, 3) array
+        Where the map rises along a line beyond the bump, see `beside.rising_ribs`.
 
     Returns
     -------
     FieldFit or None
-        None where nothing on the map rises along a line beyond the bump: then a ridge need not be feared, and no time
-        is spent on it.
+        None where there is no such place: then a ridge need not be feared, and no time is spent on it.
     """
-    fitter = Fitter.of(choice.plain)
-    places = ribs(fitter)
-    places = places[rises(choice.plain, surroundings, "rib", places)]
-    if not len(places):
+    if not len(ridges):
         return None
-    starts = _starts(choice, fitter, places)
+    fitter = Fitter.of(choice.plain)
+    starts = _starts(choice, fitter, ridges)
     fits = [fit for scene, start in starts if (fit := fitter.fit_or_none(scene, start)) is not None]
     return max(fits, key=lambda fit: fit.log_evidence) if fits else None
 
