@@ -73,7 +73,8 @@ def find_mode(
     Parameters
     ----------
     tolerance
-        Of the last step taken, in units of `scale`. A mode is nearer than that: steps shrink as their squares, down to the error of differences.
+        Of the last step taken, in units of `scale`. A mode is nearer than that: steps shrink as their squares, down to
+        the error of differences.
     """
     theta = np.array(start, dtype=np.float64)
     value = float(log_density(theta[None])[0])
