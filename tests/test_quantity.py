@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from tactile_bayes.posterior.quantity import summarise
+from tactile_bayes.posterior.quantity import quantiles_of, summarise
 from tactile_bayes.report.estimate_text import decimals
 
 N = 40_000
@@ -66,3 +66,10 @@ def test_numbers_are_written_with_nine_digits() -> None:
 )
 def test_the_last_printed_digit_is_the_first_of_twice_the_error(error: float, places: int) -> None:
     assert decimals(error) == places
+
+
+@pytest.mark.parametrize("number", [1, 2, 7, 8192])
+def test_quantiles_are_numpys(number: int) -> None:
+    values = np.random.default_rng(number).standard_normal(number)
+    at = np.array([0.0, 0.025, 0.31, 0.5, 0.975, 1.0])
+    np.testing.assert_allclose(quantiles_of(np.sort(values), at), np.quantile(values, at), rtol=1e-12, atol=1e-15)

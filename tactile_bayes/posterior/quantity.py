@@ -62,7 +62,7 @@ def summarise(draws: FloatArray, *, probability: float, effective_draws: float) 
     # spirit)
     step = np.sqrt(tail * (1.0 - tail) / max(effective_draws, 1.0))
     about = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
-    low, median, high, *ends = np.quantile(values, [tail, 0.5, 1.0 - tail, *about])
+    low, median, high, *ends = quantiles_of(np.sort(values), np.array([tail, 0.5, 1.0 - tail, *about]))
     return Quantity(
         median=float(median),
         mean=float(values.mean()),
@@ -72,3 +72,11 @@ def summarise(draws: FloatArray, *, probability: float, effective_draws: float) 
         probability=probability,
         mc_error=float(max(ends[1] - ends[0], ends[3] - ends[2]) / 2.0),
     )
+
+
+def quantiles_of(ordered: FloatArray, probabilities: FloatArray) -> FloatArray:
+    """Quantiles of sorted values, linear between neighbours: ``np.quantile``, which does not use the fast sort."""
+    place = probabilities * (len(ordered) - 1)
+    below = np.floor(place).astype(np.intp)
+    above = np.minimum(below + 1, len(ordered) - 1)
+    return np.asarray(ordered[below] + (place - below) * (ordered[above] - ordered[below]))

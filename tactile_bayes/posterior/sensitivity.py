@@ -60,14 +60,14 @@ def prior_sensitivity(
         good = np.isfinite(values)
         sd = float(values[good].std()) or 1.0
         at = np.array([0.5, TAIL, 1.0 - TAIL])
-        plain = np.ones(int(good.sum()))
-        shift = (quantiles(values[good], weight[good], at) - quantiles(values[good], plain, at)) / sd
+        order = np.argsort(values[good])
+        ordered, weighed = values[good][order], weight[good][order]
+        shift = (quantiles(ordered, weighed, at) - quantiles(ordered, np.ones(len(order)), at)) / sd
         medians[name], ends[name] = float(shift[0]), float(shift[1:][np.argmax(np.abs(shift[1:]))])
     return Sensitivity(medians, ends, shape)
 
 
-def quantiles(values: FloatArray, weights: FloatArray, probabilities: FloatArray) -> FloatArray:
-    """Weighted quantiles, linear between the middles of their steps."""
-    order = np.argsort(values)
-    edges = np.cumsum(weights[order])
-    return np.asarray(np.interp(probabilities, (edges - 0.5 * weights[order]) / edges[-1], values[order]))
+def quantiles(ordered: FloatArray, weights: FloatArray, probabilities: FloatArray) -> FloatArray:
+    """Weighted quantiles of sorted values, linear between the middles of their steps."""
+    edges = np.cumsum(weights)
+    return np.asarray(np.interp(probabilities, (edges - 0.5 * weights) / edges[-1], ordered))
