@@ -210,11 +210,12 @@ class CollapsedTarget:
         shares = np.array(SHARES)
         for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
             chosen = shares[(shares > 0) == (length > 0)]
-            if length not in self._lengths and len(chosen):
+            if not len(chosen):
+                continue
+            if length not in self._lengths:
                 field = self.window.field(length) if length else no_field(self.window.cosines)
                 self._lengths[length] = self._columns(field, chosen)
-            if len(chosen):
-                yield self._lengths[length]
+            yield self._lengths[length]
 
     def field_summary(self, theta: FloatArray) -> dict[str, float]:
         """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
@@ -343,7 +344,7 @@ class CollapsedTarget:
         size = SPANNED if self.scene.separable else BLOCK
         for i in range(0, len(theta), size):
             points = theta[i : i + size]
-            spanned = self._spanned(points) if self.scene.separable and len(points) >= LEAST_BUMPS else None
+            spanned = self._spanned(points)
             if spanned is not None:
                 yield [self._found([spanned.inner(columns)], None, columns) for columns in self.fields]
                 continue
@@ -352,6 +353,9 @@ class CollapsedTarget:
                 yield [self._under(projected, cross, columns) for columns in self.fields]
 
     def _spanned(self, theta: FloatArray) -> Spanned | None:
+        """The basis that the points' bumps share; None where there is none, or where it does not pay."""
+        if not self.scene.separable or len(theta) < LEAST_BUMPS:
+            return None
         (bumps,) = self.scene.templates(theta, self.window)
         return Spanned.of(bumps, self.window, self._weighted_plain)
 

@@ -9,6 +9,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.laplace import LogDensity
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
+from tactile_bayes.posterior.quantity import weighted_quantiles_of
 from tactile_bayes.posterior.sobol import BITS, shifted_sobol
 from tactile_bayes.records import dataclass
 
@@ -235,9 +236,7 @@ class _Sampler:
 def weighted_quantile(values: FloatArray, weights: FloatArray, probabilities: tuple[float, ...]) -> FloatArray:
     """Quantiles of weighted draws, linear between the middles of their steps."""
     order = np.argsort(values)
-    edges = np.cumsum(weights[order])
-    middle = (edges - 0.5 * weights[order]) / edges[-1]
-    return np.interp(probabilities, middle, values[order])
+    return weighted_quantiles_of(values[order], weights[order], np.array(probabilities))
 
 
 def systematic(

@@ -76,7 +76,10 @@ def summarise(draws: FloatArray, *, probability: float, effective_draws: float) 
 
 def quantiles_of(ordered: FloatArray, probabilities: FloatArray) -> FloatArray:
     """Quantiles of sorted values, linear between neighbours: ``np.quantile``, which does not use the fast sort."""
-    place = probabilities * (len(ordered) - 1)
-    below = np.floor(place).astype(np.intp)
-    above = np.minimum(below + 1, len(ordered) - 1)
-    return np.asarray(ordered[below] + (place - below) * (ordered[above] - ordered[below]))
+    return np.interp(probabilities * (len(ordered) - 1), np.arange(len(ordered)), ordered)
+
+
+def weighted_quantiles_of(ordered: FloatArray, weights: FloatArray, probabilities: FloatArray) -> FloatArray:
+    """Weighted quantiles of sorted values, linear between the middles of their steps."""
+    edges = np.cumsum(weights)
+    return np.interp(probabilities, (edges - 0.5 * weights) / edges[-1], ordered)

@@ -9,6 +9,7 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.pareto import smooth_weights
+from tactile_bayes.posterior.quantity import weighted_quantiles_of
 from tactile_bayes.records import dataclass
 
 WIDER = 2.0
@@ -62,12 +63,7 @@ def prior_sensitivity(
         at = np.array([0.5, TAIL, 1.0 - TAIL])
         order = np.argsort(values[good])
         ordered, weighed = values[good][order], weight[good][order]
-        shift = (quantiles(ordered, weighed, at) - quantiles(ordered, np.ones(len(order)), at)) / sd
+        plain = weighted_quantiles_of(ordered, np.ones(len(order)), at)
+        shift = (weighted_quantiles_of(ordered, weighed, at) - plain) / sd
         medians[name], ends[name] = float(shift[0]), float(shift[1:][np.argmax(np.abs(shift[1:]))])
     return Sensitivity(medians, ends, shape)
-
-
-def quantiles(ordered: FloatArray, weights: FloatArray, probabilities: FloatArray) -> FloatArray:
-    """Weighted quantiles of sorted values, linear between the middles of their steps."""
-    edges = np.cumsum(weights)
-    return np.asarray(np.interp(probabilities, (edges - 0.5 * weights) / edges[-1], ordered))
