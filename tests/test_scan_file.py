@@ -240,7 +240,12 @@ def test_a_recording_in_progress_can_be_read(scan: Scan, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(b"", "is empty"), (b"\x89MCAP", "cut off in its header"), (b"PK\x03\x04zipzipzip", "not an MCAP file")],
+    [
+        (b"", "is empty"),
+        (b"\x89MCAP", "cut off in its header"),
+        (b"zipzipzip", "not an MCAP file"),
+        (b"PK\x03\x04zipzipzip", "is an archive"),
+    ],
 )
 def test_a_foreign_file_is_one_line(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "x.mcap"

@@ -13,6 +13,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import atomic_path, unreadable
+from tactile_bayes.files.kinds import not_a
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import check_rigid
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
@@ -171,7 +172,9 @@ def _opened(path: Path) -> Iterator[Any]:
         file = netCDF4.Dataset(str(path), "r")
     except OSError as error:
         if path.is_file() and (error.errno or 0) < 0:  # the library numbers its own faults below zero
-            raise BadDataError("not a readable netCDF file", way_out=_WAY_OUT, path=str(path)) from None
+            raise not_a(
+                path, "a map or posterior (netCDF)", what="not a readable netCDF file", way_out=_WAY_OUT
+            ) from None
         raise unreadable(path, error) from None
     try:
         file.set_auto_mask(False)
@@ -185,6 +188,8 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _header(file: Any) -> dict[str, Any]:
+    if "posterior" in file.groups:
+        raise BadDataError("is a posterior, not a map", way_out="give the map that it was estimated from")
     schema = _attribute(file, "schema")
     if schema != SCHEMA:
         raise BadDataError(f"schema is {schema!r}, not {SCHEMA!r}", way_out=_WAY_OUT)

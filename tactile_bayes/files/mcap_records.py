@@ -18,6 +18,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.kinds import not_a
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _RECORD: Final = struct.Struct("<BQ")  # opcode, length
@@ -110,7 +111,7 @@ def _check_magic(stream: IO[bytes], path: Path) -> None:
         what = "is empty" if not start else f"is cut off in its header ({len(start)} bytes)"
     else:
         what = f"is not an MCAP file (it starts with {start!r})"
-    raise BadDataError(what, way_out="give a scan from `record`, `import` or `simulate`", path=str(path))
+    raise not_a(path, "a scan", what=what, way_out="give a scan from `record`, `import` or `simulate`")
 
 
 def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:

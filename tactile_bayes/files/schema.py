@@ -9,6 +9,7 @@ from typing import Any
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.kinds import not_a, schema_kind
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -33,6 +34,7 @@ def check_document(document: object, schema_name: str, *, path: Path) -> None:
     """
     import fastjsonschema
 
+    _check_kind(document, schema_name, path=path)
     try:
         _validator(schema_name)(document)
     except fastjsonschema.JsonSchemaValueException as error:
@@ -41,6 +43,14 @@ def check_document(document: object, schema_name: str, *, path: Path) -> None:
         value = value if len(value) <= 60 else value[:57] + "..."
         rule = error.message.split(" ", 1)[1] if " " in error.message else error.message
         raise BadDataError(f"{where} {rule} (found {value})", way_out=f"see {schema_name}", path=str(path)) from None
+
+
+def _check_kind(document: object, schema_name: str, *, path: Path) -> None:
+    """Refuse a document of another kind by its name, before its fields are held against the wrong schema."""
+    wanted = schema_kind(load_schema(schema_name).get("properties", {}).get("schema", {}).get("const"))
+    found = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
+    if wanted and found and found != wanted:
+        raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
 
 
 @cache
@@ -73,9 +83,8 @@ def load_json(path: Path) -> object:
     except OSError as error:
         raise unreadable(path, error) from None
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise BadDataError(
-            f"not a JSON file ({error})", way_out="give a file this program wrote", path=str(path)
-        ) from None
+        what = f"not a JSON file ({error})"
+        raise not_a(path, "a JSON file", what=what, way_out="give a file this program wrote") from None
     return document
 
 
