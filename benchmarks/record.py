@@ -1,8 +1,9 @@
-"""Measure recording: ``python -m benchmarks.record [throughput|load|kills] [--json OUT]``.
+"""Measure recording: ``python -m benchmarks.record [throughput|memory|load|kills] [--json OUT]``.
 
 ``throughput``: bytes a second of one core through the head's parser and through the whole recorder, against real time;
-time and size of the scan file. ``load``: emulated head and tracker recorded while 0, 2 and 4 processes are busy.
-``kills``: SIGKILL at random times; what the file has lost.
+time and size of the scan file. ``memory``: resident memory and frames per CPU second while ``--frames`` frames (2 h of
+a head at 200 Hz) and their poses are written as fast as they can be. ``load``: emulated head and tracker recorded while
+0, 2 and 4 processes are busy. ``kills``: SIGKILL at random times; what the file has lost.
 """
 
 from __future__ import annotations
@@ -39,10 +40,11 @@ d_mm = 15.0
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the figures, write JSON when asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.record", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=["throughput", "load", "kills"], default="throughput")
+    parser.add_argument("what", nargs="?", choices=["throughput", "memory", "load", "kills"], default="throughput")
     parser.add_argument("--duration", type=float, default=60.0, help="of the scan in s (60)")
     parser.add_argument("--repeats", type=int, default=10, help="kills (10)")
     parser.add_argument("--busy", type=int, nargs="+", default=[0, 2, 4], help="load: busy processes (0 2 4)")
+    parser.add_argument("--frames", type=int, default=1_440_000, help="memory: frames to write (2 h at 200 Hz)")
     parser.add_argument("--live", action="store_true", help="load: with the live view")
     parser.add_argument("--size-calibration", type=Path, metavar="FILE", help="load: sizes in the live view")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures as JSON")
@@ -51,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         folder = Path(name)
         scan = make_scan(folder, options.duration)
         print(f"load of the machine before: {os.getloadavg()[0]:.2f}, cores {os.cpu_count()}")
-        rows = {"throughput": throughput, "load": load, "kills": kills}[options.what](folder, scan, options)
+        measures = {"throughput": throughput, "memory": memory, "load": load, "kills": kills}
+        rows = measures[options.what](folder, scan, options)
         print(f"load of the machine after: {os.getloadavg()[0]:.2f}")
     if options.json:
         options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
@@ -152,6 +155,56 @@ def record_pieces(data: Any, pieces: list[bytes], path: Path) -> None:
             if number % 9 == 0:  # every 0.2 s of real time
                 writer.flush()
         writer.close({})
+
+
+def memory(folder: Path, scan: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Write a long recording, three poses to five frames, flushed as often as a live one; the memory in ten parts."""
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.scan_mcap import read_scan
+    from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive
+
+    data, rows = read_scan(scan), []
+    with create_exclusive(folder / "long.mcap", force=True) as stream:
+        writer = RecordingWriter(
+            stream,
+            head=data.head,
+            element_calibration=data.element_calibration,
+            session={"source": "benchmark"},
+            provenance=Provenance("benchmark", {}),
+        )
+        begun = time.process_time()
+        print(f"{'frames':>10} {'hours':>6} {'RSS MB':>8} {'frames per CPU s':>17}")
+        for number in range(options.frames + 1):
+            if number % max(1, options.frames // 10) == 0:
+                rows.append(_memory_row(number, time.process_time() - begun))
+            write_moment(writer, data, number)
+        writer.close({})
+    return rows
+
+
+def write_moment(writer: Any, data: Any, number: int) -> None:
+    """The n-th frame, and the pose that comes with three frames in five."""
+    time_ns = round(number / RATE_HZ * 1e9)
+    counts = data.frames.counts[number % len(data.frames)]
+    writer.add_frame(counts, device_ns=time_ns, host_ns=time_ns)
+    if number % 5 in (0, 2, 4):
+        i = number % len(data.poses)
+        position, turn = data.poses.position_mm[i], data.poses.quaternion_wxyz[i]
+        writer.add_pose(position, turn, device_ns=time_ns, host_ns=time_ns)
+    if number % round(0.2 * RATE_HZ) == 0:
+        writer.flush()
+
+
+def _memory_row(number: int, cpu_s: float) -> dict[str, Any]:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    row = {
+        "frames": number,
+        "hours": round(number / RATE_HZ / 3600, 2),
+        "rss_mb": round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1),
+        "frames_per_cpu_s": round(number / cpu_s) if number else 0,
+    }
+    print(f"{number:>10,} {row['hours']:>6} {row['rss_mb']:>8} {row['frames_per_cpu_s']:>17,}", flush=True)
+    return row
 
 
 @contextlib.contextmanager

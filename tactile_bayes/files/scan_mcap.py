@@ -103,7 +103,7 @@ class ScanWriter:
         self._attach("head.json", head_document(head))
         self._attach("element_calibration.json", calibration_document(element_calibration))
         self._register()
-        self._grid = _empty_grid(head)
+        self._grid = _grid_of(head).SerializeToString(deterministic=True)
 
     def _describe(self, session: Mapping[str, str], provenance: Provenance, truth: Mapping[str, Any] | None) -> None:
         units = {"length_unit": "mm", "time_unit": "ns", "pressure": "raw counts"}
@@ -144,28 +144,36 @@ class ScanWriter:
         """One (rows, columns) frame of raw counts."""
         if counts.shape != self._shape:
             raise BadDataError(f"a frame has shape {counts.shape}", way_out=f"this head has {self._shape} taxels")
-        self._grid.data = counts.T.astype("<u2").tobytes()
-        self._send(self._frame_channel, self._grid, device_ns=device_ns, host_ns=host_ns)
+        stamp = Grid()
+        _stamp(stamp, device_ns)
+        data = Grid(data=counts.T.astype("<u2").tobytes())
+        # Serialised messages joined are the merged message. One Grid used again and again would keep every frame: its
+        # memory is given back only with the message itself.
+        body = stamp.SerializeToString() + self._grid + data.SerializeToString()
+        self._send(self._frame_channel, body, device_ns=device_ns, host_ns=host_ns)
 
     def add_pose(self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int) -> None:
         """One (3,) position and (4,) quaternion, scalar first, of the tracker's sensor in `base`."""
         message = _pose_message(position_mm, quaternion_wxyz)
-        self._send(self._pose_channel, message, device_ns=device_ns, host_ns=host_ns)
+        self._send_message(self._pose_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None:
         """One (3,) point of `LANDMARK_NAMES` in `base`."""
         message = _pose_message(position_mm, np.array([1.0, 0.0, 0.0, 0.0]))
-        self._send(self._landmark_channel[name], message, device_ns=device_ns, host_ns=host_ns)
+        self._send_message(self._landmark_channel[name], message, device_ns=device_ns, host_ns=host_ns)
 
-    def _send(self, channel: int, message: Any, *, device_ns: int, host_ns: int) -> None:
-        message.timestamp.seconds, message.timestamp.nanos = divmod(device_ns, _NS)
+    def _send_message(self, channel: int, message: Any, *, device_ns: int, host_ns: int) -> None:
+        _stamp(message, device_ns)
+        self._send(channel, message.SerializeToString(), device_ns=device_ns, host_ns=host_ns)
+
+    def _send(self, channel: int, body: bytes, *, device_ns: int, host_ns: int) -> None:
         sequence = self._sequence.get(channel, 0)
         self._sequence[channel] = sequence + 1
         self._writer.add_message(
             channel_id=channel,
             log_time=host_ns,
             publish_time=device_ns,
-            data=message.SerializeToString(),
+            data=body,
             sequence=sequence,
         )
 
@@ -178,7 +186,12 @@ def _compact(document: object) -> str:
     return json.dumps(document, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
 
 
-def _empty_grid(head: HeadGeometry) -> Any:
+def _stamp(message: Any, device_ns: int) -> None:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(device_ns, _NS)
+
+
+def _grid_of(head: HeadGeometry) -> Any:
+    """A grid message without time and counts: what every frame of this head repeats."""
     rows, columns = head.shape
     pitch = head.pitch_mm
     grid = Grid(frame_id="scanhead", column_count=rows, row_stride=2 * rows, cell_stride=2)

@@ -120,7 +120,7 @@ class RecordingWriter(ScanWriter):
     def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None:
         """One line about the data at a time."""
         message = Log(level=Log.WARNING if serious else Log.INFO, message=text, name=device)
-        self._send(self._log_channel, message, device_ns=device_ns, host_ns=host_ns)
+        self._send_message(self._log_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def flush(self) -> None:
         """Close the chunk and hand it to the system: from then on it survives this process.
