@@ -17,10 +17,10 @@ from websockets.sync.client import connect
 
 from tactile_bayes.commands.live_view import Turn, estimate_text
 from tactile_bayes.errors import UsageError
+from tactile_bayes.hardware.account import Report
 from tactile_bayes.hardware.feed import Feed, FeedReader, SeenFrame, SeenPose
 from tactile_bayes.hardware.live import LiveMap, LiveState, grey_levels
 from tactile_bayes.hardware.readings import PoseReading
-from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
 from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator
 from tactile_bayes.mapping.poses import poses_at

@@ -140,7 +140,7 @@ def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, 
 
 
 def _read(paths: tuple[Path, ...]) -> tuple[list[Scan], list[str]]:
-    """The scans, and what unfinished files had lost."""
+    """The scans, and what unfinished files had lost or what else speaks against them."""
     from tactile_bayes.files.scan_mcap import read_scan_report
 
     scans, lost = [], []
@@ -149,7 +149,7 @@ def _read(paths: tuple[Path, ...]) -> tuple[list[Scan], list[str]]:
         if file.damaged:
             raise BadDataError(f"is damaged ({file.lost[0]})", way_out="copy it again", path=str(path))
         scans.append(file.scan)
-        lost += [f"scan {number}: {line}" for line in file.lost]
+        lost += [f"scan {number}: {line}" for line in (*file.lost, *file.cautions())]
     return scans, lost
 
 

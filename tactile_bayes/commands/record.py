@@ -13,8 +13,9 @@ from tactile_bayes.commands.emulate import PROTOCOLS
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 
 if TYPE_CHECKING:
+    from tactile_bayes.hardware.account import Report
     from tactile_bayes.hardware.readings import HelloReading
-    from tactile_bayes.hardware.recorder import Line, Observer, Recorder, Report
+    from tactile_bayes.hardware.recorder import Line, Observer, Recorder
     from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
 
 _FILE = click.Path(path_type=Path)
@@ -181,13 +182,14 @@ def _record(request: Request) -> tuple[Report, bool]:
             shared_clock=request.clock == "shared",
             invert_rotation=request.invert_rotation,
             duration_s=request.duration_s,
+            rate_hz=hello.rate_hz / request.every,
             observer=observer,
         )
         _place(landmarks, writer)
         stopper = stack.enter_context(Stopper(recorder))
         try:
             report = _run(recorder, stopper, head, request)
-            writer.close(asdict(report))
+            writer.close(asdict(report) | {"cautions": "\n".join(report.cautions)})
         except OSError as error:
             writer.stop_syncing()
             with suppress(OSError):  # what is still in its buffer cannot be written either

@@ -58,6 +58,7 @@ def _scan(path: Path) -> dict[str, Any]:
         "kind": "scan",
         "complete": file.complete,
         "lost": list(file.lost),
+        "cautions": file.cautions(),
         "frames": len(scan.frames),
         "taxels": list(scan.head.shape),
         "poses": len(scan.poses),

@@ -64,6 +64,7 @@ CHUNK_BYTES: Final = 64 * 1024
 LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
 _SESSION_SCHEMA: Final = "scan_session.schema.json"
 _NS: Final = 1_000_000_000
+_LATEST_NS: Final = 2**63 - 1
 
 
 class ScanWriter:
@@ -355,7 +356,12 @@ def _json_object(text: str, *, name: str) -> dict[str, Any]:
     return document
 
 
-def _times(messages: list[tuple[int, bytes]]) -> FloatArray:
+def _times(messages: list[tuple[int, bytes]], *, topic: str) -> FloatArray:
+    latest = max((time for time, _ in messages), default=0)
+    if latest > _LATEST_NS:
+        raise BadDataError(
+            f"{topic} holds a time of {latest} ns", way_out=f"times must be {_LATEST_NS} ns or less; record it again"
+        )
     return s_from_ns(np.array([time for time, _ in messages], dtype=np.int64))
 
 
@@ -369,13 +375,15 @@ def _frames(records: McapRecords, head: HeadGeometry) -> PressureFrames:
                 f"/pressure message {i} holds {len(body)} bytes", way_out=f"{rows} x {columns} uint16 counts are needed"
             )
     counts: NDArray[np.uint16] = np.frombuffer(b"".join(data), dtype="<u2").reshape(-1, columns, rows)
-    return PressureFrames(_times(messages), np.ascontiguousarray(counts.transpose(0, 2, 1), dtype=np.uint16))
+    return PressureFrames(
+        _times(messages, topic="/pressure"), np.ascontiguousarray(counts.transpose(0, 2, 1), dtype=np.uint16)
+    )
 
 
 def _poses(records: McapRecords) -> TrackerPoses:
     messages = records.messages("/pose", schema="foxglove.PoseInFrame")
     values = np.array([_pose_values(body) for _, body in messages], dtype=np.float64).reshape(-1, 7)
-    return TrackerPoses(_times(messages), values[:, :3], values[:, 3:])
+    return TrackerPoses(_times(messages, topic="/pose"), values[:, :3], values[:, 3:])
 
 
 def _pose_values(body: bytes) -> tuple[float, ...]:

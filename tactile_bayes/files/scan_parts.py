@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.overlap import scan_cautions
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Scan
 
 _NS = 1_000_000_000
@@ -49,6 +50,11 @@ class ScanFile:
     provenance: Mapping[str, Any]
     schema: str
     account: Mapping[str, str] = field(default_factory=dict)
+
+    def cautions(self) -> list[str]:
+        """What speaks against using the scan, one line each: by its times, and by the recorder's account."""
+        found = scan_cautions(self.scan)
+        return [*found, *(line for line in self.account.get("cautions", "").splitlines() if line not in found)]
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:

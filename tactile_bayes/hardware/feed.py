@@ -19,8 +19,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from tactile_bayes.hardware.account import Report
 from tactile_bayes.hardware.readings import CountArray, PoseReading
-from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.streams import PIPE_BYTES
 
 FRAME: Final = 1

@@ -112,9 +112,10 @@ class HeadParser:
         if shape is None or len(packet.payload) != 2 * shape[0] * shape[1]:
             self.misfits += 1
             return None
+        restarts = self.sequence.restarts
         lost = self.sequence.missing_before(packet.sequence // self._every)
         counts = np.frombuffer(packet.payload, dtype="<u2").reshape(shape)
-        return FrameReading(counts, packet.device_us * 1000, lost)
+        return FrameReading(counts, packet.device_us * 1000, lost, self.sequence.restarts > restarts)
 
     def _pose(self, packet: Packet) -> PoseReading | None:
         if len(packet.payload) != _POSE.size:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 CountArray = NDArray[np.uint16]
-MM_PER_INCH = 25.4
+MM_PER_INCH: Final = 25.4
 
 
 class FrameReading(NamedTuple):
@@ -23,11 +23,14 @@ class FrameReading(NamedTuple):
         The head's clock.
     lost
         Frames missing just before this one, by the sequence numbers.
+    restarted
+        The sequence numbers do not go on from the frame before: the device has restarted, or its counter is damaged.
     """
 
     counts: CountArray
     device_ns: int
     lost: int = 0
+    restarted: bool = False
 
 
 class PoseReading(NamedTuple):
@@ -124,8 +127,18 @@ def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) ->
     return max(map(abs, position_mm)) < 25_000 and abs(math.hypot(*quaternion_wxyz) - 1) < 0.009
 
 
+# More missing records than this are no loss: a silent device ends a recording long before.
+MOST_LOST: Final = 100_000
+
+
 class SequenceCheck:
-    """Counts what is missing by a counter of 32 bits that wraps."""
+    """Counts what is missing by a counter of 32 bits that wraps.
+
+    Parameters
+    ----------
+    lost, restarts
+        Records missing so far; how often the counter went back, or forward by more than `MOST_LOST`.
+    """
 
     def __init__(self) -> None:
         self._expected: int | None = None
@@ -133,11 +146,11 @@ class SequenceCheck:
         self.restarts = 0
 
     def missing_before(self, sequence: int) -> int:
-        """How many are missing just before `sequence`; a counter that goes back is a restart, not a loss."""
+        """How many are missing just before `sequence`; 0 when the counter restarted or is damaged."""
         expected = sequence if self._expected is None else self._expected
         gap = (sequence - expected) % 2**32
         self._expected = (sequence + 1) % 2**32
-        if gap >= 2**31:
+        if gap > MOST_LOST:
             self.restarts += 1
             return 0
         self.lost += gap

@@ -5,23 +5,27 @@ from __future__ import annotations
 import contextlib
 import select
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
 
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.hardware.account import Report, recording_cautions
 from tactile_bayes.hardware.clocks import PoseClock
 from tactile_bayes.hardware.landmarks import LandmarkTouch
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import CountArray, EndReading, FrameReading, Parser, PoseReading
 from tactile_bayes.hardware.streams import Stream
+from tactile_bayes.mapping.overlap import Span, apart
 
 FLUSH_S: Final = 0.2
 DRAIN_S: Final = 0.25
 SILENT_S: Final = 3.0
+# A recording with a duration goes on for so long at most when the head's clock is behind.
+OVERTIME_S: Final = 1.0
 _TICK_S: Final = 0.05
 
 
@@ -58,34 +62,6 @@ class Observer(Protocol):
 
 
 @dataclass(slots=True)
-class Report:
-    """The account of a recording, in records unless it says bytes."""
-
-    frames: int = 0
-    frames_lost: int = 0
-    frames_backwards: int = 0
-    head_dropped: int = 0
-    poses: int = 0
-    poses_repeated: int = 0
-    poses_flagged: int = 0
-    poses_without_time: int = 0
-    head_garbage_bytes: int = 0
-    tracker_garbage_bytes: int = 0
-    overrun_bytes: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    longest_wait_ms: float = 0.0
-    ended_by: str = ""
-    fault: str = ""
-    landmarks: list[str] = field(default_factory=list)
-
-    @property
-    def duration_s(self) -> float:
-        """By the head's clock, from the first frame to the last."""
-        return (self.last_ns - self.first_ns) / 1e9
-
-
-@dataclass(slots=True)
 class Line:
     """One device in use: its port, its reading process, its parser, the commands that start and stop it."""
 
@@ -113,7 +89,10 @@ class Recorder:
     invert_rotation
         The tracker gives the rotation from base to sensor; it is turned round.
     duration_s
-        By the head's clock; None goes on until it is stopped.
+        By the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
+        stopped.
+    rate_hz
+        Frames that the head promised; 0 when it promised none.
     observer
         Looks on.
     clock_ns
@@ -129,6 +108,7 @@ class Recorder:
         shared_clock: bool = False,
         invert_rotation: bool = False,
         duration_s: float | None = None,
+        rate_hz: float = 0.0,
         observer: Observer | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -138,6 +118,9 @@ class Recorder:
         self._clock = PoseClock(shared=shared_clock)
         self._invert = invert_rotation
         self._duration_ns = None if duration_s is None else round(duration_s * 1e9)
+        self._rate_hz = rate_hz
+        self._frame_span, self._pose_span = Span(), Span()
+        self._begun_ns = self._heard_ns = 0
         self._observer = observer
         self._now_ns = clock_ns
         self._zero_ns = clock_ns()
@@ -185,8 +168,10 @@ class Recorder:
                     self._sink.flush()
                     self._account()
                 self._look_for_silence(now)
+                self._look_at_host_time(now)
         finally:
             self._hush()
+            self._judge()
             self._account()
         return self.report
 
@@ -218,25 +203,26 @@ class Recorder:
                 pass
 
     def _frame(self, reading: FrameReading, host_ns: int) -> None:
-        report, host_ns = self.report, host_ns - self._zero_ns
-        if not self.recording or (report.frames and reading.device_ns <= report.last_ns):
-            report.frames_backwards += self.recording
+        if not self.recording:
             return
-        self._clock.head.observe(reading.device_ns, host_ns)
+        report, host_ns = self.report, host_ns - self._zero_ns
+        device_ns, event = self._clock.head.read(reading.device_ns, host_ns)
         if not report.frames:
-            report.first_ns = reading.device_ns
-        elif self._duration_ns is not None and reading.device_ns - report.first_ns >= self._duration_ns:
+            report.first_ns, self._begun_ns = device_ns, host_ns
+        elif self._duration_ns is not None and device_ns - report.first_ns >= self._duration_ns:
             self.stop("duration")
             return
-        if reading.lost:
-            report.frames_lost += reading.lost
-            self._note(f"{reading.lost} frames lost before this one", "head", reading.device_ns, host_ns)
-        self._sink.add_frame(reading.counts, device_ns=reading.device_ns, host_ns=max(0, host_ns))
+        for text in _oddities(reading, event):
+            self._note(text, "head", device_ns, host_ns)
+        report.frames_lost += reading.lost
+        report.frame_counter_restarts += reading.restarted
+        self._sink.add_frame(reading.counts, device_ns=device_ns, host_ns=max(0, host_ns))
+        self._frame_span.add(device_ns / 1e9)
         report.frames += 1
-        report.last_ns = reading.device_ns
+        report.last_ns, self._heard_ns = device_ns, host_ns
         report.longest_wait_ms = max(report.longest_wait_ms, (self._now_ns() - self._zero_ns - host_ns) / 1e6)
         if self._observer is not None:
-            self._observer.frame(reading.counts, reading.device_ns)
+            self._observer.frame(reading.counts, device_ns)
 
     def _pose(self, reading: PoseReading, host_ns: int) -> None:
         if self._invert:
@@ -246,15 +232,19 @@ class Recorder:
         self._touched(reading, host_ns)
         if not self.recording:
             return
-        device_ns = self._clock.place(reading.device_ns, host_ns)
-        if device_ns is None:
+        moment = self._clock.place(reading.device_ns, host_ns)
+        if moment is None:
             self.report.poses_without_time += 1
             return
+        device_ns, event = moment
         flags = self._flags(reading)
         position, turn = np.array(reading.position_mm), np.array(reading.quaternion_wxyz)
         self._sink.add_pose(position, turn, device_ns=device_ns, host_ns=max(0, host_ns))
         self.report.poses += 1
         self._pose_ns = device_ns
+        self._pose_span.add(device_ns / 1e9)
+        if event:
+            self._note(event, "tracker", device_ns, host_ns)
         if flags:
             serious = flags != ("repeated",)
             self._note(", ".join(flags), "tracker", device_ns, host_ns, serious=serious)
@@ -314,6 +304,28 @@ class Recorder:
                 )
                 self.stop(f"the {line.role} fell silent")
 
+    def _look_at_host_time(self, now_ns: int) -> None:
+        """End a recording with a duration although the head's clock is behind."""
+        if self._duration_ns is None or not self.report.frames:
+            return
+        passed_ns = now_ns - self._zero_ns - self._begun_ns
+        if passed_ns > self._duration_ns + OVERTIME_S * 1e9:
+            self.stop("duration, by this computer's clock")
+
+    def _judge(self) -> None:
+        """What to know before the recording is used; a tracker none of whose poses is of use is a fault."""
+        report, clock = self.report, self._clock
+        report.head_clock_steps, report.head_clock_wraps = clock.head.steps, clock.head.wraps
+        report.tracker_clock_steps, report.tracker_clock_wraps = clock.tracker.steps, clock.tracker.wraps
+        passed_s = (self._heard_ns - self._begun_ns) / 1e9
+        spans = self._frame_span, self._pose_span
+        report.cautions = recording_cautions(report, *spans, passed_s=passed_s, rate_hz=self._rate_hz)
+        if self._tracker is not None and report.frames and not report.fault and apart(*spans):
+            report.fault = (
+                f"{self._tracker.port.name}: none of its {report.poses} poses was measured while frames came; check "
+                "that it runs, and record again"
+            )
+
     def _done(self) -> bool:
         """Whether all that belongs to the recording has arrived."""
         if self._drain_until_ns is None:
@@ -336,3 +348,13 @@ class Recorder:
             with contextlib.suppress(DeviceError):
                 line.port.write(line.stop)
             line.stream.stop()
+
+
+def _oddities(reading: FrameReading, event: str) -> Iterator[str]:
+    """What to note about a frame."""
+    if event:
+        yield event
+    if reading.restarted:
+        yield "the frame counter does not go on from the frame before: the head restarted, or its counter is damaged"
+    if reading.lost:
+        yield f"{reading.lost} frames lost before this one"

@@ -38,7 +38,7 @@ def map_text(tactile_map: TactileMap, *, lost: Sequence[str] = ()) -> str:
     Parameters
     ----------
     lost
-        What the scan files had lost before they were read, one line each.
+        What the scan files had lost before they were read, and what else speaks against them, one line each.
     """
     parts = (_what, _frames, _timing, _plane, _strokes, _cells)
     rows = [row for part in parts for row in part(tactile_map)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
-    from tactile_bayes.hardware.recorder import Report
+    from tactile_bayes.hardware.account import Report
 
 
 def record_text(report: Report, *, output: str) -> str:
@@ -22,11 +22,13 @@ def record_text(report: Report, *, output: str) -> str:
         *report.landmarks,
     ]
     odd = {
-        "frames out of order, left out": report.frames_backwards,
+        "times the head's counter of time wrapped": report.head_clock_wraps,
+        "times the tracker's counter of time wrapped": report.tracker_clock_wraps,
         "poses without a time, left out": report.poses_without_time,
         "bytes from the head that made no sense": report.head_garbage_bytes,
         "bytes from the tracker that made no sense": report.tracker_garbage_bytes,
         "bytes this computer came too late for": report.overrun_bytes,
     }
     lines += [f"{words}: {number}" for words, number in odd.items() if number]
+    lines += [f"caution: {text}" for text in report.cautions]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"

@@ -1,0 +1,351 @@
+"""Clocks that wrap, step, stand still or run wrong: no record is lost, and what happened is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from emulated_devices import short_scan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile_bayes.errors import BadDataError, DeviceError
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_mcap import ScanWriter, read_scan
+from tactile_bayes.hardware.account import Report
+from tactile_bayes.hardware.clocks import (
+    HEAD_STILL_NS,
+    LATEST_NS,
+    MOST_STEPS,
+    TRACKER_STILL_NS,
+    WRAPS_NS,
+    DeviceClock,
+    PoseClock,
+    wrap_period,
+)
+from tactile_bayes.hardware.readings import MOST_LOST, EndReading, FrameReading, PoseReading, SequenceCheck
+from tactile_bayes.hardware.recorder import Line, Recorder
+
+S = 1_000_000_000
+FRAME_NS = S // 200
+COUNTS = np.zeros((2, 2), dtype=np.uint16)
+
+
+class FakePort:
+    """A port that is spoken to."""
+
+    name = "tracker fake"
+
+    def write(self, data: bytes) -> None:
+        if data == b"gone":
+            raise DeviceError("it has gone")
+
+
+class FakeParser:
+    garbage_bytes = 0
+
+
+class FakeStream:
+    ended = False
+    overrun_bytes = 0
+
+    def stop(self) -> None:
+        """Nothing to stop."""
+
+
+class Kept:
+    """A sink that remembers."""
+
+    def __init__(self) -> None:
+        self.frames, self.poses, self.notes = [], [], []
+
+    def add_frame(self, _counts, *, device_ns, **_):
+        self.frames.append(device_ns)
+
+    def add_pose(self, *_, device_ns, **__):
+        self.poses.append(device_ns)
+
+    def add_note(self, text, *, device, **_):
+        self.notes.append((device, text))
+
+    def flush(self):
+        """Nothing waits."""
+
+
+class Session:
+    """A recorder fed by hand, in a time of its own."""
+
+    def __init__(self, *, shared: bool = False, tracker: bool = True, **options) -> None:
+        self.now_ns, self.sink = 0, Kept()
+        self.lines = [Line(role, FakePort(), FakeStream(), FakeParser(), b"", b"") for role in ("head", "tracker")]
+        self.recorder = Recorder(
+            self.lines[0],
+            self.lines[1] if tracker else None,
+            self.sink,
+            shared_clock=shared,
+            clock_ns=lambda: self.now_ns,
+            **options,
+        )
+        self.recorder.recording = True
+
+    def frame(self, device_ns: int, **more) -> None:
+        self.recorder._read(self.lines[0], FrameReading(COUNTS, device_ns, **more), self.now_ns)
+
+    def pose(self, device_ns: int | None, x_mm: float = 0.0) -> None:
+        self.recorder._read(self.lines[1], PoseReading((x_mm, 0, 0), (1, 0, 0, 0), device_ns), self.now_ns)
+
+    def end(self) -> Report:
+        self.recorder._judge()
+        return self.recorder.report
+
+
+def run_head(raw_of, *, seconds: float = 2.0, **options) -> tuple[Session, Report]:
+    """A head at 200 Hz whose clock says ``raw_of(true time in ns)``."""
+    session = Session(tracker=False, **options)
+    for i in range(round(seconds * 200)):
+        session.now_ns = i * FRAME_NS
+        session.frame(raw_of(session.now_ns))
+    return session, session.end()
+
+
+def wrapping(period_ns: int, *, before_s: float = 1.0):
+    """A counter of that period which wraps so long after the start."""
+    return lambda true_ns: (true_ns + period_ns - round(before_s * S)) % period_ns
+
+
+@pytest.mark.parametrize("period_ns", WRAPS_NS)
+def test_a_counter_that_wraps_is_unwrapped_to_the_nanosecond(period_ns):
+    session, report = run_head(wrapping(period_ns))
+    assert np.unique(np.diff(session.sink.frames)).tolist() == [FRAME_NS]
+    assert (report.head_clock_wraps, report.head_clock_steps, report.cautions) == (1, 0, [])
+    assert session.sink.notes == [("head", f"the clock wrapped after {period_ns / 1e9:.6f} s")]
+
+
+def test_32_bits_of_microseconds_wrap_as_a_head_sends_them():
+    _, report = run_head(lambda true_ns: ((true_ns // 1000 + 2**32 - 700_000) % 2**32) * 1000)
+    assert report.frames == 400
+    assert report.duration_s == pytest.approx(1.995, abs=1e-6)
+    assert report.head_clock_wraps == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "raw_of"),
+    [
+        ("back by 7 s", lambda t: t + 10 * S - (7 * S if t >= S else 0)),
+        ("back to 0", lambda t: t + 12_345_678_901 if t < S else t - S),
+        ("forward by an hour", lambda t: t + (3600 * S if t >= S else 0)),
+        ("a period of 37 s", wrapping(37 * S)),
+        ("beyond 2^63 ns", lambda t: t + (2**63 if t >= S else 0)),
+    ],
+)
+def test_a_step_is_told_and_nothing_is_lost(name, raw_of):
+    session, report = run_head(raw_of)
+    assert report.frames == len(session.sink.frames) == 400, name
+    # the step itself is measured by when the frames arrived, here without delay
+    assert np.diff(session.sink.frames).tolist() == [FRAME_NS] * 399
+    assert report.head_clock_steps == 1
+    assert len(session.sink.notes) == 1
+    assert session.sink.notes[0][1].startswith("the clock stepped ")
+    assert report.cautions == ["the head's clock stepped once; this computer's clock was used instead"]
+
+
+@pytest.mark.parametrize("value", [0, 5 * S, 2**63])
+def test_a_clock_that_stands_still_is_replaced(value):
+    session, report = run_head(lambda _: value)
+    assert report.frames == 400
+    assert np.diff(session.sink.frames).min() >= 0
+    late = np.array(session.sink.frames) - session.sink.frames[0] - FRAME_NS * np.arange(400)
+    assert abs(late[-1]) < 1e6
+    assert (np.abs(late) > 1e6).sum() * FRAME_NS <= HEAD_STILL_NS + FRAME_NS
+    assert any("stood still" in text for _, text in session.sink.notes)
+    assert len(session.sink.notes) <= 2
+
+
+def test_a_clock_of_coarse_ticks_is_no_clock_that_stands_still():
+    session, report = run_head(lambda t: t // (20 * 10**6) * 20 * 10**6)
+    assert report.head_clock_steps == 0
+    assert session.sink.notes == []
+
+
+@pytest.mark.parametrize(("factor", "steps"), [(1000, MOST_STEPS), (0.001, 0)])
+def test_a_clock_in_another_unit_is_told(factor, steps):
+    _, report = run_head(lambda t: round(t * factor), seconds=3.0)
+    assert report.frames == 600
+    assert report.head_clock_steps == steps
+    words = "stepped 20 times" if steps else "the head's clock ran 0.0 s while 3.0 s passed on this computer"
+    assert any(words in text for text in report.cautions)
+
+
+@pytest.mark.parametrize("start", [2**62, 2**63, 2**64 * 1000 - 5 * S])
+def test_times_that_no_file_can_hold_are_brought_into_range(start):
+    session, report = run_head(lambda t: start + t)
+    assert 0 <= min(session.sink.frames) <= max(session.sink.frames) < 2**63
+    assert np.unique(np.diff(session.sink.frames)).tolist() == [FRAME_NS]
+    assert report.head_clock_steps == 1
+
+
+@given(
+    raws=st.lists(st.integers(0, 2**64 * 1000), min_size=1, max_size=60),
+    gaps=st.lists(st.integers(0, S), min_size=60, max_size=60),
+)
+def test_whatever_a_clock_says_times_rise_and_fit_a_file(raws, gaps):
+    clock, host, before = DeviceClock(still_ns=HEAD_STILL_NS), 0, 0
+    for raw, gap in zip(raws, gaps, strict=False):
+        host += gap
+        time_ns = clock.read(raw, host).time_ns
+        assert before <= time_ns < 2 * LATEST_NS
+        before = time_ns
+
+
+@pytest.mark.parametrize("raw_of", [lambda t: t, lambda _: 7, lambda t: t + (3600 * S if t >= S else 0)])
+def test_a_duration_ends_whatever_the_clock_does(raw_of):
+    session = Session(tracker=False, duration_s=3.0)
+    for i in range(10 * 200):
+        session.now_ns = i * FRAME_NS
+        session.frame(raw_of(session.now_ns))
+        session.recorder._look_at_host_time(session.now_ns)
+        if session.recorder.report.ended_by:
+            break
+    assert session.recorder.report.ended_by == "duration"
+    assert 3.0 <= session.now_ns / 1e9 <= 3.3
+    assert session.recorder.report.frames == pytest.approx(600, abs=1)
+
+
+def test_a_clock_that_lags_ends_by_this_computers():
+    session = Session(tracker=False, duration_s=3.0)
+    for i in range(10 * 200):
+        session.now_ns = i * FRAME_NS
+        session.frame(session.now_ns // 1000)
+        session.recorder._look_at_host_time(session.now_ns)
+        if session.recorder.report.ended_by:
+            break
+    assert session.recorder.report.ended_by == "duration, by this computer's clock"
+    assert session.now_ns / 1e9 == pytest.approx(4.0, abs=0.1)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(
+    ("name", "raw_of", "steps", "wraps"),
+    [
+        ("sound", lambda t: t, 0, 0),
+        ("32 bits of us", wrapping((1 << 32) * 1000), 0, 1),
+        ("back", lambda t: t + 10 * S - (7 * S if t >= S else 0), 1, 0),
+        ("forward", lambda t: t + (3600 * S if t >= S else 0), 1, 0),
+        ("constant", lambda _: 7 * S, 1, 0),
+    ],
+)
+def test_a_trackers_clock_may_do_all_that_too(shared, name, raw_of, steps, wraps):
+    session = Session(shared=shared)
+    for i in range(3 * 200):
+        session.now_ns = i * FRAME_NS
+        session.frame(raw_of(session.now_ns) if shared else session.now_ns)
+        session.pose(raw_of(session.now_ns), x_mm=float(i))
+    report = session.end()
+    assert (report.frames, report.poses) == (600, 600), name
+    assert (report.tracker_clock_steps, report.tracker_clock_wraps) == (steps, wraps)
+    apart_ns = np.abs(np.array(session.sink.poses) - np.array(session.sink.frames))
+    settled = slice(round(1.1 * TRACKER_STILL_NS / FRAME_NS), None) if name == "constant" else slice(None)
+    assert apart_ns[settled].max() < 1e6
+    assert len([1 for device, _ in session.sink.notes if device == "tracker"]) == steps + wraps
+
+
+def test_poses_keep_their_order_when_they_are_placed():
+    clock = PoseClock(shared=False)
+    clock.head.read(0, 0)
+    times = [clock.place(None, host).time_ns for host in (10, 30, 20, 40)]
+    assert times == sorted(times)
+
+
+def test_a_restart_is_no_wrap():
+    assert wrap_period(2**32 * 1000 - 5, 10, passed_ns=15) == 2**32 * 1000
+    assert wrap_period(2**32 * 1000 - 5, 10, passed_ns=S) is None
+    assert wrap_period(50 * S, 0, passed_ns=FRAME_NS) is None
+
+
+@pytest.mark.parametrize(("jump", "lost"), [(1, 0), (4, 3), (MOST_LOST + 1, MOST_LOST), (MOST_LOST + 2, 0), (2**30, 0)])
+def test_a_counter_that_jumps_far_is_damaged_and_no_loss(jump, lost):
+    check = SequenceCheck()
+    check.missing_before(7)
+    assert check.missing_before(7 + jump) == lost
+    assert check.restarts == (jump > MOST_LOST + 1)
+
+
+def test_a_damaged_frame_counter_is_told():
+    session = Session(tracker=False)
+    for i in range(10):
+        session.now_ns = i * FRAME_NS
+        session.frame(session.now_ns, restarted=i == 5)
+    report = session.end()
+    assert (report.frames, report.frames_lost, report.frame_counter_restarts) == (10, 0, 1)
+    assert "restarted, or its counter is damaged" in session.sink.notes[0][1]
+    assert report.cautions == ["the head's frame counter restarted or was damaged once"]
+
+
+def mismatch(frames: tuple[float, float], poses: tuple[float, float], *, rate_hz: float = 200.0) -> Report:
+    """The account of frames and poses that were measured between these times in s."""
+    session = Session(shared=True, rate_hz=rate_hz)
+    times = np.arange(0, 6 * S, FRAME_NS)
+    for i, time_ns in enumerate(times.tolist()):
+        session.now_ns = time_ns
+        if frames[0] * S <= time_ns <= frames[1] * S:
+            session.frame(time_ns)
+        if poses[0] * S <= time_ns <= poses[1] * S:
+            session.pose(time_ns, x_mm=float(i))
+    return session.end()
+
+
+@pytest.mark.parametrize(
+    ("frames", "poses", "said"),
+    [
+        ((0, 5), (0, 5), []),
+        ((0, 5), (0, 2.2), ["poses end 2.8 s before the frames"]),
+        ((0, 5), (1.5, 5), ["poses start 1.5 s after the frames"]),
+        ((0, 2), (3, 5), ["no frame has a pose: poses cover 3.00 to 5.00 s, frames 0.00 to 2.00 s"]),
+    ],
+)
+def test_poses_that_do_not_cover_the_frames_are_told(frames, poses, said):
+    report = mismatch(frames, poses)
+    assert report.cautions == said
+    assert ("none of its" in report.fault) == any("no frame has a pose" in text for text in said)
+
+
+def test_no_pose_at_all_is_a_fault():
+    session = Session()
+    for i in range(10):
+        session.now_ns = i * FRAME_NS
+        session.frame(session.now_ns)
+    assert "tracker fake: none of its 0 poses was measured while frames came" in session.end().fault
+
+
+def test_gaps_a_promise_not_kept_and_a_stuck_tracker_are_told():
+    session = Session(shared=True, rate_hz=200.0)
+    for i in range(800):
+        session.now_ns = i * FRAME_NS
+        if not 300 <= i < 400:
+            session.pose(session.now_ns)
+        if i % 4 == 0 and not 500 <= i < 600:
+            session.frame(session.now_ns)
+    session.recorder._read(session.lines[0], EndReading(800, 0), session.now_ns)
+    cautions = session.end().cautions
+    assert "no pose for 0.50 s from 1.50 s on (longest gap)" in cautions
+    assert "no frame for 0.52 s from 2.48 s on (longest gap)" in cautions
+    assert any(text.startswith("the head promised 200 frames per second and measured 43") for text in cautions)
+    assert "every pose is the same: the tracker does not follow the head" in cautions
+
+
+@pytest.mark.parametrize("topic", ["/pressure", "/pose"])
+def test_a_file_with_a_time_that_no_reader_can_hold_is_refused_in_one_line(tmp_path, topic):
+    scan = short_scan(0.1)
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = ScanWriter(
+            stream,
+            head=scan.head,
+            element_calibration=scan.element_calibration,
+            session={"source": "test"},
+            provenance=Provenance("test", {}),
+        )
+        writer.add_frame(scan.frames.counts[0], device_ns=2**63 if topic == "/pressure" else 0, host_ns=0)
+        place, turn = scan.poses.position_mm[0], scan.poses.quaternion_wxyz[0]
+        writer.add_pose(place, turn, device_ns=2**63 if topic == "/pose" else 0, host_ns=0)
+        writer.finish()
+    with pytest.raises(BadDataError, match=f"{topic} holds a time of {2**63} ns"):
+        read_scan(tmp_path / "a.mcap")
