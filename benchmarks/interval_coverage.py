@@ -9,8 +9,9 @@ truth is the nearest Gaussian, under the row's errors or by plain squares), and 
 truth is the bump's own. Where frames were divided by their means, a map's bump has other widths than the field's, and
 the truth is what the same estimate says of the same scan without sensor and tracker errors. A narrow bump under strong
 correlated errors calls for a finer field than others. The negative controls: the model of independent errors without
-its inflation, on maps with a field; the coarse field for the narrow bump; and the head's maps without their figures of
-the frames' places.
+its inflation, on maps with a field; the coarse field for the narrow bump; the head's maps without their figures of
+the frames' places; and maps whose level is not known, with that level held at the map's median. Such maps are grids in
+another unit and scans mapped without normalising, fitted as `estimate` does where nothing is said.
 
 `sizes`: the whole path. Each mass is scanned three times by the solid model, each scan mapped and sized, alone and
 pooled, with the shipped calibration. `population` draws bodies from the prior that the calibration was learned over,
@@ -44,7 +45,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions, fit_bump
+from tactile_bayes.posterior.fit import FitOptions, default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
 
 NOMINAL = 0.9
@@ -70,7 +71,17 @@ NARROW = {
 }
 NARROW_SIGMA = (2.0, 2.4)
 NARROW_KIND = {"white": 0.002, "field": 0.03, "length_mm": 3.0}
-ROWS = (*KINDS, BY_SQUARES, *HEADS, CONTROL, *NARROW)
+GRID_LEVELLESS = "grid of an unknown level, field 3 mm"
+SINGLE_LEVELLESS = "the same grid without its counts and variances"
+HEAD_LEVELLESS = "simulated head in kPa (map --normalise none)"
+HELD = {
+    "control: the grid's level held at its median": GRID_LEVELLESS,
+    "control: the kPa map's level held at its median": HEAD_LEVELLESS,
+}
+LEVELLESS = (GRID_LEVELLESS, SINGLE_LEVELLESS, HEAD_LEVELLESS, *HELD)
+UNIT, GRID_HALF_MM = 37.0, 22.0
+"""What a value of 1 becomes in a grid of an unknown level, and how far it reaches."""
+ROWS = (*KINDS, BY_SQUARES, *HEADS, CONTROL, *NARROW, *LEVELLESS)
 Row = dict[str, Any]
 
 
@@ -117,7 +128,13 @@ def widths(run: Callable[..., Iterable[Any]], maps: int, rows: Iterable[int]) ->
 
 def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
     rng = np.random.default_rng([SEED, index])
-    if kind in HEADS:
+    fit = FitOptions("free", 20.0, "off", None, "field", field_cosines=NARROW.get(kind))
+    method = "importance"
+    if kind in LEVELLESS:
+        tactile_map, truth, fit = _levelless(kind, index, rng)
+        # independent errors with many of them shared leave importance sampling to chains of minutes
+        method = "laplace" if fit.noise == "independent" else method
+    elif kind in HEADS:
         tactile_map, truth = _head_map(index, kind)
     elif kind in NARROW:
         tactile_map, truth = _grid_map(NARROW_KIND, rng, sigma=NARROW_SIGMA)
@@ -126,7 +143,7 @@ def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
         tactile_map, truth = _grid_map(KINDS[same.get(kind, kind)], rng, by_squares=kind == BY_SQUARES)
     if kind == CONTROL:
         return _held_by_independent(tactile_map, truth)
-    options = EstimateOptions(fit=FitOptions("free", 20.0, "off", None, "field", field_cosines=NARROW.get(kind)))
+    options = EstimateOptions(method=method, fit=fit)
     found = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
     if found.map_posterior is None:
         return None
@@ -136,6 +153,33 @@ def _one_map(kind: str, index: int) -> tuple[bool, bool] | None:
         for draws in (found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     )
     return bool(x[0] <= truth[0] <= x[1]), bool(y[0] <= truth[1] <= y[1])
+
+
+def _levelless(kind: str, index: int, rng: np.random.Generator) -> tuple[TactileMap, tuple[float, float], FitOptions]:
+    """A map whose level is not known, its truth, and the fit that `estimate` takes by default, or took before."""
+    row = HELD.get(kind, kind)
+    if row == HEAD_LEVELLESS:
+        tactile_map, truth = _head_map(index, row)
+    else:
+        known, truth = _grid_map(KINDS["field 3 mm"], rng)
+        recipe = replace(known.recipe, normalise="none")
+        told = {"variance": UNIT**2 * known.variance}
+        if row == SINGLE_LEVELLESS:
+            told = {"variance": np.zeros_like(known.variance), "count": np.ones_like(known.count)}
+        tactile_map = _cropped(replace(known, mean=UNIT * known.mean, recipe=recipe, background=None, **told))
+    if kind in HELD:
+        level = float(np.median(tactile_map.mean[tactile_map.covered]))
+        divided = {"mean": tactile_map.mean / level, "variance": tactile_map.variance / level**2}
+        return replace(tactile_map, background=1.0, **divided), truth, FitOptions("fixed", 20.0, "off")
+    background, noise = default_errors(tactile_map)
+    return tactile_map, truth, FitOptions(background, 20.0, "off", noise=noise)
+
+
+def _cropped(tactile_map: TactileMap) -> TactileMap:
+    """The middle of a map, `GRID_HALF_MM` on every side."""
+    keep = np.abs(tactile_map.x_mm) <= GRID_HALF_MM
+    cells = {name: getattr(tactile_map, name)[np.ix_(keep, keep)] for name in ("mean", "variance", "count")}
+    return replace(tactile_map, x_mm=tactile_map.x_mm[keep], y_mm=tactile_map.y_mm[keep], **cells)
 
 
 def _held_by_independent(tactile_map: TactileMap, truth: tuple[float, float]) -> tuple[bool, bool] | None:
@@ -231,7 +275,9 @@ def _head_map(index: int, kind: str) -> tuple[TactileMap, tuple[float, float]]:
         gain_share=float(rng.uniform(0.002, 0.02)),
     )
     x, y = rng.uniform(-3.0, 3.0, 2)
-    lump = Lump(x_mm=float(x), y_mm=float(y), amplitude=HEADS[kind], sigma_x_mm=SIGMA[0], sigma_y_mm=SIGMA[1])
+    lump = Lump(
+        x_mm=float(x), y_mm=float(y), amplitude=HEADS.get(kind, AMPLITUDE), sigma_x_mm=SIGMA[0], sigma_y_mm=SIGMA[1]
+    )
     scene = Scene(seed=index, frame_rate_hz=100.0, lumps=(lump,), noise=noise, strokes=Strokes(yaw_deg=0.0))
     clean = replace(scene, noise=Noise(0.0, 0.0, 0.0, 0.0, 0.0), tracker=Tracker())
 
@@ -239,7 +285,7 @@ def _head_map(index: int, kind: str) -> tuple[TactileMap, tuple[float, float]]:
         return build_map(simulate(scene, rng=np.random.default_rng([SEED, index, 2])).scan, normalise=normalise)
 
     if kind != MEANS:
-        found = mapped(scene, "gain")
+        found = mapped(scene, "none" if kind == HEAD_LEVELLESS else "gain")
         told = {name: value for name, value in found.quality.items() if name not in POSE_NOISE}
         return (replace(found, quality=told) if kind == UNTOLD else found), SIGMA
     noisy, exact = mapped(scene, "mean"), mapped(clean, "mean")

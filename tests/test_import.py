@@ -18,6 +18,7 @@ from tactile_bayes.files.arrays_npz import read_arrays
 from tactile_bayes.files.grid_import import read_grid
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.posterior.cells import window_cells
 
 Arrays = dict[str, Any]
 
@@ -200,6 +201,19 @@ def test_count_and_variance_come_along(tmp_path: Path) -> None:
     np.testing.assert_array_equal(grid.count, count)
     np.testing.assert_array_equal(np.isnan(grid.mean), count == 0)
     assert grid.variance[0, 0] == 0.5
+
+
+def test_a_variance_is_unknown_where_a_cell_has_one_reading(tmp_path: Path) -> None:
+    """As numpy's `var(ddof=1)` leaves it; anywhere else a variance of NaN is a fault."""
+    count, variance = np.array([[1, 2], [3, 0]]), np.array([[np.nan, 0.5], [0.25, np.nan]])
+    np.savez(tmp_path / "g.npz", mean=np.ones((2, 2)), count=count, variance=variance, spacing_mm=1.0)
+    grid = read_grid(tmp_path / "g.npz")
+    np.testing.assert_array_equal(grid.variance, variance)
+    cells = window_cells(grid, (0.0, 0.0), radius_mm=5.0)
+    assert cells.reading_variance == pytest.approx((0.5 * 2 + 0.25 * 3) / 5)
+    np.savez(tmp_path / "bad.npz", mean=np.ones((2, 2)), count=count + 1, variance=variance, spacing_mm=1.0)
+    with pytest.raises(BadDataError, match=r"variance is nan at \(0, 0\), where count is 2.*0 or 1"):
+        read_grid(tmp_path / "bad.npz")
 
 
 def test_an_empty_field_is_a_cell_without_data(tmp_path: Path) -> None:

@@ -44,7 +44,8 @@ def command() -> None:
 @click.option(
     "--background",
     type=click.Choice(["fixed", "free"]),
-    help="How the table's maps were fitted (declared); by default what a study's table says, else fixed.",
+    help="How the table's maps were fitted (declared). Default: what a study's table says; else fixed, or free with "
+    "--normalise none.",
 )
 @click.option(
     "--fit-radius-mm",
@@ -122,7 +123,7 @@ def size(
         click.echo(_log_quadratic(table, output, force=force), nl=False)
         return
     rows = read_table(table, "size_table.table.json")
-    background = _background(rows, background)
+    background = _background(rows, background, normalise)
     flat_field = rows.columns["flat_field"][0]
     recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise, flat_field=flat_field)
     rng = np.random.default_rng(seed)
@@ -146,9 +147,9 @@ def size(
     click.echo(calibration_text(calibration, terms=size_terms(lumps), not_left_out=silent), nl=False)
 
 
-def _background(table: Table, declared: str | None) -> str:
-    """How the table's maps were fitted: what its rows say, else what is declared, else fixed."""
-    from tactile_bayes.errors import BadDataError
+def _background(table: Table, declared: str | None, normalise: str) -> str:
+    """How the table's maps were fitted: what its rows say, else what is declared, else fixed where there is a level."""
+    from tactile_bayes.errors import BadDataError, UsageError
 
     for name in ("background", "flat_field"):
         if len(set(table.columns[name])) > 1:
@@ -157,7 +158,10 @@ def _background(table: Table, declared: str | None) -> str:
     said: str | None = table.columns["background"][0]
     if said and declared and said != declared:
         raise BadDataError(f"its background is {said}", way_out="leave out --background", path=str(table.path))
-    return said or declared or "fixed"
+    found = said or declared or ("free" if normalise == "none" else "fixed")
+    if normalise == "none" and found == "fixed":
+        raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
+    return found
 
 
 def _refuse_declared(ctx: click.Context) -> None:

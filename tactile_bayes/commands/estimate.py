@@ -46,7 +46,10 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option("--figure", metavar="FIG.png", type=_FILE, help="Draw the size posterior.")
 @click.option("--map-figure", metavar="FIG.png", type=_FILE, help="Draw the map with the fitted ellipse.")
 @click.option(
-    "--background", type=click.Choice(["fixed", "free"]), help="As the calibration's maps were fitted, if not given."
+    "--background",
+    type=click.Choice(["fixed", "free"]),
+    help="Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free where the level is "
+    "not known (normalise none).",
 )
 @click.option(
     "--fit-radius-mm", type=click.FloatRange(min=0.0, min_open=True), help="As the calibration's, if not given."

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
+    from tactile_bayes.posterior.fit import FitOptions
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
     from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors
     from tactile_bayes.posterior.size_calibration import SizeCalibration
@@ -60,6 +61,14 @@ class Answer:
     normalise: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class NoSize:
+    """Why there are widths only where no calibration was named, and what would lead to a size."""
+
+    reason: str
+    advice: str = ""
+
+
 def answer_map(path: Path, *, settings: Settings) -> Answer:
     """One map of several, in whichever process; a fault of this map is its answer."""
     try:
@@ -82,7 +91,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     tactile_map = read_map(path)
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
-    options = _options(settings, calibration)
+    options = _options(settings, calibration, tactile_map)
     if calibration is not None:
         calibration = calibration_for(tactile_map, calibration)
     inputs = {"map": path} | ({"size_calibration": source} if source else {})
@@ -99,8 +108,8 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
     except BadDataError as error:
         raise error.at(path) from None
-    if why_none and estimate.status == "estimate":
-        estimate = replace(estimate, reason=why_none)
+    if why_none is not None and estimate.status == "estimate":
+        estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     if calibration is not None and estimate.size is not None:
         words = _calibration_words(settings.calibration or shipped, calibration)
         estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
@@ -137,15 +146,15 @@ def _calibration_words(name: str, calibration: SizeCalibration | LogQuadratic) -
 
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
-) -> tuple[Path | None, SizeCalibration | LogQuadratic | None, str]:
+) -> tuple[Path | None, SizeCalibration | LogQuadratic | None, NoSize | None]:
     """The calibration that was named, or the shipped one where nothing was said and it fits the map and the options.
 
     Returns
     -------
     path, calibration
         None where there is none.
-    reason
-        Why the shipped one was not used; empty when it was, or when the user decided.
+    why_none
+        Why the shipped one was not used; None when it was, or when the user decided.
     """
     from tactile_bayes.files.shipped import default_for, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
@@ -153,27 +162,59 @@ def choose_calibration(
 
     path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
     if path is None:
-        return None, None, ""
+        return None, None, None
     calibration = read_size_calibration(path)
+    if tactile_map.background is None and calibration.recipe.normalise != tactile_map.recipe.normalise:
+        why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map).fit)
+        if settings.calibration is None:
+            return None, None, replace(why_none, reason=f"{why_none.reason}; widths only")
+        raise BadDataError(f"{settings.calibration} does not fit: {why_none.reason}", way_out=why_none.advice)
     if settings.calibration is not None:
-        return path, calibration, ""
-    fit = _options(settings, calibration).fit
+        return path, calibration, None
+    fit = _options(settings, calibration, tactile_map).fit
     differs = recipe_differences(tactile_map, calibration, fit)
     if differs or settings.method == "optimise":
         what = "; ".join(differs) or "method optimise knows no noise field"
-        return None, None, f"the shipped calibration does not fit: {what}; widths only"
-    return path, calibration, ""
+        return None, None, NoSize(f"the shipped calibration does not fit: {what}; widths only")
+    return path, calibration, None
 
 
-def _options(settings: Settings, calibration: SizeCalibration | LogQuadratic | None) -> EstimateOptions:
-    """What is not given is as the calibration's maps were fitted, else as the paper printed it."""
+def _level_unknown(tactile_map: TactileMap, fit: FitOptions) -> NoSize:
+    """Why a map whose level is not known has widths only, and the commands that lead to a size."""
+    made = f"--normalise {tactile_map.recipe.normalise} --background {fit.background} --noise {fit.noise}"
+    learn = (
+        "estimate maps of at least 8 lumps of known size made the same way, list their d_mm, amplitude, sigma_x_mm and "
+        f"sigma_y_mm in LUMPS.csv, run `tactile-bayes calibrate size LUMPS.csv {made} --fit-radius-mm "
+        f"{fit.radius_mm:g} -o size.json` and give --size-calibration size.json"
+    )
+    if tactile_map.recipe.source == "scan":
+        reason = "the map is in kPa, and the shipped calibrations are for maps of normalised frames"
+        return NoSize(reason, f"map the scan again without --normalise none; or {learn}")
+    reason = "the grid's level is not known, and the shipped calibrations need the amplitude relative to it"
+    declare = "if its values were divided by their level already, import it again with --normalise gain"
+    return NoSize(reason, f"{declare} (frames divided by their means: mean); otherwise {learn}")
+
+
+def _options(
+    settings: Settings, calibration: SizeCalibration | LogQuadratic | None, tactile_map: TactileMap
+) -> EstimateOptions:
+    """What is not given is as the calibration's maps were fitted, else as the paper printed it.
+
+    Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
+    """
     from tactile_bayes.files.prior_toml import read_prior
     from tactile_bayes.posterior.estimate import EstimateOptions
-    from tactile_bayes.posterior.fit import FitOptions
+    from tactile_bayes.posterior.fit import FitOptions, default_errors
 
-    noise = settings.noise or (calibration.recipe.noise if calibration else "independent")
-    printed = "free" if noise == "field" else "fixed"
-    background = settings.background or (calibration.recipe.background if calibration else printed)
+    background, noise = default_errors(tactile_map)
+    if settings.background or settings.method == "optimise":
+        noise = "independent"
+    if calibration is not None:
+        background, noise = calibration.recipe.background, calibration.recipe.noise
+    noise = settings.noise or noise
+    if calibration is None and noise == "field":
+        background = "free"
+    background = settings.background or background
     radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
     fit = FitOptions(background, radius, settings.rotation, settings.centre_mm, noise, None, settings.field_cosines)
     return EstimateOptions(

@@ -32,8 +32,9 @@ def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "
     Parameters
     ----------
     path
-        ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` and ``spacing_mm``; a ``.csv`` of
-        numbers, an empty field for a cell without data; or a grey ``.tif``, ``.pgm`` or ``.png`` image.
+        ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN where count is 1) and
+        ``spacing_mm``; a ``.csv`` of numbers, an empty field for a cell without data; or a grey ``.tif``, ``.pgm`` or
+        ``.png`` image.
     spacing_mm
         Side of the square cells; may be left out when the ``.npz`` holds it.
     normalise
@@ -140,15 +141,21 @@ def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tu
 
 
 def _variance(held: np.ndarray[Any, Any] | None, count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> FloatArray:
-    """Variance within a cell: 0 where it is not known, NaN where there is no data."""
+    """Variance within a cell: 0 in a grid that has none, NaN where there is no data.
+
+    It may also be NaN where a cell has a single reading: a sample variance, numpy's with ddof=1, does not exist there.
+    """
     if held is None:
         return np.where(count > 0, 0.0, np.nan)
     variance = _numbers(held, name="variance")
     _check_same_shape(variance, count, name="variance")
-    bad = np.argwhere((count > 0) & ~(variance >= 0))
+    bad = np.argwhere((count > 0) & ~(variance >= 0) & ~((count == 1) & np.isnan(variance)))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
-        raise BadDataError(f"variance is {variance[index]:g} at {index}", way_out="it must not be negative or NaN")
+        raise BadDataError(
+            f"variance is {variance[index]:g} at {index}, where count is {count[index]}",
+            way_out="it must not be negative, and NaN (not known) only where count is 0 or 1",
+        )
     return np.where(count > 0, variance, np.nan)
 
 

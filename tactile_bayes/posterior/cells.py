@@ -57,7 +57,7 @@ class FitCells:
     x_mm, y_mm : (k,) arrays
         Cell centres in `plane`.
     value, variance, count : (k,) arrays
-        Mean, within-cell variance and number of readings.
+        Mean, within-cell variance (NaN where it is not known) and number of readings.
     row, column : (k,) int arrays
         Where the cells lie in the map's grid.
     cell_mm
@@ -79,6 +79,13 @@ class FitCells:
     def __len__(self) -> int:
         return len(self.value)
 
+    @property
+    def reading_variance(self) -> float:
+        """Variance of a reading within its cell, pooled over the cells that know theirs; 0 where none does."""
+        known = np.isfinite(self.variance)
+        readings = float(np.sum(self.count[known]))
+        return float(np.sum(self.variance[known] * self.count[known])) / readings if readings > 0 else 0.0
+
 
 def trusted(tactile_map: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """(ny, nx) True for covered cells with at least a tenth of the median count.
@@ -97,12 +104,11 @@ def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, rad
     dy = tactile_map.y_mm[:, None] - centre_mm[1]
     inside = trusted(tactile_map) & (dx**2 + dy**2 <= radius_mm**2)
     row, column = np.nonzero(inside)
-    variance = tactile_map.variance[inside]
     return FitCells(
         x_mm=tactile_map.x_mm[column],
         y_mm=tactile_map.y_mm[row],
         value=tactile_map.mean[inside].astype(np.float64),
-        variance=np.where(np.isfinite(variance), variance, 0.0),
+        variance=tactile_map.variance[inside],
         count=tactile_map.count[inside].astype(np.float64),
         row=row,
         column=column,

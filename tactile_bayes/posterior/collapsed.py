@@ -379,8 +379,7 @@ def _side_by_side(found: list[WithEvidence]) -> WithEvidence:
 
 def independent_variance(cells: FitCells) -> FloatArray:
     """(n,) independent variance of the cells, mean 1: reading variance over count where readings were counted."""
-    reading = float(np.sum(cells.variance * cells.count) / np.sum(cells.count))
-    variance = 1.0 / cells.count if reading > 0 else np.ones(len(cells))
+    variance = 1.0 / cells.count if cells.reading_variance > 0 else np.ones(len(cells))
     return np.asarray(variance / variance.mean())
 
 

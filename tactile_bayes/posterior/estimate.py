@@ -16,7 +16,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
 from tactile_bayes.posterior.fat_depth import head_profile
-from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions
+from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, check_background
 from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, fat_left_out, pooled_size
@@ -158,7 +158,10 @@ def estimate_map(
         When the map or the fit options differ from the calibration's recipe.
     NotConvergedError
         When the method does not converge.
+    UsageError
+        When an option does not go with another, or with the map.
     """
+    check_background(tactile_map, options.fit)
     _check_options(options)
     if calibration is not None:
         check_recipe(tactile_map, calibration, options.fit)

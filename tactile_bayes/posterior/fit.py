@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import Bump, BumpPrior
@@ -50,7 +51,8 @@ class FitOptions:
     Parameters
     ----------
     background
-        ``"fixed"`` at the level that normalising defines (1 in Eq 7), or ``"free"``.
+        ``"fixed"`` at the level that normalising defines (1 in Eq 7), or ``"free"``. A map whose level is not known
+        can only have a free one.
     radius_mm
         Cells within this distance of the lump's centre are fitted.
     rotation
@@ -231,8 +233,35 @@ def fit_close(
     return fit_bump(tactile_map, centre_mm, options=near)
 
 
+def default_errors(tactile_map: TactileMap) -> tuple[str, str]:
+    """Background and noise of `FitOptions` where neither an option nor a size calibration decides.
+
+    As the paper printed it where the level is known. Without a level the background is free, under correlated errors,
+    which also take a sloping level: least squares alone then takes a slope for errors and its intervals grow several
+    times too wide. A grid of single values, such as a picture, says nothing of its errors; there what the field would
+    take up is the shape itself, so its errors are independent (docs/decisions/0071).
+    """
+    if tactile_map.background is not None:
+        return "fixed", "independent"
+    return "free", "field" if bool((tactile_map.count > 1).any()) else "independent"
+
+
+def check_background(tactile_map: TactileMap, options: FitOptions) -> None:
+    """Refuse to fix the background of a map whose level is not known: there is nothing to fix it at.
+
+    The map's median, which is the nearest guess, moves with the lump itself: nominal 90 % intervals of widths then
+    cover 4 to 29 % (docs/coverage.md).
+    """
+    if options.background == "fixed" and tactile_map.background is None:
+        raise UsageError(
+            f"the map's level far from a lump is not known (normalise {tactile_map.recipe.normalise}), so a background "
+            "cannot be fixed at it; give --background free"
+        )
+
+
 def _bump(tactile_map: TactileMap, options: FitOptions, *, rotated: bool) -> Bump:
-    level = None if options.background == "free" else typical_level(tactile_map)
+    check_background(tactile_map, options)
+    level = None if options.background == "free" else tactile_map.background
     return Bump(rotated=rotated, background=level, scale=value_scale(tactile_map))
 
 

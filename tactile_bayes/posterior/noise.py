@@ -50,7 +50,7 @@ def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
     (k,) array
         Scaled so that their mean is 1.
     """
-    reading = float(np.sum(cells.variance * cells.count) / np.sum(cells.count))
+    reading = cells.reading_variance
     if not reading > 0:
         return np.ones(len(cells))
     misfit = max(residual_variance - reading * float(np.mean(1.0 / cells.count)), 1e-3 * residual_variance)

@@ -54,16 +54,20 @@ def estimate_text(
     `quantities` where they are at hand.
     """
     if estimate.status == "no_estimate":
-        advice = [f"What would help: {estimate.advice}."] if estimate.advice else []
-        return "\n".join([f"No estimate: {estimate.reason}.", *advice, *_looked_at(estimate), RESEARCH_USE]) + "\n"
+        first = [f"No estimate: {estimate.reason}.", *_advice(estimate)]
+        return "\n".join([*first, *_looked_at(estimate), RESEARCH_USE]) + "\n"
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
     lines = [_table(quantities, probability), ""]
     if estimate.reason:
-        lines.append(f"No size: {estimate.reason}.")
+        lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
     lines += [*_findings(estimate), *_scene(estimate), *_warnings(estimate), *_left_out(estimate)]
     lines += [] if prior is None else [prior_line(prior, field=estimate.diagnostics.get("noise") == "field")]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _advice(estimate: Estimate) -> list[str]:
+    return [f"What would help: {estimate.advice}."] if estimate.advice else []
 
 
 def _table(quantities: Mapping[str, Quantity], probability: float) -> str:
