@@ -11,7 +11,8 @@ import sys
 import click
 
 from tactile_bayes import __version__
-from tactile_bayes.errors import EXIT_INTERRUPTED, TactileBayesError
+from tactile_bayes.commands.printing import ReaderGoneError, protect_streams
+from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, TactileBayesError
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -90,8 +91,11 @@ def main() -> None:
     atexit.register(gc.freeze)  # what is left goes with the process: nothing is gained by looking through it
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    protect_streams()
     try:
         status = cli.main(prog_name="tactile-bayes", standalone_mode=False)
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except click.Abort:
         click.echo("interrupted", err=True)
         sys.exit(EXIT_INTERRUPTED)
@@ -101,4 +105,17 @@ def main() -> None:
     except TactileBayesError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(error.exit_code)
+    except ReaderGoneError:
+        sys.exit(EXIT_READER_GONE)
+    except (OSError, MemoryError) as error:
+        click.echo(f"error: {_system_fault(error)}", err=True)
+        sys.exit(EXIT_FAULT)
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _system_fault(error: OSError | MemoryError) -> str:
+    """The one line for what the system refused and no command foresaw."""
+    if isinstance(error, MemoryError):
+        return "the memory did not suffice; give a smaller file, or a machine with more"
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"

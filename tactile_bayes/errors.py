@@ -1,27 +1,30 @@
 """Every error the program can explain in one line, each with the exit code it ends in.
 
-Exit codes: 0 done, 2 usage, 3 bad data, 4 device, 5 not converged, 6 no estimate, 130 interrupted.
+Exit codes: 0 done, 1 fault, 2 usage, 3 bad data, 4 device, 5 not converged, 6 no estimate, 130 interrupted, 141 the
+reader of the output has gone.
 """
 
 from __future__ import annotations
 
 EXIT_DONE = 0
+EXIT_FAULT = 1
 EXIT_USAGE = 2
 EXIT_BAD_DATA = 3
 EXIT_DEVICE = 4
 EXIT_NOT_CONVERGED = 5
 EXIT_NO_ESTIMATE = 6
 EXIT_INTERRUPTED = 130
+EXIT_READER_GONE = 141
 
 
 class TactileBayesError(Exception):
     """Base of all errors that end in one line on stderr and a documented exit code."""
 
-    exit_code = 1
+    exit_code = EXIT_FAULT
 
 
 class UsageError(TactileBayesError):
-    """The options contradict each other or the state of the disk (for example, the output exists)."""
+    """The options contradict each other or the state of the disk: the output exists, or cannot be written."""
 
     exit_code = EXIT_USAGE
 

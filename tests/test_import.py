@@ -259,7 +259,7 @@ def test_every_fault_of_a_grid_is_one_line(
         ("g.csv", b"1,2\n3\n", "row 2 has 1 fields"),
         ("g.csv", b"x,y\n1,2\n", "row 1, column 1 holds 'x'"),
         ("g.csv", b"", "is empty"),
-        ("g.csv", b"\xff\xfe\x00", "not a table"),
+        ("g.csv", b"\xff\xfe\x00", "not a table|not UTF-8"),
         ("g.tif", b"II*\x00junk", "is not an image|cannot be decoded"),
         ("g.pgm", b"P5 4 4 255\n12", "is not an image|cannot be decoded"),
         ("g.docx", b"", "suffix"),

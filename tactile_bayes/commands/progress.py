@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
+from tactile_bayes.commands.printing import raw_stream
+
 # Work that ends sooner draws nothing.
 QUIET_S = 2.0
 # Between two drawings; a bar is for eyes.
@@ -32,7 +34,7 @@ def progress_bar(
     clock
         Seconds from anywhere.
     """
-    out = sys.stderr if stream is None else stream
+    out = raw_stream(sys.stderr) if stream is None else stream
     if not out.isatty():
         yield lambda _done, _total: None
         return

@@ -19,8 +19,6 @@ Arrays (mm, kPa, s; read without pickle):
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -28,11 +26,9 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.npz import Arrays, load_npz
 from tactile_bayes.geometry import check_rigid
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
-
-Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
 # Letters are lengths that must agree between arrays.
 _SHAPES: Final[Mapping[str, tuple[str | int, ...]]] = {
@@ -70,59 +66,6 @@ def read_arrays(path: Path) -> Scan:
         raise error.at(path) from None
 
 
-def load_npz(path: Path, *, required: list[str], optional: tuple[str, ...]) -> Arrays:
-    """The named arrays of an .npz file, never unpickling anything.
-
-    Raises
-    ------
-    BadDataError
-        When the file is no .npz, is cut off, lacks a required array, or holds one that only pickle could read.
-    """
-    _check_zip(path)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in required if name not in archive.files]
-            if missing:
-                raise _missing(missing, found=archive.files)
-            return {name: _member(archive, name) for name in (*required, *optional) if name in archive.files}
-    except (zipfile.BadZipFile, EOFError, OSError) as error:
-        raise BadDataError(f"is not a whole .npz file ({error})", way_out="copy it again") from None
-
-
-def _check_zip(path: Path) -> None:
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(6)
-            whole = zipfile.is_zipfile(stream)
-    except OSError as error:
-        raise unreadable(path, error) from None
-    if whole:
-        return
-    if start.startswith(b"PK"):
-        raise BadDataError("is a zip archive that is cut off (no directory at its end)", way_out="copy it again")
-    if start == b"\x93NUMPY":
-        raise BadDataError("is a single .npy array", way_out="save all arrays in one file with numpy.savez_compressed")
-    raise BadDataError(f"is not an .npz file (it starts with {start!r})", way_out="save it with numpy.savez_compressed")
-
-
-def _missing(missing: list[str], *, found: list[str]) -> BadDataError:
-    has = ", ".join(sorted(found)[:12]) or "nothing"
-    grid = " (for a grid of values give --as map)" if "mean" in found else ""
-    return BadDataError(f"lacks {', '.join(missing)} (it has {has})", way_out=f"add the missing arrays{grid}")
-
-
-def _member(archive: Any, name: str) -> np.ndarray[Any, np.dtype[Any]]:
-    try:
-        array: np.ndarray[Any, np.dtype[Any]] = np.asarray(archive[name])
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise BadDataError(f"{name} is damaged ({error})", way_out="copy the file again") from None
-    except ValueError:
-        raise BadDataError(
-            f"{name} holds Python objects, which are never unpickled", way_out="save it as an array of plain numbers"
-        ) from None
-    return array
-
-
 def _check_shapes(arrays: Arrays) -> None:
     lengths: dict[str, tuple[int, str]] = {}  # letter -> length, and the array that set it
     for name, array in arrays.items():
@@ -154,12 +97,13 @@ def _check_numbers(arrays: Arrays) -> None:
     for name, array in arrays.items():
         if array.dtype.kind not in "iuf":
             raise BadDataError(f"{name} is {array.dtype}", way_out="give real numbers")
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            index = tuple(int(i) for i in bad[0])
+        finite = np.isfinite(array)
+        if not finite.all():
+            index = tuple(int(i) for i in np.unravel_index(int(finite.argmin()), finite.shape))
             where = f" (first at {index})" if index else ""
+            number = finite.size - int(finite.sum())
             raise BadDataError(
-                f"{name} holds {len(bad)} values that are not finite{where}", way_out="repair or leave them out"
+                f"{name} holds {number} values that are not finite{where}", way_out="repair or leave them out"
             )
 
 

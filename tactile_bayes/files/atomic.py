@@ -1,8 +1,9 @@
-"""Files that appear whole or not at all, readable by their owner only."""
+"""Files that appear whole or not at all, readable by their owner only; whatever hinders a write is one line."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
@@ -11,17 +12,48 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.reading import open_input, special_kind, unreadable
 
 _PART = ".part"
+_LONGEST_STEM = 100
+_WAYS_OUT = {
+    errno.ENOSPC: "make room, or choose another place",
+    errno.EDQUOT: "make room, or choose another place",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
 
 
 def refuse_existing(path: Path, *, force: bool) -> None:
-    """Stop before any work is done when the output exists and --force was not given."""
-    if path.exists() and not force:
-        raise UsageError(f"{path} exists; choose another name or give --force")
-    if not path.parent.is_dir():
-        raise UsageError(f"{path.parent} is not a directory; create it first")
+    """Stop before any work is done when `path` cannot become an output.
+
+    Raises
+    ------
+    UsageError
+        When `path` exists and --force was not given; when it is a directory, a FIFO, a socket or a device, whether or
+        not --force was given; when its directory does not exist or may not be written.
+    """
+    try:
+        kind = special_kind(path.stat().st_mode)
+    except FileNotFoundError:
+        kind = ""
+    except OSError as error:
+        raise unwritable(path, error) from None
+    else:
+        if kind:
+            raise UsageError(f"{path} is {kind}; give the name of a regular file")
+        if not force:
+            raise UsageError(f"{path} exists; choose another name or give --force")
+    folder = _target(path).parent
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a directory; create it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise UsageError(f"{folder} may not be written; choose another place")
+
+
+def _target(path: Path) -> Path:
+    """What is written: of a symbolic link, what it points to."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 @contextlib.contextmanager
@@ -30,26 +62,44 @@ def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
 
     The file is created with mode 0600, flushed to disk and renamed over the target, so that a kill at any
     moment leaves the old file or none. If the block raises, the temporary file goes; what a killed process of this
-    computer left beside the same target goes with the next write.
+    computer left beside the same target goes with the next write. A symbolic link stays, and what it points to is
+    replaced. Nothing but the writing belongs inside the block: each `OSError` in it is told as a failed write.
 
     Raises
     ------
     UsageError
-        When `path` exists and `force` is false, or its directory does not exist.
+        As `refuse_existing`, or when the system does not take the file (a full disk, a read-only one, a long name).
     """
     refuse_existing(path, force=force)
-    _sweep(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.{_host()}-{os.getpid()}-", suffix=_PART, dir=path.parent)
+    target = _target(path)
+    try:
+        _sweep(target)
+        with _temporary(target) as partial:
+            yield partial
+            partial.chmod(0o600)
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
+            _publish(partial, target, force=force)
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+@contextlib.contextmanager
+def _temporary(target: Path) -> Iterator[Path]:
+    handle, name = tempfile.mkstemp(prefix=f"{_stem(target)}-{os.getpid()}-", suffix=_PART, dir=target.parent)
     os.close(handle)
     partial = Path(name)
     try:
         yield partial
-        partial.chmod(0o600)
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        _publish(partial, path, force=force)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _stem(target: Path) -> str:
+    """What the temporary files of a target on this computer begin with; short, however long the target's name is."""
+    name = os.fsencode(target.name)
+    short = target.name if len(name) <= _LONGEST_STEM else f"{zlib.crc32(name):08x}"
+    return f".{short}.{_host()}"
 
 
 def _host() -> str:
@@ -59,13 +109,13 @@ def _host() -> str:
     return f"{zlib.crc32(socket.gethostname().encode()):08x}"
 
 
-def _sweep(path: Path) -> None:
-    """Remove what processes that are no more left of an earlier write of `path`."""
-    pattern = re.compile(rf"{re.escape(f'.{path.name}.{_host()}')}-(\d+)-[^.]*{re.escape(_PART)}")
-    for name in os.listdir(path.parent):  # noqa: PTH208 (names only: the directory may be large)
+def _sweep(target: Path) -> None:
+    """Remove what processes that are no more left of an earlier write of `target`."""
+    pattern = re.compile(rf"{re.escape(_stem(target))}-(\d+)-[^.]*{re.escape(_PART)}")
+    for name in os.listdir(target.parent):  # noqa: PTH208 (names only: the directory may be large)
         found = pattern.fullmatch(name)
         if found and not _alive(int(found[1])):
-            path.with_name(name).unlink(missing_ok=True)
+            target.with_name(name).unlink(missing_ok=True)
 
 
 def _alive(process: int) -> bool:
@@ -78,22 +128,34 @@ def _alive(process: int) -> bool:
     return True
 
 
-def _publish(partial: Path, path: Path, *, force: bool) -> None:
+def _publish(partial: Path, target: Path, *, force: bool) -> None:
     if force:
-        partial.replace(path)
+        partial.replace(target)
         return
     try:
-        path.hardlink_to(partial)  # fails, rather than overwrites, if somebody made the file meanwhile
+        target.hardlink_to(partial)  # fails, rather than overwrites, if somebody made the file meanwhile
     except FileExistsError:
-        raise UsageError(f"{path} exists; choose another name or give --force") from None
+        raise UsageError(f"{target} exists; choose another name or give --force") from None
     except OSError:  # a file system without hard links
-        partial.replace(path)
+        partial.replace(target)
 
 
 def write_text(path: Path, text: str, *, force: bool = False) -> None:
     """Write `text` as UTF-8, atomically."""
+    write_bytes(path, text.encode("utf-8"), force=force)
+
+
+def write_bytes(path: Path, data: bytes, *, force: bool = False) -> None:
+    """Write `data` atomically; see `atomic_path` for the errors."""
     with atomic_path(path, force=force) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(data)
+
+
+def unwritable(path: Path, error: OSError) -> UsageError:
+    """The one line for an output that the system does not take."""
+    shown = str(path) if len(str(path)) <= 120 else f"{str(path)[:117]}..."
+    way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
+    return UsageError(f"{shown} cannot be written ({error.strerror or error}); {way_out}")
 
 
 def sha256(path: Path) -> str:
@@ -104,13 +166,8 @@ def sha256(path: Path) -> str:
     BadDataError
         When the file cannot be read.
     """
-    try:
-        with path.open("rb") as file:
+    with open_input(path) as file:
+        try:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise unreadable(path, error) from None
-
-
-def unreadable(path: Path, error: OSError) -> BadDataError:
-    """The one line for a file that cannot be opened."""
-    return BadDataError(f"cannot be read ({error.strerror or error})", way_out="check the path", path=str(path))
+        except OSError as error:
+            raise unreadable(path, error) from None

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import zipfile
+import hashlib
+import io
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import atomic_path
+from tactile_bayes.files.atomic import write_bytes
+from tactile_bayes.files.npz import load_npz
 from tactile_bayes.posterior.chain_state import ChainState
 
-SCHEMA = "tactile-bayes/checkpoint/1"
+SCHEMA = "tactile-bayes/checkpoint/2"
 SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2}
 
 
@@ -40,25 +44,40 @@ class CheckpointFile:
         if not self.path.exists():
             return None
         try:
-            with np.load(self.path, allow_pickle=False) as data:
-                found = {name: data[name] for name in data.files}
-        except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError):
-            raise BadDataError(f"{self.path} is no checkpoint", way_out="name another file") from None
-        if str(found.get("schema", "")) != SCHEMA or any(
-            name not in found or found[name].ndim != n for name, n in SHAPES.items()
-        ):
-            raise BadDataError(f"{self.path} is no checkpoint of schema {SCHEMA}", way_out="name another file")
+            found = load_npz(self.path, required=["schema", "key", "sha256", *SHAPES], optional=())
+        except BadDataError as error:
+            raise BadDataError(
+                f"is no checkpoint: {error.what}", way_out="name another file", path=str(self.path)
+            ) from None
+        shaped = all(found[name].ndim == n for name, n in SHAPES.items())
+        if str(found["schema"]) != SCHEMA or not shaped:
+            raise BadDataError(f"is no checkpoint of schema {SCHEMA}", way_out="name another file", path=str(self.path))
+        if str(found["sha256"]) != _digest(found):
+            raise BadDataError("is damaged: its checksum does not match", way_out="remove it", path=str(self.path))
         if str(found["key"]) != self._bound(key):
             raise BadDataError(
-                f"{self.path} is a checkpoint of another map, calibration or setting",
+                "is a checkpoint of another map, calibration or setting",
                 way_out="give the same map and options (only --max-steps may differ), or name another file",
+                path=str(self.path),
             )
         return ChainState(**{name: found[name] for name in SHAPES})
 
     def save(self, key: str, state: ChainState) -> None:
         """Write the state, whole or not at all."""
-        with atomic_path(self.path, force=True) as partial, partial.open("wb") as file:
-            np.savez(file, schema=np.array(SCHEMA), key=np.array(self._bound(key)), **state.as_arrays())
+        arrays = {"schema": np.array(SCHEMA), "key": np.array(self._bound(key)), **state.as_arrays()}
+        buffer = io.BytesIO()
+        np.savez(buffer, sha256=np.array(_digest(arrays)), **arrays)
+        write_bytes(self.path, buffer.getvalue(), force=True)
 
     def _bound(self, key: str) -> str:
         return f"{key}:{self.context}"
+
+
+def _digest(arrays: Mapping[str, np.ndarray[Any, Any]]) -> str:
+    """Checksum of the state and of what it is bound to: a changed number must not come back as another."""
+    digest = hashlib.sha256()
+    for name in ("key", *SHAPES):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

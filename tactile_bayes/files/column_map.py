@@ -6,13 +6,12 @@ word that the table writes for a mass that was looked for and not found.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
 from tactile_bayes.files.tables import Table, parse_number, read_raw
 
@@ -79,14 +78,7 @@ def excision_columns(excision: Mapping[str, Any]) -> list[str]:
 
 def read_mapping(path: Path) -> dict[str, Any]:
     """The mapping, checked against ``column_map.schema.json``."""
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadDataError(
-            f"is not TOML ({error})", way_out="see the column mapping in the tutorial", path=str(path)
-        ) from None
+    document = load_toml(path, way_out="see the column mapping in the tutorial")
     check_document(document, "column_map.schema.json", path=path)
     return document
 

@@ -8,6 +8,7 @@ centres are placed about the centre of the grid, so x and y run from -(n-1)/2 to
 from __future__ import annotations
 
 import csv
+import io
 import warnings
 from pathlib import Path
 from typing import Any, Final
@@ -15,8 +16,8 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.arrays_npz import load_npz
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.npz import load_npz
+from tactile_bayes.files.reading import CELLS, TABLE_BYTES, check_limit, decoding, open_input, read_text
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 
@@ -176,13 +177,10 @@ def _check_level(values: FloatArray, *, normalise: str) -> None:
 
 
 def _table(path: Path) -> FloatArray:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if any(field.strip() for field in row)]
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise BadDataError(f"is not a table of text ({error})", way_out="give comma-separated numbers") from None
+    text = read_text(path, most=TABLE_BYTES, way_out="give comma-separated numbers")
+    with decoding("is not a table of text", way_out="give comma-separated numbers"):
+        lines = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=""))
+        rows = [row for row in lines if any(field.strip() for field in row)]
     if not rows:
         raise BadDataError("is empty", way_out="give comma-separated numbers")
     for number, row in enumerate(rows, start=1):
@@ -205,16 +203,18 @@ def _field(text: str, row: int, column: int) -> float:
 def _image(path: Path) -> FloatArray:
     from PIL import Image, UnidentifiedImageError
 
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # damage is told by the errors below
-            pages, mode = getattr(image, "n_frames", 1), image.mode
-            pixels = np.asarray(image)
-    except UnidentifiedImageError:
-        raise BadDataError("is not an image", way_out="give a grey TIFF, PGM or PNG") from None
-    except FileNotFoundError as error:
-        raise unreadable(path, error) from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise BadDataError(f"cannot be decoded ({error})", way_out="save it again as TIFF, PGM or PNG") from None
+    with (
+        open_input(path) as file,
+        decoding("cannot be decoded", way_out="save it again as TIFF, PGM or PNG"),
+        warnings.catch_warnings(action="ignore"),  # damage is told by the errors
+    ):
+        try:
+            image = Image.open(file, formats=("TIFF", "PPM", "PNG"))
+        except UnidentifiedImageError:
+            raise BadDataError("is not an image", way_out="give a grey TIFF, PGM or PNG") from None
+        check_limit(image.width * image.height, CELLS, what="it has {} pixels")
+        pages, mode = getattr(image, "n_frames", 1), image.mode
+        pixels = np.asarray(image)
     if pages > 1:
         raise BadDataError(f"holds {pages} images", way_out="give one")
     if pixels.ndim == 3 and (pixels[..., :3] == pixels[..., :1]).all():

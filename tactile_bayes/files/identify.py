@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.documents import load_json, parse_json
+from tactile_bayes.files.reading import open_input
 
 if TYPE_CHECKING:
-    from tactile_bayes.scan import Scan
+    from tactile_bayes.files.netcdf import Group
 
 _MCAP = b"\x89MCAP0\r\n"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -33,11 +32,8 @@ def describe(path: Path) -> dict[str, Any]:
     BadDataError
         When it is none of our files.
     """
-    try:
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with open_input(path) as file:
+        head = file.read(4096)
     if head.startswith(_MCAP):
         return _scan(path)
     if head.startswith(_HDF5):
@@ -48,71 +44,33 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _scan(path: Path) -> dict[str, Any]:
-    from tactile_bayes.files.scan_mcap import read_scan_report
+    from tactile_bayes.files.scan_summary import summarise_scan
 
-    file = read_scan_report(path)
-    scan = file.scan
-    time = scan.frames.time_s
-    return {
-        "schema": "tactile-bayes/scan/1",
-        "kind": "scan",
-        "complete": file.complete,
-        "lost": list(file.lost),
-        "cautions": file.cautions(),
-        "frames": len(scan.frames),
-        "taxels": list(scan.head.shape),
-        "poses": len(scan.poses),
-        "duration_s": float(time[-1] - time[0]) if len(time) else 0.0,
-        "frame_rate_hz": float((len(time) - 1) / (time[-1] - time[0]))
-        if len(time) > 1 and time[-1] > time[0]
-        else None,
-        **_recording(file.account, file.topics, scan),
-        "landmarks": scan.landmarks is not None,
-        "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
-        "session": dict(scan.session),
-        "provenance": dict(file.provenance),
-    }
-
-
-def _recording(account: Mapping[str, str], topics: Mapping[str, int], scan: Scan) -> dict[str, Any]:
-    """What is missing: by the gaps between the frames' times, and by the recorder's account if it came to give one."""
-    import numpy as np
-
-    steps = np.diff(scan.frames.time_s)
-    period = float(np.median(steps)) if len(steps) else 0.0
-    missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
-    names = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "overrun_bytes", "ended_by", "fault")
-    told = {name: account[name] for name in names if account.get(name)}
-    return {"frames_missing": missing, "notes": topics.get("/log", 0)} | ({"recording": told} if told else {})
+    return summarise_scan(path)
 
 
 def _netcdf(path: Path) -> dict[str, Any]:
-    import netCDF4
+    from tactile_bayes.files.netcdf import open_netcdf
 
-    try:
-        with netCDF4.Dataset(path) as dataset:
-            group = dataset.groups.get("posterior")
-            if group is not None and "schema" in group.ncattrs():
-                return _posterior(group)
-    except OSError:
-        raise BadDataError(
-            "cannot be read as netCDF", way_out="it may be cut short; make it again", path=str(path)
-        ) from None
+    with open_netcdf(path, way_out="it may be cut short; make it again") as file:
+        group = file.group("posterior")
+        if group is not None and "schema" in group.attributes():
+            return _posterior(group)
     return _map(path)
 
 
-def _posterior(group: Any) -> dict[str, Any]:
-    attributes = {name: group.getncattr(name) for name in group.ncattrs()}
+def _posterior(group: Group) -> dict[str, Any]:
+    attributes = group.attributes()
     return {
-        "schema": str(attributes["schema"]),
+        "schema": attributes["schema"],
         "kind": "posterior",
-        "method": str(attributes.get("method", "")),
-        "chains": len(group.dimensions["chain"]),
-        "draws": len(group.dimensions["draw"]),
-        "variables": sorted(name for name in group.variables if name not in ("chain", "draw")),
+        "method": attributes.get("method", ""),
+        "chains": group.dimension("chain"),
+        "draws": group.dimension("draw"),
+        "variables": [name for name in group.variables() if name not in ("chain", "draw")],
         "units": {"_mm": "mm", "_rad": "rad", "others": "as the map: 1 is the background"},
-        "diagnostics": json.loads(attributes.get("diagnostics", "{}")),
-        "provenance": json.loads(attributes.get("provenance", "{}")),
+        "diagnostics": parse_json(attributes.get("diagnostics", "{}")),
+        "provenance": parse_json(attributes.get("provenance", "{}")),
     }
 
 
@@ -142,12 +100,7 @@ def _map(path: Path) -> dict[str, Any]:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise BadDataError(
-            f"not a JSON file ({error})", way_out="give one of this program's files", path=str(path)
-        ) from None
+    document: Any = load_json(path, way_out="give one of this program's files")
     if isinstance(document, list) and document and isinstance(document[0], dict):
         return {"schema": document[0].get("schema"), "kind": "list", "length": len(document)}
     schema = document.get("schema") if isinstance(document, dict) else None

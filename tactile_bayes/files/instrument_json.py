@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import date
@@ -12,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable, write_text
+from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_parts import (
     calibration_document,
@@ -120,12 +120,7 @@ def read_landmarks(path: Path) -> Landmarks:
 
 
 def _read(path: Path, schema: str, *, way_out: str) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise BadDataError(f"is not a JSON file ({error})", way_out=way_out, path=str(path)) from None
+    document: Any = load_json(path, way_out=way_out)
     found = document.get("schema") if isinstance(document, dict) else None
     if found != schema:
         raise BadDataError(f"has schema {found!r}, not {schema!r}", way_out=way_out, path=str(path))

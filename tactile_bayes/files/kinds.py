@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.reading import open_input
 
 _BEGINNINGS = {
     b"\x89MCAP0\r\n": "a scan",
@@ -41,9 +42,9 @@ _LOOKED_AT = 4096
 def kind_of(path: Path) -> str:
     """What a file holds, in words, or an empty string when its first bytes do not tell."""
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             start = file.read(_LOOKED_AT)
-    except OSError:
+    except (BadDataError, OSError):
         return ""
     for beginning, kind in _BEGINNINGS.items():
         if start.startswith(beginning):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,15 +11,16 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import atomic_path, unreadable
-from tactile_bayes.files.kinds import not_a
+from tactile_bayes.files.atomic import write_bytes
+from tactile_bayes.files.documents import parse_json
+from tactile_bayes.files.netcdf import Group, Variable, netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.geometry import check_rigid
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.presets import NORMALISE
 
 SCHEMA = "tactile-bayes/map/1"
-MAX_CELLS = 2**24
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"
 
 # variable -> (type, dimensions, attributes); the long names are for the reader of the file.
@@ -56,32 +56,23 @@ def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, fo
     BadDataError
         When the map's axes do not step by its cell.
     """
-    import netCDF4
-
     _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
-    with (
-        atomic_path(path, force=force) as partial,
-        netCDF4.Dataset(str(partial), "w", clobber=True, format="NETCDF4") as file,
-    ):
-        file.setncatts(_attributes(tactile_map, provenance))
-        file.createDimension("y", len(tactile_map.y_mm))
-        file.createDimension("x", len(tactile_map.x_mm))
-        file.createDimension("row", 4)
-        file.createDimension("column", 4)
-        for name, (kind, dimensions, attributes) in _VARIABLES.items():
-            units = _units(tactile_map).get(name)
-            _write_variable(
-                file,
-                name,
-                kind,
-                dimensions,
-                getattr(tactile_map, name),
-                attributes | ({"units": units} if units else {}),
-            )
-        for name, meaning in _TRANSFORMS.items():
-            transform = getattr(tactile_map, name)
-            if transform is not None:
-                _write_variable(file, name, "f8", ("row", "column"), transform, {"long_name": meaning})
+    data = netcdf_bytes(_variables(tactile_map), attributes=_attributes(tactile_map, provenance))
+    write_bytes(path, data, force=force)
+
+
+def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
+    units = _units(tactile_map)
+    variables = {}
+    for name, (kind, dimensions, attributes) in _VARIABLES.items():
+        more = {"units": units[name]} if name in units else {}
+        variables[name] = Variable(np.asarray(getattr(tactile_map, name), kind), dimensions, attributes | more)
+    for name, meaning in _TRANSFORMS.items():
+        transform = getattr(tactile_map, name)
+        if transform is not None:
+            values = np.asarray(transform, dtype=np.float64)
+            variables[name] = Variable(values, ("row", "column"), {"long_name": meaning})
+    return variables
 
 
 def read_map(path: Path) -> TactileMap:
@@ -92,8 +83,9 @@ def read_map(path: Path) -> TactileMap:
     BadDataError
         Naming the file, the variable or attribute, its value and the way out.
     """
-    with _opened(path) as file:
+    with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
+        check_limit(_dimension(file, "y") * _dimension(file, "x"), CELLS, what="it has {} cells")
         arrays = {name: _read_variable(file, name) for name in _VARIABLES}
         transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
         _check_lattice({name: arrays[name] for name in ("x_mm", "y_mm")}, header["recipe"].cell_mm)
@@ -116,7 +108,7 @@ def read_map_header(path: Path) -> dict[str, Any]:
     dict with ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``provenance``, ``background``,
     ``frame_count`` and ``shape`` (ny, nx).
     """
-    with _opened(path) as file:
+    with open_netcdf(path, way_out=_WAY_OUT) as file:
         shape = tuple(_dimension(file, name) for name in ("y", "x"))
         return _header(file) | {"shape": shape}
 
@@ -152,70 +144,33 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _write_variable(
-    file: Any, name: str, kind: str, dimensions: tuple[str, ...], values: object, attributes: Mapping[str, str]
-) -> None:
-    packing = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}  # a check sum, so that damage shows
-    variable = file.createVariable(name, kind, dimensions, fill_value=False, **packing)
-    variable.setncatts(attributes)
-    variable[:] = values
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """The open file; every fault in it becomes a `BadDataError` that names `path`."""
-    import netCDF4
-
-    try:
-        with path.open("rb"):
-            pass
-        file = netCDF4.Dataset(str(path), "r")
-    except OSError as error:
-        if path.is_file() and (error.errno or 0) < 0:  # the library numbers its own faults below zero
-            raise not_a(
-                path, "a map or posterior (netCDF)", what="not a readable netCDF file", way_out=_WAY_OUT
-            ) from None
-        raise unreadable(path, error) from None
-    try:
-        file.set_auto_mask(False)
-        yield file
-    except BadDataError as error:
-        raise error.at(path) from None
-    except (RuntimeError, OSError) as error:
-        raise BadDataError(f"the file is damaged ({error})", way_out=_WAY_OUT, path=str(path)) from None
-    finally:
-        file.close()
-
-
-def _header(file: Any) -> dict[str, Any]:
-    if "posterior" in file.groups:
+def _header(file: Group) -> dict[str, Any]:
+    if file.group("posterior") is not None:
         raise BadDataError("is a posterior, not a map", way_out="give the map that it was estimated from")
-    schema = _attribute(file, "schema")
+    texts = file.attributes()
+    schema = _attribute(texts, "schema")
     if schema != SCHEMA:
         raise BadDataError(f"schema is {schema!r}, not {SCHEMA!r}", way_out=_WAY_OUT)
     return {
         "schema": schema,
-        "recipe": _recipe(_decoded(file, "recipe", dict)),
-        "background": _number(_decoded(file, "background", (float, int, type(None))), name="background"),
-        "frame_count": _decoded(file, "frame_count", int),
-        "quality": _quality(_decoded(file, "quality", dict)),
-        "masked_taxels": [str(line) for line in _decoded(file, "masked_taxels", list)],
-        "provenance": _decoded(file, "provenance", dict),
+        "recipe": _recipe(_decoded(texts, "recipe", dict)),
+        "background": _number(_decoded(texts, "background", (float, int, type(None))), name="background"),
+        "frame_count": _decoded(texts, "frame_count", int),
+        "quality": _quality(_decoded(texts, "quality", dict)),
+        "masked_taxels": [str(line) for line in _decoded(texts, "masked_taxels", list)],
+        "provenance": _decoded(texts, "provenance", dict),
     }
 
 
-def _attribute(file: Any, name: str) -> str:
-    if name not in file.ncattrs():
+def _attribute(texts: Mapping[str, str], name: str) -> str:
+    if name not in texts:
         raise BadDataError(f"attribute {name} is missing", way_out=_WAY_OUT)
-    return str(file.getncattr(name))
+    return texts[name]
 
 
-def _decoded(file: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    text = _attribute(file, name)
-    try:
-        value = json.loads(text)
-    except json.JSONDecodeError:
-        value = ...
+def _decoded(texts: Mapping[str, str], name: str, kind: type | tuple[type, ...]) -> Any:
+    text = _attribute(texts, name)
+    value = parse_json(text, name=f"attribute {name}", way_out=_WAY_OUT)
     if not isinstance(value, kind) or isinstance(value, bool):
         raise BadDataError(f"attribute {name} holds {_short(text)}", way_out=_WAY_OUT)
     return value
@@ -267,38 +222,27 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _dimension(file: Any, name: str) -> int:
-    if name not in file.dimensions:
+def _dimension(file: Group, name: str) -> int:
+    length = file.dimension(name)
+    if length is None:
         raise BadDataError(f"dimension {name} is missing", way_out=_WAY_OUT)
-    return len(file.dimensions[name])
+    return length
 
 
-def _read_variable(file: Any, name: str) -> Any:
-    """One array, after its type, dimensions and size were checked."""
+def _read_variable(file: Group, name: str) -> Any:
     kind, dimensions, _ = _VARIABLES[name]
-    return _checked(file, name, kind, dimensions)
-
-
-def _checked(file: Any, name: str, kind: str, dimensions: tuple[str, ...]) -> Any:
-    if name not in file.variables:
+    values = file.array(name, kind=kind, dimensions=dimensions)
+    if values is None:
         raise BadDataError(f"variable {name} is missing", way_out=_WAY_OUT)
-    variable = file.variables[name]
-    if variable.dimensions != dimensions:
-        raise BadDataError(f"variable {name} has dimensions {variable.dimensions}, not {dimensions}", way_out=_WAY_OUT)
-    if variable.dtype != np.dtype(kind):
-        raise BadDataError(f"variable {name} is {variable.dtype}, not {np.dtype(kind)}", way_out=_WAY_OUT)
-    size = int(np.prod([len(file.dimensions[dimension]) for dimension in dimensions], dtype=object))
-    if size > MAX_CELLS:
-        raise BadDataError(f"variable {name} has {size} cells, over {MAX_CELLS}", way_out=_WAY_OUT)
-    return np.asarray(variable[:], dtype=np.dtype(kind).newbyteorder("="))
+    return values
 
 
-def _read_transform(file: Any, name: str) -> Any:
-    if name not in file.variables:
+def _read_transform(file: Group, name: str) -> Any:
+    transform = file.array(name, kind="f8", dimensions=("row", "column"))
+    if transform is None:
         return None
-    if len(file.dimensions.get("row", ())) != 4 or len(file.dimensions.get("column", ())) != 4:
+    if transform.shape != (4, 4):
         raise BadDataError(f"variable {name} is not 4 by 4", way_out=_WAY_OUT)
-    transform = _checked(file, name, "f8", ("row", "column"))
     check_rigid(transform, name=name)
     return transform
 

@@ -4,25 +4,84 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
+from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Metadata, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
 from tactile_bayes.files.kinds import not_a
+from tactile_bayes.files.mcap_chunks import Unpacker, damage
+from tactile_bayes.files.reading import open_input, unreadable
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _RECORD: Final = struct.Struct("<BQ")  # opcode, length
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHECKSUM: Final = struct.Struct("<I")
+# a schema or channel is an object each: it counts so many bytes, however short it is written
+_DESCRIPTION_BYTES: Final = 1000
+_KINDS: Final = {
+    Opcode.CHUNK: Chunk,
+    Opcode.METADATA: Metadata,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+}
+
+
+class Messages:
+    """Times and bodies of messages in file order, without an object for each.
+
+    Parameters
+    ----------
+    keep
+        Whether bodies are kept, or times only.
+    """
+
+    def __init__(self, *, keep: bool = True) -> None:
+        self._times = array("Q")
+        self._ends = array("Q")
+        self._data = bytearray()
+        self.keep = keep
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def add(self, time_ns: int, body: memoryview) -> None:
+        """One more message."""
+        self._times.append(time_ns)
+        if self.keep:
+            self._data += body
+            self._ends.append(len(self._data))
+
+    def extend(self, other: Messages) -> None:
+        """All messages of another channel."""
+        start = len(self._data)
+        self._times += other._times
+        self._data += other._data
+        self._ends.extend(start + end for end in other._ends)
+
+    @property
+    def times_ns(self) -> NDArray[np.uint64]:
+        """Publish times in ns, as the file has them."""
+        return np.array(self._times, dtype=np.uint64)
+
+    def bodies(self) -> Iterator[bytes]:
+        """The messages' bytes, one by one."""
+        start = 0
+        with memoryview(self._data) as data:
+            for end in self._ends:
+                yield bytes(data[start:end])
+                start = end
 
 
 @dataclass(slots=True)
@@ -31,8 +90,10 @@ class McapRecords:
 
     Parameters
     ----------
-    bodies
-        By channel id, (publish time in ns, message bytes) in file order.
+    keep
+        Topics whose messages are kept; of others only the times are. None keeps all.
+    by_channel
+        Messages by channel id.
     chunks, last_ns
         Chunks met, and the host time at which the last intact one ends.
     all_data
@@ -45,11 +106,12 @@ class McapRecords:
         One line a loss.
     """
 
+    keep: Collection[str] | None = None
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     schemas: dict[int, str] = field(default_factory=dict)
     channels: dict[int, Any] = field(default_factory=dict)
-    bodies: dict[int, list[tuple[int, bytes]]] = field(default_factory=dict)
+    by_channel: dict[int, Messages] = field(default_factory=dict)
     chunks: int = 0
     last_ns: int = 0
     all_data: bool = False
@@ -57,49 +119,69 @@ class McapRecords:
     damaged: bool = False
     lost: list[str] = field(default_factory=list)
 
-    def messages(self, topic: str, *, schema: str, name: str | None = None) -> list[tuple[int, bytes]]:
-        """Messages of a topic (and of the channel with that `name` in its metadata) as (publish time, bytes).
+    def messages(self, topic: str, *, schema: str, name: str | None = None) -> Messages:
+        """Messages of a topic (and of the channels with that `name` in their metadata).
 
         Raises
         ------
         BadDataError
             When a channel of the topic holds another type.
         """
-        found = []
+        found = Messages()
         for number, channel in self.channels.items():
             if channel.topic != topic or (name is not None and channel.metadata.get("name") != name):
                 continue
             kind = self.schemas.get(channel.schema_id, "no schema")
             if kind != schema:
                 raise BadDataError(f"{topic} holds {kind}", way_out=f"it must hold {schema}")
-            found += self.bodies.get(number, [])
+            held = self.by_channel.get(number)
+            if held is not None and not len(found):
+                found = held
+            elif held is not None:
+                found.extend(held)
         return found
 
     def topic_counts(self) -> dict[str, int]:
         """Messages by topic."""
         counts: Counter[str] = Counter()
         for number, channel in self.channels.items():
-            counts[channel.topic] += len(self.bodies.get(number, []))
+            counts[channel.topic] += len(self.by_channel.get(number, ()))
         return dict(sorted(counts.items()))
 
+    def channel_messages(self, number: int) -> Messages:
+        """Where the messages of a channel go; bodies of unknown channels are kept until it is known what they are."""
+        found = self.by_channel.get(number)
+        if found is None:
+            channel = self.channels.get(number)
+            keep = self.keep is None or channel is None or channel.topic in self.keep
+            found = self.by_channel[number] = Messages(keep=keep)
+        return found
 
-def read_records(path: Path) -> McapRecords:
+
+def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapRecords:
     """Read a file from front to back, with or without its index.
+
+    Parameters
+    ----------
+    keep
+        Topics whose messages are kept; of others only the times are. None keeps all.
 
     Raises
     ------
     BadDataError
-        When the file cannot be opened or is no MCAP file.
+        When the file cannot be opened, is no MCAP file or unpacks to more than its limit.
     """
-    records = McapRecords()
-    try:
-        with path.open("rb") as stream:
+    records = McapRecords(keep=keep)
+    with open_input(path) as stream:
+        try:
             _check_magic(stream, path)
             size = stream.seek(0, io.SEEK_END)
-            stream.seek(0)
+            stream.seek(len(_MAGIC))
             _collect(records, stream, size=size)
-    except OSError as error:
-        raise unreadable(path, error) from None
+        except OSError as error:
+            raise unreadable(path, error) from None
+        except BadDataError as error:
+            raise error.at(path) from None
     return records
 
 
@@ -116,50 +198,74 @@ def _check_magic(stream: IO[bytes], path: Path) -> None:
 
 def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
     """Fill `records` up to the end of the file or the first record that cannot be read."""
-    iterator = _records_of(stream, size=size, from_start=True)
+    unpacker = Unpacker(size)
+    checksum = zlib.crc32(_MAGIC)
     while True:
-        try:
-            record = next(iterator, None)
-        except CRCValidationError:
-            # The checksum over everything. A damaged chunk was told already; otherwise it is a description.
-            if not records.damaged:
-                records.lost.append("a record outside the chunks changed (the checksum of the whole does not match)")
-            records.damaged = records.all_data = True
-            iterator = _records_of(stream, size=size, from_start=False)
-        except (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError) as error:
-            _tell_end(records, stream.tell(), size=size, error=error)
+        start = stream.tell()
+        head = stream.read(_RECORD.size)
+        opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (1, 0)
+        if opcode == 0 or length > size:
+            _tell_damage(records, start, size=size)
             return
-        else:
-            if record is None:
-                records.finished = True  # the reader stops only after a footer and the closing magic
-                return
-            _take(records, record)
+        body = stream.read(length)
+        if len(head) < _RECORD.size or len(body) < length:
+            _tell_cut(records, size=size)
+            return
+        if opcode == Opcode.DATA_END:
+            _end_data(records, body, checksum)
+        if opcode == Opcode.FOOTER:
+            records.finished = stream.read(len(_MAGIC)) == _MAGIC
+            if not records.finished:
+                _tell_cut(records, size=size)
+            return
+        if not records.all_data:
+            checksum = zlib.crc32(body, zlib.crc32(head, checksum))
+        if opcode in _KINDS:
+            _take(records, opcode, body, start=start, unpacker=unpacker)
 
 
-def _records_of(stream: IO[bytes], *, size: int, from_start: bool) -> Iterator[Any]:
-    """Records from here on; without the opening magic, the whole has no checksum to fail again."""
-    reader = StreamReader(
-        stream, skip_magic=not from_start, emit_chunks=True, validate_crcs=from_start, record_size_limit=size
-    )
-    return iter(reader.records)
+def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
+    """Compare the checksum over everything, where there is one."""
+    declared = _CHECKSUM.unpack_from(body)[0] if len(body) >= _CHECKSUM.size else 0
+    if declared not in (0, checksum):
+        if not records.damaged:  # a damaged chunk was told already; otherwise it is a description
+            records.lost.append("a record outside the chunks changed (the checksum of the whole does not match)")
+        records.damaged = True
+    records.all_data = True
 
 
-def _tell_end(records: McapRecords, position: int, *, size: int, error: Exception) -> None:
+def _tell_cut(records: McapRecords, *, size: int) -> None:
     if records.all_data:
         records.lost.append("the end of the file is missing; all messages are there")
-    elif position >= size:
-        records.lost.append(f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost")
     else:
+        records.lost.append(f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost")
+
+
+def _tell_damage(records: McapRecords, position: int, *, size: int) -> None:
+    if records.all_data:
+        records.lost.append("the end of the file is damaged; all messages are there")
+        return
+    records.damaged = True
+    records.lost.append(f"unreadable from byte {position} of {size} on (no record begins there)")
+
+
+def _take(records: McapRecords, opcode: int, body: bytes, *, start: int, unpacker: Unpacker) -> None:
+    """Keep one record from outside the chunks, or say that it makes no sense."""
+    try:
+        record = _KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(body)))
+    except Exception as error:  # struct.error, EndOfFile, UnicodeDecodeError...
         records.damaged = True
-        why = str(error) or type(error).__name__
-        records.lost.append(f"unreadable from byte {position} of {size} on ({why})")
+        records.lost.append(f"the record at byte {start} makes no sense ({damage(error)})")
+        return
+    if isinstance(record, Chunk):
+        records.chunks += 1
+        _take_chunk(records, record, unpacker)
+    else:
+        _describe(records, record)
 
 
-def _take(records: McapRecords, record: Any) -> None:
+def _describe(records: McapRecords, record: Any) -> None:
     match record:
-        case Chunk():
-            records.chunks += 1
-            _take_chunk(records, record)
         case Metadata():
             records.metadata[record.name] = dict(record.metadata)
         case Attachment():
@@ -168,30 +274,44 @@ def _take(records: McapRecords, record: Any) -> None:
             records.schemas[record.id] = record.name
         case Channel():
             records.channels[record.id] = record
-        case DataEnd():
-            records.all_data = True
 
 
-def _take_chunk(records: McapRecords, chunk: Any) -> None:
-    """Keep a chunk's messages, or none of them when its checksum fails."""
+def _take_chunk(records: McapRecords, chunk: Any, unpacker: Unpacker) -> None:
+    """Keep a chunk's messages, or none of them when it is damaged."""
     try:
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        data = stream.read(length)
-    except Exception as error:  # each decompressor has an error class of its own
+        data = unpacker.unpack(chunk)
+        descriptions, spans = _split(data, unpacker)
+    except BadDataError:  # over a limit
+        raise
+    except Exception as error:  # each decompressor has an error class of its own, and so have records
         start, end = chunk.message_start_time / 1e9, chunk.message_end_time / 1e9
-        why = "its checksum does not match" if isinstance(error, CRCValidationError) else "it cannot be decompressed"
-        records.lost.append(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {why}")
+        records.lost.append(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {damage(error)}")
         records.damaged = True
         return
     records.last_ns = max(records.last_ns, chunk.message_end_time)
+    for record in descriptions:
+        _describe(records, record)
+    with memoryview(data) as view:
+        for channel, time_ns, start, end in spans:
+            records.channel_messages(channel).add(time_ns, view[start:end])
+
+
+def _split(data: bytes, unpacker: Unpacker) -> tuple[list[Any], list[tuple[int, int, int, int]]]:
+    """The schemas and channels of a chunk, and where its messages are: channel, publish time, start, end."""
+    descriptions, spans = [], []
     offset = 0
     while offset < len(data):
         opcode, size = _RECORD.unpack_from(data, offset)
         start = offset + _RECORD.size
         offset = start + size
+        if offset > len(data):
+            raise ValueError("a record ends beyond it")
         if opcode == Opcode.MESSAGE:
+            if size < _MESSAGE.size:
+                raise ValueError("a message is shorter than its head")
             channel, _, _, publish_ns = _MESSAGE.unpack_from(data, start)
-            records.bodies.setdefault(channel, []).append((publish_ns, data[start + _MESSAGE.size : offset]))
+            spans.append((channel, publish_ns, start + _MESSAGE.size, offset))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            kind = Schema if opcode == Opcode.SCHEMA else Channel
-            _take(records, kind.read(ReadDataStream(io.BytesIO(data[start:offset]))))
+            unpacker.count(_DESCRIPTION_BYTES)
+            descriptions.append(_KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(data[start:offset]))))
+    return descriptions, spans

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from tactile_bayes.files.atomic import atomic_path
+from tactile_bayes.files.atomic import write_bytes
+from tactile_bayes.files.netcdf import Variable, netcdf_bytes
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.size import SizePosterior
@@ -27,8 +30,6 @@ def write_posterior(path: Path, estimate: Estimate, *, provenance: Provenance, f
     """
     if estimate.map_posterior is None or estimate.draws is None:
         raise ValueError("no estimate, so no posterior to write")
-    from tactile_bayes.posterior.inference_data import to_inference_data
-
     posterior = estimate.map_posterior
     variables = {
         "amplitude": posterior.amplitude,
@@ -54,15 +55,11 @@ def write_posterior(path: Path, estimate: Estimate, *, provenance: Provenance, f
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in estimate.diagnostics.items() if _plain(v)}),
     }
-    data = to_inference_data({k: np.asarray(v) for k, v in variables.items()}, attributes=attributes)
-    with atomic_path(path, force=force) as partial:
-        data.to_netcdf(str(partial), engine="h5netcdf")
+    write_bytes(path, _posterior_bytes(variables, attributes), force=force)
 
 
 def write_pooled(path: Path, size: SizePosterior, *, provenance: Provenance, force: bool = False) -> None:
     """Write the draws of a mass's size, pooled over its maps, atomically."""
-    from tactile_bayes.posterior.inference_data import to_inference_data
-
     names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
     variables = {name: np.atleast_2d(getattr(size, name)) for name in names}
     attributes = {
@@ -72,9 +69,17 @@ def write_pooled(path: Path, size: SizePosterior, *, provenance: Provenance, for
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in size.figures.items() if _plain(v)}),
     }
-    data = to_inference_data(variables, attributes=attributes)
-    with atomic_path(path, force=force) as partial:
-        data.to_netcdf(str(partial), engine="h5netcdf")
+    write_bytes(path, _posterior_bytes(variables, attributes), force=force)
+
+
+def _posterior_bytes(variables: Mapping[str, Any], attributes: Mapping[str, str]) -> bytes:
+    """A file with one group of (chain, draw) variables, as InferenceData has it."""
+    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in variables.items()}
+    axes = ("chain", "draw")
+    lengths = next(iter(arrays.values())).shape
+    held = {name: Variable(np.arange(n), (name,), {}) for name, n in zip(axes, lengths, strict=True)}
+    held |= {name: Variable(values, axes, {}) for name, values in arrays.items()}
+    return netcdf_bytes(held, attributes=attributes, group="posterior")
 
 
 def _plain(value: object) -> bool:

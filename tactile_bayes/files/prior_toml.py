@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
 from tactile_bayes.posterior.bump import BumpPrior
 
@@ -23,21 +22,10 @@ def read_prior(path: Path | None) -> BumpPrior:
     """
     if path is None:
         return BumpPrior()
-    import tomllib
-
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadDataError(f"is not TOML ({error})", way_out=f"see {SCHEMA}", path=str(path)) from None
+    document = load_toml(path, way_out=f"see {SCHEMA}")
     unknown = sorted(set(document) - set(BumpPrior().as_dict()))
     if unknown:
         known = ", ".join(BumpPrior().as_dict())
         raise BadDataError(f"unknown key {unknown[0]}", way_out=f"the keys are {known}", path=str(path))
     check_document(document, SCHEMA, path=path)
-    values = {name: float(value) for name, value in document.items()}
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise BadDataError(f"{name} is {value}", way_out="give a finite number", path=str(path))
-    return BumpPrior(**values)
+    return BumpPrior(**{name: float(value) for name, value in document.items()})

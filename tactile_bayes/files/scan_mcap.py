@@ -21,7 +21,7 @@ Times
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -36,7 +36,8 @@ from numpy.typing import NDArray
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
-from tactile_bayes.files.mcap_records import McapRecords, read_records
+from tactile_bayes.files.documents import parse_json
+from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_parts import (
     ScanFile,
@@ -62,6 +63,7 @@ from tactile_bayes.scan import (
 SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
 CHUNK_BYTES: Final = 64 * 1024
 LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
+TOPICS: Final = ("/pressure", "/pose", "/landmark")
 _SESSION_SCHEMA: Final = "scan_session.schema.json"
 _NS: Final = 1_000_000_000
 _LATEST_NS: Final = 2**63 - 1
@@ -289,7 +291,7 @@ def read_scan_report(path: Path) -> ScanFile:
     BadDataError
         When the file cannot be read, is no scan, or was cut off before its first complete chunk.
     """
-    records = _scan_records(path)
+    records = scan_records(path, keep=TOPICS)
     try:
         return _assemble(records, path=path)
     except BadDataError as error:
@@ -298,13 +300,19 @@ def read_scan_report(path: Path) -> ScanFile:
 
 def read_truth(path: Path) -> dict[str, Any] | None:
     """What a simulated scan was made from; None for a scan that holds no truth."""
-    truth = _scan_records(path).metadata.get("truth")
-    return None if truth is None else _json_object(truth.get("json", ""), name="truth")
+    truth = scan_records(path, keep=()).metadata.get("truth")
+    return None if truth is None else json_object(truth.get("json", ""), name="truth")
 
 
-def _scan_records(path: Path) -> McapRecords:
-    """All records, after the file was found to be a scan of a version this program knows."""
-    records = read_records(path)
+def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
+    """All records, after the file was found to be a scan of a version this program knows.
+
+    Parameters
+    ----------
+    keep
+        Topics whose messages are kept; of others only the times are.
+    """
+    records = read_records(path, keep=keep)
     schema = records.metadata.get("tactile-bayes", {}).get("schema")
     if schema is None:
         what = "is cut off in its header" if records.lost else "is an MCAP file, but not a scan of this program"
@@ -319,15 +327,15 @@ def _scan_records(path: Path) -> McapRecords:
 
 
 def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
-    head = head_from_document(_attachment(records, "head.json"))
-    calibration = calibration_from_document(_attachment(records, "element_calibration.json"))
+    head = head_from_document(json_attachment(records, "head.json"))
+    calibration = calibration_from_document(json_attachment(records, "element_calibration.json"))
     session = records.metadata.get("session", {})
     check_document(session, _SESSION_SCHEMA, path=path)
     frames = _frames(records, head)
     if not len(frames) and not records.finished:
         raise BadDataError("was cut off before its first complete chunk", way_out="nothing can be kept; scan again")
     scan = Scan(frames, _poses(records), head, calibration, landmarks=_landmarks(records), session=session)
-    provenance = _json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
+    provenance = json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
     return ScanFile(
         scan=scan,
         complete=records.finished and not records.lost,
@@ -340,56 +348,66 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
     )
 
 
-def _attachment(records: McapRecords, name: str) -> dict[str, Any]:
+def json_attachment(records: McapRecords, name: str) -> dict[str, Any]:
+    """An attached JSON object."""
     if name not in records.attachments:
         raise BadDataError(f"holds no {name}", way_out="the recording was cut off in its header; scan again")
-    return _json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
+    return json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
 
 
-def _json_object(text: str, *, name: str) -> dict[str, Any]:
-    try:
-        document = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise BadDataError(f"{name} is not JSON ({error})", way_out="copy the file again") from None
+def json_object(text: str, *, name: str) -> dict[str, Any]:
+    """The JSON object that a part of the file is."""
+    document = parse_json(text, name=name)
     if not isinstance(document, dict):
         raise BadDataError(f"{name} is a {type(document).__name__}", way_out="it must be a JSON object")
     return document
 
 
-def _times(messages: list[tuple[int, bytes]], *, topic: str) -> FloatArray:
-    latest = max((time for time, _ in messages), default=0)
+def message_times(messages: Messages, *, topic: str) -> FloatArray:
+    """The messages' times in s.
+
+    Raises
+    ------
+    BadDataError
+        When one lies beyond what 63 bits of nanoseconds hold.
+    """
+    times = messages.times_ns
+    latest = int(times.max()) if len(times) else 0
     if latest > _LATEST_NS:
         raise BadDataError(
             f"{topic} holds a time of {latest} ns", way_out=f"times must be {_LATEST_NS} ns or less; record it again"
         )
-    return s_from_ns(np.array([time for time, _ in messages], dtype=np.int64))
+    return s_from_ns(times.astype(np.int64))
 
 
 def _frames(records: McapRecords, head: HeadGeometry) -> PressureFrames:
     messages = records.messages("/pressure", schema="foxglove.Grid")
     rows, columns = head.shape
-    data = [_decode(Grid, body).data for _, body in messages]
-    for i, body in enumerate(data):
-        if len(body) != 2 * rows * columns:
+    counts: NDArray[np.uint16] = np.empty((len(messages), rows, columns), dtype=np.uint16)
+    for i, body in enumerate(messages.bodies()):
+        data = _decode(Grid, body).data
+        if len(data) != 2 * rows * columns:
             raise BadDataError(
-                f"/pressure message {i} holds {len(body)} bytes", way_out=f"{rows} x {columns} uint16 counts are needed"
+                f"/pressure message {i} holds {len(data)} bytes", way_out=f"{rows} x {columns} uint16 counts are needed"
             )
-    counts: NDArray[np.uint16] = np.frombuffer(b"".join(data), dtype="<u2").reshape(-1, columns, rows)
-    return PressureFrames(
-        _times(messages, topic="/pressure"), np.ascontiguousarray(counts.transpose(0, 2, 1), dtype=np.uint16)
-    )
+        counts[i] = np.frombuffer(data, dtype="<u2").reshape(columns, rows).T
+    return PressureFrames(message_times(messages, topic="/pressure"), counts)
 
 
 def _poses(records: McapRecords) -> TrackerPoses:
     messages = records.messages("/pose", schema="foxglove.PoseInFrame")
-    values = np.array([_pose_values(body) for _, body in messages], dtype=np.float64).reshape(-1, 7)
-    return TrackerPoses(_times(messages, topic="/pose"), values[:, :3], values[:, 3:])
+    values = _pose_table(messages)
+    return TrackerPoses(message_times(messages, topic="/pose"), values[:, :3], values[:, 3:])
 
 
-def _pose_values(body: bytes) -> tuple[float, ...]:
-    pose = _decode(PoseInFrame, body).pose
-    place, turn = pose.position, pose.orientation
-    return (place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z)
+def _pose_table(messages: Messages) -> FloatArray:
+    """A row of position and quaternion, scalar first, for each pose."""
+    table: FloatArray = np.empty((len(messages), 7))
+    for i, body in enumerate(messages.bodies()):
+        pose = _decode(PoseInFrame, body).pose
+        place, turn = pose.position, pose.orientation
+        table[i] = place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z
+    return table
 
 
 def _landmarks(records: McapRecords) -> Landmarks | None:
@@ -397,9 +415,9 @@ def _landmarks(records: McapRecords) -> Landmarks | None:
     points, apart = {}, []
     for name in LANDMARK_NAMES:
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
-        if not touches:
+        if not len(touches):
             return None
-        places = np.array([_pose_values(touch[1])[:3] for touch in touches])
+        places = _pose_table(touches)[:, :3]
         points[f"{name}_mm"] = places[-1]
         apart += np.linalg.norm(places[:-1] - places[-1], axis=1).tolist()
     return Landmarks(**points, spread_mm=max(apart) if apart else None)

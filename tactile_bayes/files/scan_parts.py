@@ -53,8 +53,12 @@ class ScanFile:
 
     def cautions(self) -> list[str]:
         """What speaks against using the scan, one line each: by its times, and by the recorder's account."""
-        found = scan_cautions(self.scan)
-        return [*found, *(line for line in self.account.get("cautions", "").splitlines() if line not in found)]
+        return all_cautions(scan_cautions(self.scan), self.account)
+
+
+def all_cautions(found: list[str], account: Mapping[str, str]) -> list[str]:
+    """The cautions found in a scan, and those that only its recorder could have."""
+    return [*found, *(line for line in account.get("cautions", "").splitlines() if line not in found)]
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:

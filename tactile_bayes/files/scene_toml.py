@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import difflib
-import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.documents import parse_toml
+from tactile_bayes.files.reading import TOML_BYTES, read_text
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.forward.scene import (
     Background,
@@ -47,12 +46,7 @@ def read_scene(path: Path) -> Scene:
     BadDataError
         Naming the file, the key, its value and what is allowed.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except UnicodeDecodeError as error:
-        raise BadDataError(f"is not text ({error})", way_out="give a scene as TOML", path=str(path)) from None
+    text = read_text(path, most=TOML_BYTES, way_out="give a scene as TOML")
     try:
         return scene_from_toml(text)
     except BadDataError as error:
@@ -61,25 +55,9 @@ def read_scene(path: Path) -> Scene:
 
 def scene_from_toml(text: str) -> Scene:
     """The scene a TOML text describes; see `read_scene` for the errors."""
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BadDataError(f"is not TOML ({error})", way_out="see the scene in the documentation") from None
-    _check_finite(document, where="")
+    document = parse_toml(text, way_out="see the scene in the documentation")
     _check(document)
     return _scene(document)
-
-
-def _check_finite(value: object, *, where: str) -> None:
-    """TOML can write nan and inf, which pass every range."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            _check_finite(item, where=f"{where}.{key}" if where else key)
-    elif isinstance(value, list):
-        for i, item in enumerate(value):
-            _check_finite(item, where=f"{where}[{i}]")
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise BadDataError(f"{where} is {value}", way_out="give a finite number")
 
 
 def _check(document: dict[str, Any]) -> None:

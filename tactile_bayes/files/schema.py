@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
-from tactile_bayes.files.kinds import not_a, schema_kind
+from tactile_bayes.files.documents import load_json
+from tactile_bayes.files.kinds import schema_kind
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -67,24 +67,6 @@ def read_json(path: Path, schema_name: str) -> dict[str, Any]:
     document = load_json(path)
     check_document(document, schema_name, path=path)
     assert isinstance(document, dict)
-    return document
-
-
-def load_json(path: Path) -> object:
-    """Read a JSON file, whatever it holds.
-
-    Raises
-    ------
-    BadDataError
-        When it cannot be read or is not JSON.
-    """
-    try:
-        document: object = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        what = f"not a JSON file ({error})"
-        raise not_a(path, "a JSON file", what=what, way_out="give a file this program wrote") from None
     return document
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files import size_quadratic_json as quadratic
 from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import check_document, dump_json, load_json
+from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.files.shipped import is_shipped
 from tactile_bayes.files.size_parts_json import number
 from tactile_bayes.posterior.log_quadratic import LogQuadratic

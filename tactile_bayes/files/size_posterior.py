@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.documents import load_json
+from tactile_bayes.files.netcdf import open_netcdf
+from tactile_bayes.files.reading import open_input
 from tactile_bayes.files.schema import check_document
 
 PROBABILITY = 0.95
@@ -35,11 +36,8 @@ def read_stated_size(path: Path) -> StatedSize:
     BadDataError
         When the file is neither `estimate --json` of one map or one mass nor a posterior, or holds no size.
     """
-    try:
-        with path.open("rb") as file:
-            head = file.read(8)
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with open_input(path) as file:
+        head = file.read(8)
     return _from_json(path) if head.lstrip().startswith((b"{", b"[")) else _from_netcdf(path)
 
 
@@ -97,10 +95,7 @@ def _check_status(status: str | None, stated: StatedSize, row: int, *, fault: Ca
 
 
 def _from_json(path: Path) -> StatedSize:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise BadDataError(f"not a JSON file ({error})", way_out="give `estimate --json`", path=str(path)) from None
+    document: Any = load_json(path, way_out="give `estimate --json`")
     if isinstance(document, list):
         if len(document) != 1:
             what = f"holds {len(document)} estimates"
@@ -115,18 +110,10 @@ def _from_json(path: Path) -> StatedSize:
 
 
 def _from_netcdf(path: Path) -> StatedSize:
-    import netCDF4
-
-    try:
-        with netCDF4.Dataset(path) as dataset:
-            group = dataset.groups.get("posterior")
-            draws = None if group is None else group.variables.get("max_size_mm")
-            values = None if draws is None else np.asarray(draws[:], dtype=np.float64).ravel()
-    except OSError:
-        raise BadDataError(
-            "is neither JSON nor netCDF", way_out="give what `estimate` wrote with --json or -o", path=str(path)
-        ) from None
-    values = np.zeros(0) if values is None else values[np.isfinite(values) & (values > 0)]
+    with open_netcdf(path, way_out="give what `estimate` wrote with --json or -o") as file:
+        group = file.group("posterior")
+        values = None if group is None else group.array("max_size_mm", kind="f8", dimensions=("chain", "draw"))
+    values = np.zeros(0) if values is None else values.ravel()[np.isfinite(values.ravel()) & (values.ravel() > 0)]
     if len(values) < 2:
         way_out = "estimate with --size-calibration, so that the posterior holds sizes"
         raise BadDataError("holds no draws of max_size_mm", way_out=way_out, path=str(path))

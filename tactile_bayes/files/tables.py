@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.atomic import unreadable
+from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
 from tactile_bayes.files.schema import load_schema
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -146,10 +146,7 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
 
 
 def _decode(path: Path) -> str:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise unreadable(path, error) from None
+    data = read_bytes(path, most=TABLE_BYTES)
     if data.startswith(_BYTE_ORDER_MARKS):
         raise BadDataError("is UTF-16 text", way_out=_AS_UTF8, path=str(path))
     try:

@@ -1,10 +1,8 @@
-"""The one door to arviz: chain diagnostics and InferenceData."""
+"""The one door to arviz: chain diagnostics."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -32,13 +30,3 @@ def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
         "ess_bulk": float(min(arviz.ess(column, method="bulk") for column in columns)),
         "ess_tail": float(min(arviz.ess(column, method="tail") for column in columns)),
     }
-
-
-def to_inference_data(posterior: Mapping[str, FloatArray], *, attributes: Mapping[str, str]) -> Any:
-    """InferenceData with one posterior group of (chain, draw) variables and no clock time in it."""
-    data = arviz.from_dict(posterior={name: np.asarray(values) for name, values in posterior.items()})
-    for group in data.groups():
-        data[group].attrs.pop("created_at", None)
-    data.posterior.attrs.update(attributes)
-    data.attrs.pop("created_at", None)
-    return data

@@ -1,0 +1,99 @@
+"""Everything printed goes through here: control characters are shown, not obeyed, and a full disk is one line."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import sys
+from typing import Any, TextIO
+
+from tactile_bayes.errors import UsageError
+
+# C0 but tab and newline, delete, C1, line and direction marks, halves of surrogate pairs
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
+
+
+class ReaderGoneError(Exception):
+    """Whoever read the standard output stopped: ``tactile-bayes show scan.mcap | head -1``."""
+
+
+def printable(text: str) -> str:
+    r"""The text with each control character as its escape, for example ``\x1b``; tabs and newlines stay.
+
+    What a file holds may reach a terminal only so: control characters can move its cursor, rename its window or hide
+    what was printed before.
+    """
+    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+class PrintableStream:
+    """A text stream that shows control characters; everything else is the stream underneath.
+
+    Parameters
+    ----------
+    stream
+        Where to write.
+    required
+        Whether a failed write is an error (standard output) or let go (standard error, where no one could be told).
+    """
+
+    def __init__(self, stream: TextIO, *, required: bool) -> None:
+        self._stream = stream
+        self._required = required
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write the text, made printable."""
+        try:
+            self._stream.write(printable(text))
+        except OSError as error:
+            self._failed(error)
+        return len(text)
+
+    def flush(self) -> None:
+        """Hand over what was written.
+
+        Raises
+        ------
+        UsageError
+            When the standard output cannot take it.
+        ReaderGoneError
+            When its reader has gone.
+        """
+        try:
+            self._stream.flush()
+        except OSError as error:
+            self._failed(error)
+
+    def _failed(self, error: OSError) -> None:
+        _abandon(self._stream)
+        if not self._required:
+            return
+        if error.errno == errno.EPIPE:
+            raise ReaderGoneError
+        raise UsageError(f"the standard output cannot be written ({error.strerror}); make room, or send it elsewhere")
+
+
+def _abandon(stream: TextIO) -> None:
+    """Let what is still buffered go nowhere, or Python would try again at its end and print a traceback."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+def protect_streams() -> None:
+    """Make the standard streams of this process printable, in any locale."""
+    for name, required in (("stdout", True), ("stderr", False)):
+        stream = getattr(sys, name)
+        if stream is not None and not isinstance(stream, PrintableStream):
+            stream.reconfigure(errors="backslashreplace")
+            setattr(sys, name, PrintableStream(stream, required=required))
+
+
+def raw_stream(stream: Any) -> TextIO:
+    """The stream underneath, for what draws with control characters itself."""
+    found: TextIO = stream._stream if isinstance(stream, PrintableStream) else stream
+    return found

@@ -1,0 +1,110 @@
+"""JSON and TOML from files: of limited size and depth, with finite numbers and whole characters only."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.kinds import kind_of
+from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, read_text
+
+MOST_LEVELS: Final = 64
+MOST_KEY_PARTS: Final = 16
+# the parser's time grows with the square of a key's parts
+_LONG_KEY: Final = re.compile(
+    rf"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*(?:\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*){{{MOST_KEY_PARTS}}}"""
+)
+
+
+def load_json(path: Path, *, way_out: str = "give a file this program wrote") -> object:
+    """Read a JSON file, whatever it holds.
+
+    Raises
+    ------
+    BadDataError
+        When it cannot be read or is not JSON, is too large or too deep, or holds a number that is not finite.
+    """
+    try:
+        return parse_json(read_text(path, most=JSON_BYTES, way_out=way_out), way_out=way_out)
+    except BadDataError as error:
+        kind = kind_of(path)
+        if kind and not kind.endswith("(JSON)"):
+            raise BadDataError(f"is {kind}, not a JSON file", way_out=way_out, path=str(path)) from None
+        raise error.at(path) from None
+
+
+def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again") -> object:
+    """The document of a JSON text; see `load_json` for the errors.
+
+    Parameters
+    ----------
+    name
+        Of the part of a file that the text is, for the error; empty for a whole file.
+    """
+    with decoding(f"{name} is not JSON".lstrip(), way_out=way_out):
+        document: object = json.loads(text)
+    check_plain(document, way_out=way_out, name=name)
+    return document
+
+
+def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    BadDataError
+        When it cannot be read or is not TOML, is too large or too deep, or holds a number that is not finite.
+    """
+    try:
+        return parse_toml(read_text(path, most=TOML_BYTES, way_out=way_out), way_out=way_out)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
+    """The document of a TOML text; see `load_toml` for the errors."""
+    import tomllib
+
+    long = _LONG_KEY.search(text)
+    if long:
+        line = text.count("\n", 0, long.start()) + 1
+        raise BadDataError(f"line {line}: a key of more than {MOST_KEY_PARTS} parts", way_out=way_out)
+    with decoding("is not TOML", way_out=way_out):
+        document = tomllib.loads(text)
+    check_plain(document, way_out=way_out)
+    return document
+
+
+def check_plain(document: object, *, way_out: str, name: str = "") -> None:
+    """Refuse what cannot go on into a report: depth, numbers that are not finite, halves of characters.
+
+    Raises
+    ------
+    BadDataError
+        Naming the first such value.
+    """
+    level = [(name, document)]
+    for _ in range(MOST_LEVELS):
+        level = [part for where, item in level for part in _parts(where, item, way_out=way_out)]
+        if not level:
+            return
+    raise BadDataError(f"is nested more than {MOST_LEVELS} levels deep", way_out=way_out)
+
+
+def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, object]]:
+    """The parts of a container, each with its place; a single value is checked."""
+    if isinstance(item, dict):
+        for key, value in item.items():
+            yield "", key
+            yield (f"{where}.{key}" if where else str(key)), value
+    elif isinstance(item, list):
+        yield from ((f"{where}[{i}]", value) for i, value in enumerate(item))
+    elif isinstance(item, float) and not math.isfinite(item):
+        raise BadDataError(f"{where or 'the document'} is {item}", way_out="give a finite number")
+    elif isinstance(item, str) and not item.isascii() and any("\ud800" <= letter <= "\udfff" for letter in item):
+        raise BadDataError(f"{where or 'a key'} holds half a character: {item[:40]!a}", way_out=way_out)

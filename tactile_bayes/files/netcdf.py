@@ -1,0 +1,255 @@
+"""netCDF-4 files by h5py alone: written in memory and published whole, read with every declared size checked first.
+
+A netCDF-4 file is an HDF5 file whose dimensions are dimension scales. A dimension without a variable of its name is an
+empty scale, which netCDF hides. Record 0080 says why neither netCDF4 nor h5netcdf is used here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.kinds import not_a
+from tactile_bayes.files.reading import check_limit, decoding, open_input, unpacked_limit
+from tactile_bayes.records import dataclass
+
+_NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable.{:10d}"
+_PACKING: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "fletcher32": True}
+_DEFLATE, _SHUFFLE, _CHECKSUM = 1, 2, 3  # HDF5's numbers of the filters above
+_DAMAGED: Final = "not a readable netCDF file"
+_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """One array of a netCDF file.
+
+    Parameters
+    ----------
+    values
+        Numbers; their type is the variable's.
+    dimensions
+        The name of each axis.
+    attributes
+        Text by name: units, a long name.
+    """
+
+    values: Any
+    dimensions: tuple[str, ...]
+    attributes: Mapping[str, str]
+
+
+def netcdf_bytes(variables: Mapping[str, Variable], *, attributes: Mapping[str, str], group: str = "/") -> bytes:
+    """A netCDF-4 file as bytes; equal contents give equal bytes.
+
+    Parameters
+    ----------
+    variables
+        By name; one that is called as its only dimension becomes that dimension's coordinate.
+    attributes
+        Text by name, of the group.
+    group
+        Where everything goes, for example ``posterior``.
+    """
+    import h5py
+
+    with h5py.File("memory", "w", driver="core", backing_store=False, track_order=True) as file:
+        place = file if group == "/" else file.create_group(group, track_order=True)
+        for name, value in attributes.items():
+            place.attrs[name] = value
+        scales = _write_dimensions(place, variables)
+        for name, variable in variables.items():
+            if name not in scales:
+                _write_variable(place, name, variable, scales)
+        file.flush()
+        image: bytes = file.id.get_file_image()
+    return image
+
+
+def _write_dimensions(place: Any, variables: Mapping[str, Variable]) -> dict[str, Any]:
+    """A scale for each dimension, with the values of its coordinate where there is one."""
+    lengths: dict[str, int] = {}
+    for variable in variables.values():
+        lengths |= dict(zip(variable.dimensions, np.shape(variable.values), strict=True))
+    scales = {}
+    for number, (name, length) in enumerate(lengths.items()):
+        if name in variables:
+            scale = _write_values(place, name, variables[name])
+            scale.make_scale(name)
+        else:
+            scale = place.create_dataset(name, shape=(length,), dtype=">f4")
+            scale.make_scale(_NO_VARIABLE.format(length))
+        scale.attrs["_Netcdf4Dimid"] = np.int32(number)
+        scales[name] = scale
+    return scales
+
+
+def _write_variable(place: Any, name: str, variable: Variable, scales: Mapping[str, Any]) -> None:
+    written = _write_values(place, name, variable)
+    for axis, dimension in enumerate(variable.dimensions):
+        written.dims[axis].attach_scale(scales[dimension])
+
+
+def _write_values(place: Any, name: str, variable: Variable) -> Any:
+    written = place.create_dataset(name, data=variable.values, track_order=True, **_PACKING)
+    for key, text in variable.attributes.items():
+        written.attrs[key] = text
+    return written
+
+
+class Group:
+    """One group of an open netCDF file; whatever is read is checked first.
+
+    Parameters
+    ----------
+    place
+        The group, of h5py.
+    most_bytes
+        What the arrays of the file may unpack to.
+    way_out
+        What to do about a fault of the file.
+    """
+
+    def __init__(self, place: Any, *, most_bytes: int, way_out: str) -> None:
+        self._place = place
+        self._most_bytes = most_bytes
+        self._way_out = way_out
+
+    def group(self, name: str) -> Group | None:
+        """A group inside; None where there is none."""
+        import h5py
+
+        found = self._own(name)
+        return (
+            Group(found, most_bytes=self._most_bytes, way_out=self._way_out) if isinstance(found, h5py.Group) else None
+        )
+
+    def attributes(self) -> dict[str, str]:
+        """The attributes that are text, by name."""
+        held = {str(name): _text(self._place.attrs[name]) for name in self._place.attrs}
+        return {name: text for name, text in held.items() if text is not None}
+
+    def dimension(self, name: str) -> int | None:
+        """The length of a dimension; None where there is none."""
+        found = self._dataset(name)
+        return None if found is None or len(found.shape) != 1 else int(found.shape[0])
+
+    def variables(self) -> list[str]:
+        """The names of the arrays, in alphabetical order; dimensions without values are not among them."""
+        datasets = {str(name): self._dataset(str(name)) for name in self._place}
+        return sorted(name for name, found in datasets.items() if found is not None and not _is_bare(found))
+
+    def array(self, name: str, *, kind: str, dimensions: tuple[str, ...]) -> Any:
+        """The values of a variable; None where there is none.
+
+        Parameters
+        ----------
+        kind
+            The type that it must have: ``f8``, ``i8``.
+        dimensions
+            The dimensions that it must have.
+
+        Raises
+        ------
+        BadDataError
+            When it has other dimensions or another type, is over the limits, or its bytes are damaged.
+        """
+        found = self._dataset(name)
+        if found is None or _is_bare(found):
+            return None
+        if found.dtype != np.dtype(kind) and found.dtype != np.dtype(kind).newbyteorder():
+            raise BadDataError(f"variable {name} is {found.dtype}, not {np.dtype(kind)}", way_out=self._way_out)
+        has = _dimensions(found)
+        if has != dimensions:
+            raise BadDataError(f"variable {name} has dimensions {has}, not {dimensions}", way_out=self._way_out)
+        check_limit(found.size * found.dtype.itemsize, self._most_bytes, what=f"variable {name} unpacks to {{}} bytes")
+        self._check_chunks(name, found)
+        return np.asarray(found[...], dtype=np.dtype(kind))
+
+    def _own(self, name: str) -> Any:
+        """A member of this file; links to other places and files are not followed."""
+        import h5py
+
+        if not isinstance(self._place.get(name, getlink=True), h5py.HardLink):
+            return None
+        return self._place[name]
+
+    def _dataset(self, name: str) -> Any:
+        """A dataset whose values are in this file; None where there is none."""
+        import h5py
+
+        found = self._own(name)
+        if not isinstance(found, h5py.Dataset):
+            return None
+        if found.shape is None or found.external or found.is_virtual:
+            raise BadDataError(f"variable {name} keeps its values elsewhere", way_out=self._way_out)
+        return found
+
+    def _check_chunks(self, name: str, found: Any) -> None:
+        """Refuse a chunk that unpacks to more than it declares: HDF5 would go on for as long as there is memory."""
+        created = found.id.get_create_plist()
+        filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
+        if len(set(filters)) < len(filters) or not set(filters) <= {_DEFLATE, _SHUFFLE, _CHECKSUM}:
+            raise BadDataError(f"variable {name} is packed by filters {filters}", way_out=self._way_out)
+        if not found.chunks:
+            return
+        declared = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize
+        check_limit(declared, self._most_bytes, what=f"a chunk of variable {name} unpacks to {{}} bytes")
+        if _DEFLATE not in filters:
+            return
+        for number in range(found.id.get_num_chunks()):
+            _, packed = found.id.read_direct_chunk(found.id.get_chunk_info(number).chunk_offset)
+            if len(zlib.decompressobj().decompress(packed, declared + 5)) > declared + 4:  # a checksum has four bytes
+                what = f"a chunk of variable {name} unpacks to more than it declares"
+                raise BadDataError(what, way_out=self._way_out)
+
+
+def _text(value: Any) -> str | None:
+    """An attribute's text, of fixed or variable length, alone or as the one string of a list; else None."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if isinstance(value, bytes):
+        return value.decode("utf-8")
+    return str(value) if isinstance(value, str) else None
+
+
+def _is_bare(dataset: Any) -> bool:
+    """Whether a dataset only stands for a dimension."""
+    name = dataset.attrs.get("NAME", b"")
+    text = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
+    return text.startswith(_NO_VARIABLE.partition("{")[0])
+
+
+def _dimensions(dataset: Any) -> tuple[str, ...]:
+    """The name of each axis, by the scale that is attached to it; a coordinate is its own."""
+    if dataset.is_scale:
+        return (PurePosixPath(dataset.name).name,)
+    return tuple(PurePosixPath(axis[0].name).name if len(axis) else "" for axis in dataset.dims)
+
+
+@contextlib.contextmanager
+def open_netcdf(path: Path, *, way_out: str) -> Iterator[Group]:
+    """The root group of a netCDF-4 file; every fault in the block becomes a `BadDataError` that names `path`.
+
+    Raises
+    ------
+    BadDataError
+        When the file cannot be read, is no netCDF-4 file or is damaged.
+    """
+    import h5py
+
+    try:
+        with open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                raise not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
+            size = stream.seek(0, 2)
+            with h5py.File(stream, "r") as file:
+                yield Group(file, most_bytes=unpacked_limit(size), way_out=way_out)
+    except BadDataError as error:
+        raise error.at(path) from None

@@ -1,0 +1,167 @@
+"""Opening files that others wrote: regular files only, up to a stated size, and one line for whatever a decoder raises.
+
+Limits are judged before memory is taken. Each is multiplied by the environment variable ``TACTILE_BAYES_LIMITS`` (a
+number, 1 where it is not set), so that a sound file that is too large for them can still be read.
+
+| what | limit |
+|---|---|
+| TOML | 1 MB, keys of up to 16 parts |
+| JSON | 16 MB, 64 levels deep |
+| CSV and text tables | 32 MB |
+| a grid, an image or a map | 2^24 cells |
+| what is packed (MCAP, npz, netCDF) | unpacked 64 MB or 32 times the file, whichever is more |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
+
+LIMITS_VARIABLE: Final = "TACTILE_BAYES_LIMITS"
+TOML_BYTES: Final = 10**6
+JSON_BYTES: Final = 16 * 10**6
+TABLE_BYTES: Final = 32 * 10**6
+CELLS: Final = 2**24
+_UNPACKED_BYTES: Final = 64 * 10**6
+_UNPACKED_TIMES: Final = 32
+
+_KINDS: Final = (
+    (stat.S_ISDIR, "a directory"),
+    (stat.S_ISFIFO, "a FIFO"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def open_input(path: Path) -> io.BufferedReader:
+    """Open a regular file for reading; nothing waits for a writer or a device.
+
+    Raises
+    ------
+    BadDataError
+        When there is no such file, it may not be read, or it is a directory, a FIFO, a socket or a device.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    except OSError as error:
+        raise unreadable(path, error) from None
+    kind = special_kind(os.fstat(descriptor).st_mode)
+    if kind:
+        os.close(descriptor)
+        raise BadDataError(f"is {kind}", way_out="give a regular file", path=str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def special_kind(mode: int) -> str:
+    """What a path is in words ("a FIFO"), by its mode; empty for a regular file."""
+    return next((words for test, words in _KINDS if test(mode)), "")
+
+
+def read_bytes(path: Path, *, most: int) -> bytes:
+    """All bytes of a regular file of up to `most` bytes (times ``TACTILE_BAYES_LIMITS``).
+
+    Raises
+    ------
+    BadDataError
+        When the file cannot be read or is larger.
+    """
+    with open_input(path) as file:
+        try:
+            check_limit(os.fstat(file.fileno()).st_size, most, what="it has {} bytes")
+            return file.read()
+        except OSError as error:
+            raise unreadable(path, error) from None
+        except BadDataError as error:
+            raise error.at(path) from None
+
+
+def read_text(path: Path, *, most: int, way_out: str) -> str:
+    """A file's UTF-8 text; see `read_bytes` for limits and errors."""
+    data = read_bytes(path, most=most)
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        what = f"line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text"
+        raise BadDataError(what, way_out=way_out, path=str(path)) from None
+
+
+def check_limit(size: int, most: int, *, what: str) -> None:
+    """Refuse a declared size over a limit.
+
+    Parameters
+    ----------
+    size, most
+        Both of one unit; `most` is multiplied by ``TACTILE_BAYES_LIMITS``.
+    what
+        Says what was declared, with ``{}`` for the number: ``"mean has {} cells"``.
+
+    Raises
+    ------
+    BadDataError
+        When `size` is larger.
+    """
+    allowed = most * limit_factor()
+    if size > allowed:
+        times = -(-size // most)
+        raise BadDataError(
+            f"{what.format(f'{size:,}')}, over the limit of {int(allowed):,}",
+            way_out=f"if the file is sound, set {LIMITS_VARIABLE}={times}",
+        )
+
+
+def unpacked_limit(file_bytes: int) -> int:
+    """How many bytes a packed file may unpack to, before ``TACTILE_BAYES_LIMITS``."""
+    return max(_UNPACKED_BYTES, _UNPACKED_TIMES * file_bytes)
+
+
+def limit_factor() -> float:
+    """What every limit is multiplied by.
+
+    Raises
+    ------
+    UsageError
+        When ``TACTILE_BAYES_LIMITS`` is no number above 0.
+    """
+    text = os.environ.get(LIMITS_VARIABLE, "1")
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 0 < factor < float("inf"):
+        raise UsageError(f"{LIMITS_VARIABLE} is {text!r}; give a number above 0, or unset it")
+    return factor
+
+
+@contextlib.contextmanager
+def decoding(what: str, *, way_out: str) -> Iterator[None]:
+    """Turn whatever a decoder raises on damaged bytes into one `BadDataError`.
+
+    Only calls into decoders of other packages belong inside: each of them has error classes of its own, and damaged
+    bytes bring out others as well.
+
+    Parameters
+    ----------
+    what
+        What could not be done: ``"cannot be decoded"``.
+    """
+    try:
+        yield
+    except TactileBayesError:
+        raise
+    except Exception as error:
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise BadDataError(f"{what} ({why})", way_out=way_out) from None
+
+
+def unreadable(path: Path, error: OSError) -> BadDataError:
+    """The one line for a file that cannot be opened."""
+    return BadDataError(f"cannot be read ({error.strerror or error})", way_out="check the path", path=str(path))
