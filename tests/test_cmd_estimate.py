@@ -260,7 +260,7 @@ def test_priors_come_from_a_file_and_are_printed(folder: Path) -> None:
 
 
 def test_a_checkpoint_goes_on_where_it_stopped(folder: Path) -> None:
-    words = ("--method", "ensemble", "--accuracy-sd", 0.15, "--json")
+    words = ("--method", "ensemble", "--accuracy-sd", 0.1, "--json")
     stopped = field(folder, *words, "--checkpoint", "chain.npz", "--max-steps", 150)
     assert stopped.returncode == 5
     resumed, whole = field(folder, *words, "--checkpoint", "chain.npz"), field(folder, *words)

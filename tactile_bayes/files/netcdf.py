@@ -1,4 +1,4 @@
-"""netCDF-4 files by h5py alone: written in memory and published whole, read with every declared size checked first.
+"""Files of netCDF-4 by h5py alone: written in memory and published whole, read with every declared size checked first.
 
 A netCDF-4 file is an HDF5 file whose dimensions are dimension scales. A dimension without a variable of its name is an
 empty scale, which netCDF hides. Record 0080 says why neither netCDF4 nor h5netcdf is used here.

@@ -38,7 +38,12 @@ def read_stated_size(path: Path) -> StatedSize:
     """
     with open_input(path) as file:
         head = file.read(8)
-    return _from_json(path) if head.lstrip().startswith((b"{", b"[")) else _from_netcdf(path)
+    if head.lstrip().startswith((b"{", b"[")):
+        return _from_json(path)
+    if head.startswith(b"\x89HDF"):
+        return _from_netcdf(path)
+    way_out = "give what `estimate` wrote with --json or -o"
+    raise BadDataError("is neither JSON nor netCDF", way_out=way_out, path=str(path))
 
 
 def fill_from_posteriors(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
 import sys
@@ -89,7 +90,8 @@ def protect_streams() -> None:
     for name, required in (("stdout", True), ("stderr", False)):
         stream = getattr(sys, name)
         if stream is not None and not isinstance(stream, PrintableStream):
-            stream.reconfigure(errors="backslashreplace")
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
             setattr(sys, name, PrintableStream(stream, required=required))
 
 
