@@ -11,8 +11,8 @@ import sys
 import click
 
 from tactile_bayes import __version__
-from tactile_bayes.printing import ReaderGoneError, protect_streams
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, TactileBayesError
+from tactile_bayes.printing import ReaderGoneError, protect_streams
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
 COMMANDS: dict[str, tuple[str, str]] = {

@@ -10,7 +10,14 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.mcap_records import McapRecords
-from tactile_bayes.files.scan_mcap import LANDMARK_NAMES, SCAN_SCHEMA, json_attachment, json_object, message_times, scan_records
+from tactile_bayes.files.scan_mcap import (
+    LANDMARK_NAMES,
+    SCAN_SCHEMA,
+    json_attachment,
+    json_object,
+    message_times,
+    scan_records,
+)
 from tactile_bayes.files.scan_parts import all_cautions, head_from_document
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.overlap import Span, overlap_cautions
