@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.forward.scene import Lump, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, TcpLink
+from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
 from tactile_bayes.scan import Scan
 
 
@@ -23,9 +23,12 @@ def short_scan(duration_s: float = 1.0, *, seed: int = 3) -> Scan:
 
 
 @contextmanager
-def serving(device: Device, link: Link, faults: Faults | None = None, *, speed: float = 1.0) -> Iterator[Emulator]:
+def serving(
+    device: Device, link: Link, faults: Faults | None = None, *, stage: Stage | None = None, leads: bool = True
+) -> Iterator[Emulator]:
     """Serve a device until the block ends; the emulator's link says where."""
-    emulator = Emulator(device, link, faults=faults or Faults(), rng=np.random.default_rng(1), speed=speed)
+    rng = np.random.default_rng(1)
+    emulator = Emulator(device, link, faults=faults or Faults(), rng=rng, stage=stage, leads=leads)
     thread = threading.Thread(target=emulator.run, daemon=True)
     thread.start()
     try:
@@ -50,9 +53,10 @@ def head_and_tracker(
 ) -> Iterator[list[str]]:
     """Both devices of a scan; the words that tell `record` about them."""
     links: list[Link] = [TcpLink("127.0.0.1", 0), TcpLink("127.0.0.1", 0)] if tcp else [PtyLink(), PtyLink()]
+    stage = Stage(speed=speed)
     tracker = EmulatedTracker(scan.poses, protocol=protocol, hold=tracker_faults.hold if tracker_faults else 1)
     with (
-        serving(EmulatedHead(scan), links[0], head_faults, speed=speed),
-        serving(tracker, links[1], tracker_faults, speed=speed),
+        serving(EmulatedHead(scan), links[0], head_faults, stage=stage),
+        serving(tracker, links[1], tracker_faults, stage=stage, leads=False),
     ):
         yield ["--head", links[0].url, "--tracker", links[1].url, "--tracker-protocol", protocol]

@@ -38,6 +38,7 @@ _CODE = "A code, not a name."
 @click.option("--tracker-rom", type=_FILE, metavar="TOOL.rom", help="ndi: description of a wireless tool.")
 @click.option("--every", type=click.IntRange(1, 255), default=1, show_default=True, help="Ask for every n-th frame.")
 @click.option("--duration", "duration_s", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Stop then.")
+@click.option("--at-once", is_flag=True, help="Start without waiting for space. Default: with --duration.")
 @click.option(
     "--clock",
     type=click.Choice(["arrival", "shared"]),
@@ -75,8 +76,8 @@ def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
     """Record a scan head and a tracker.
 
     On a terminal, `n` and `x` touch the sternal notch and the xiphoid, space starts, `q` or Ctrl-C stops; with
-    --duration, or without a terminal, recording starts at once. The file can be read at any moment: a kill costs at
-    most the last fraction of a second, and `repair` closes what was cut off.
+    --duration or --at-once, or without a terminal, recording starts at once. The file can be read at any moment: a
+    kill costs at most the last fraction of a second, and `repair` closes what was cut off.
 
     Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
     """
@@ -111,6 +112,7 @@ class Request:
     tracker_rom: Path | None
     every: int
     duration_s: float | None
+    at_once: bool
     clock: str
     invert_rotation: bool
     like: Path | None
@@ -267,7 +269,7 @@ def _place(landmarks: Landmarks | None, writer: Any) -> None:
 def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:
     from tactile_bayes.commands.record_parts import Keys
 
-    with Keys(recorder, head.scanhead_from_tracker, wait=request.duration_s is None) as keys:
+    with Keys(recorder, head.scanhead_from_tracker, wait=request.duration_s is None and not request.at_once) as keys:
         if not keys.waiting:
             recorder.start()
 

@@ -52,22 +52,19 @@ def command(
     if output is not None:
         refuse_existing(output, force=force)
     found = read_scan(scan)
-    with tempfile.TemporaryDirectory() as folder, _emulated(scan, "head", speed) as head:
-        shared = {"like": scan, "head_url": head, "clock": "shared", "live": live, "serve": serve, "force": force}
-        more = {"output": output or Path(folder) / "replayed.mcap", "size_calibration": size_calibration}
+    with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(found.poses))) as urls:
+        options = {"like": scan, "clock": "shared", "at_once": True, "live": live, "serve": serve, "force": force}
+        options |= {"output": output or Path(folder) / "replayed.mcap", "size_calibration": size_calibration}
+        options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if found.landmarks is not None:
-            more["landmarks"] = scan
-        if not len(found.poses):
-            ctx.invoke(record.command, **shared, **more)
-            return
-        with _emulated(scan, "tracker", speed) as tracker:
-            ctx.invoke(record.command, **shared, **more, tracker_url=tracker, tracker_protocol="open")
+            options["landmarks"] = scan
+        ctx.invoke(record.command, **options)
 
 
 @contextmanager
-def _emulated(scan: Path, kind: str, speed: float) -> Iterator[str]:
-    """One emulated device in a process of its own; its URL."""
-    words = ["emulate", kind, str(scan), "--speed", str(speed)]
+def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, str]]:
+    """Emulated devices that play one scan together, in a process of their own; their URLs by role."""
+    words = ["emulate", "both" if poses else "head", str(scan), "--speed", str(speed)]
     process = subprocess.Popen(
         [sys.executable, "-m", "tactile_bayes", *words],
         stdout=subprocess.PIPE,
@@ -76,10 +73,10 @@ def _emulated(scan: Path, kind: str, speed: float) -> Iterator[str]:
     )
     assert process.stdout is not None
     try:
-        url = process.stdout.readline().strip()
-        if not url:
-            raise DeviceError(f"the emulated {kind} did not start; try `tactile-bayes emulate {kind} {scan}`")
-        yield url
+        told = [process.stdout.readline().split() for _ in range(1 + poses)]
+        if not all(told):
+            raise DeviceError(f"the emulated devices did not start; try `tactile-bayes {' '.join(words[:3])}`")
+        yield {role: line[-1] for role, line in zip(("head", "tracker"), told, strict=False)}
     finally:
         process.terminate()
         process.wait()

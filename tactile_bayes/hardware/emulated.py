@@ -73,7 +73,22 @@ class Device(Protocol):
 
     @property
     def streaming(self) -> bool:
-        """Whether it was told to send."""
+        """Whether it sends, or will when the scan begins."""
+
+    @property
+    def starts(self) -> int:
+        """How often it was told to send; each time is a new beginning."""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the host was the last to say something about sending, and said stop."""
+
+    @property
+    def said_end(self) -> bool:
+        """Whether its protocol tells the host that it has sent everything, and it did."""
+
+    def greet(self) -> None:
+        """A host has connected."""
 
     def hear(self, data: bytes) -> bytes:
         """Take commands; the answer."""
@@ -85,7 +100,27 @@ class Device(Protocol):
         """What it says after its last record; it does not stream from then on."""
 
 
-class EmulatedHead:
+class _Sender:
+    """What every device that streams remembers of its commands."""
+
+    def __init__(self) -> None:
+        self.starts = 0
+        self.streaming = self.stopped = self.said_end = False
+
+    def start(self) -> None:
+        """The host wants records."""
+        self.starts += 1
+        self.streaming, self.stopped, self.said_end = True, False, False
+
+    def stop(self) -> None:
+        """The host wants none."""
+        self.streaming, self.stopped = False, True
+
+    def greet(self) -> None:
+        """Most devices wait for a command."""
+
+
+class EmulatedHead(_Sender):
     """A head in the open framing.
 
     Parameters
@@ -95,8 +130,8 @@ class EmulatedHead:
     """
 
     def __init__(self, scan: Scan) -> None:
+        super().__init__()
         self.times_s = scan.frames.time_s
-        self.streaming = False
         self._scan = scan
         self._every = 1
         self._commands = PacketParser()
@@ -117,10 +152,10 @@ class EmulatedHead:
                 answer += head.encode_hello(self.hello())
             elif packet.kind == head.START:
                 self._every = max(1, packet.payload[0] if packet.payload else 1)
-                self.streaming = True
+                self.start()
                 answer += head.encode_hello(self.hello())
             elif packet.kind == head.STOP:
-                self.streaming = False
+                self.stop()
         return answer
 
     def record(self, index: int) -> bytes:
@@ -132,11 +167,11 @@ class EmulatedHead:
 
     def end(self, sent: int, dropped: int) -> bytes:
         """An END."""
-        self.streaming = False
+        self.streaming, self.said_end = False, True
         return head.encode_end(sent, dropped)
 
 
-class EmulatedTracker:
+class EmulatedTracker(_Sender):
     """A tracker of one of the makers, or in the open framing.
 
     Parameters
@@ -150,8 +185,8 @@ class EmulatedTracker:
     """
 
     def __init__(self, poses: TrackerPoses, *, protocol: str, hold: int = 1) -> None:
+        super().__init__()
         self.times_s = poses.time_s
-        self.streaming = protocol == "igtlink"  # a server that sends to whoever connects
         self._poses = poses
         self._protocol = protocol
         self._commands = PacketParser()
@@ -167,6 +202,11 @@ class EmulatedTracker:
         whole = int(time_s)
         return PoseReading((x, y, z), (w, i, j, k), whole * _NS + round((time_s - whole) * _NS))
 
+    def greet(self) -> None:
+        """An OpenIGTLink server sends to whoever connects."""
+        if self._protocol == "igtlink":
+            self.start()
+
     def hear(self, data: bytes) -> bytes:
         """Start, stop, and one record when asked; settings are taken for granted."""
         if self._protocol == "open":
@@ -174,12 +214,12 @@ class EmulatedTracker:
         answer = b""
         for letter in _SETTING.sub(b"", data).decode("latin-1"):
             if letter in "PB" and len(self.times_s):
-                self.streaming = False
+                self.stop()
                 answer += self.record(0)
             elif letter in "C@":
-                self.streaming = True
+                self.start()
             elif letter == "c":
-                self.streaming = False
+                self.stop()
         return answer
 
     def _hear_open(self, data: bytes) -> bytes:
@@ -187,8 +227,10 @@ class EmulatedTracker:
         for packet in self._commands.feed(data):
             if packet.kind == head.ASK:
                 answer += head.encode_hello(HelloReading("emulated tracker", 0, 0, 0, 0.0))
-            elif packet.kind in (head.START, head.STOP):
-                self.streaming = packet.kind == head.START
+            elif packet.kind == head.START:
+                self.start()
+            elif packet.kind == head.STOP:
+                self.stop()
         return answer
 
     def record(self, index: int) -> bytes:
@@ -197,8 +239,8 @@ class EmulatedTracker:
 
     def end(self, sent: int, dropped: int) -> bytes:
         """An END in the open framing; trackers say nothing."""
-        self.streaming = False
-        return head.encode_end(sent, dropped) if self._protocol == "open" else b""
+        self.streaming, self.said_end = False, self._protocol == "open"
+        return head.encode_end(sent, dropped) if self.said_end else b""
 
 
 def _inches(pose: PoseReading) -> tuple[float, float, float]:

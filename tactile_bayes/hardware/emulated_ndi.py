@@ -46,7 +46,12 @@ class EmulatedNdi:
         The tool has to be described by the host first.
     clock
         Seconds from anywhere.
+    elapsed
+        Seconds of the scan that other devices play too, None while it waits; by default the scan begins with TSTART.
     """
+
+    starts = 0
+    streaming = stopped = said_end = False
 
     def __init__(
         self,
@@ -55,9 +60,10 @@ class EmulatedNdi:
         hold: int = 1,
         wireless: bool = False,
         clock: Callable[[], float] = time.monotonic,
+        elapsed: Callable[[], float | None] | None = None,
     ) -> None:
         self.times_s = poses.time_s
-        self.streaming = False
+        self._elapsed = elapsed
         self.described = b""
         self._poses, self._hold, self._clock = poses, max(1, hold), clock
         self._begun: float | None = None
@@ -68,6 +74,9 @@ class EmulatedNdi:
         """Take commands; the answers."""
         *lines, self._rest = (self._rest + data).split(b"\r")
         return b"".join(self._answer(line) for line in lines)
+
+    def greet(self) -> None:
+        """Nothing is said to a host that connects."""
 
     def record(self, index: int) -> bytes:
         """Nothing comes unasked."""
@@ -128,7 +137,7 @@ class EmulatedNdi:
     def _poses_now(self) -> bytes:
         if self._begun is None or self._port != "enabled":
             return _text(f"ERROR{_NOT_NOW:02X}")
-        elapsed = self._clock() - self._begun
+        elapsed = self._clock() - self._begun if self._elapsed is None else self._elapsed() or 0.0
         index = int(np.searchsorted(self.times_s - self.times_s[0], elapsed, side="right")) - 1
         index -= index % self._hold
         if elapsed > self.times_s[-1] - self.times_s[0] + 0.1:  # the tool is put away

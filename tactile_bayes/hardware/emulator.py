@@ -1,11 +1,13 @@
-"""Serve an emulated device over a pseudo-terminal or TCP, at the scan's own rate."""
+"""Serve emulated devices over pseudo-terminals or TCP, at the scan's own rate."""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
 import socket
+import termios
 import time
 import tty
 from collections.abc import Callable
@@ -20,7 +22,13 @@ from tactile_bayes.hardware.emulated import Device, Faults
 # A device's own buffer: what does not fit is dropped record by record, as firmware does.
 BUFFER_BYTES: Final = 256 * 1024
 _READ: Final = 4096
+_LOOK_S: Final = 0.01
 _IDLE_S: Final = 0.2
+# A follower repeats its first record so often while the scan waits, but not so soon after a START.
+_HOLD_S: Final = 0.01
+_SETTLE_S: Final = 0.5
+# How long `--once` waits for a host to read, and to say STOP to a device that does not tell its end.
+LINGER_S: Final = 5.0
 
 
 class Link(Protocol):
@@ -41,6 +49,9 @@ class Link(Protocol):
 
     def write(self, data: bytes) -> int:
         """Send what fits; how many bytes that was."""
+
+    def finish(self, patience_s: float) -> None:
+        """Wait until the host has read everything, then close."""
 
     def close(self) -> None:
         """Pull the cable."""
@@ -76,6 +87,16 @@ class PtyLink:
             return os.write(self._near, data)
         except BlockingIOError:
             return 0
+
+    def finish(self, patience_s: float) -> None:
+        """Wait until nothing is left in the terminal's buffer, which goes with the terminal."""
+        end, left = time.monotonic() + patience_s, bytearray(4)
+        while time.monotonic() < end:
+            fcntl.ioctl(self._far, termios.FIONREAD, left)
+            if not any(left):
+                break
+            time.sleep(_LOOK_S)
+        self.close()
 
     def close(self) -> None:
         """Both ends go: the host sees the end of the device."""
@@ -133,6 +154,16 @@ class TcpLink:
         except OSError:
             return len(data)
 
+    def finish(self, patience_s: float) -> None:
+        """Say that nothing more comes, and hear the host out: closing on unread bytes loses what is on its way."""
+        if self._host is not None:
+            with contextlib.suppress(OSError):
+                self._host.shutdown(socket.SHUT_WR)
+                self._host.settimeout(patience_s)
+                while self._host.recv(_READ):
+                    pass
+        self.close()
+
     def close(self) -> None:
         """Close both sockets."""
         if self._host is not None:
@@ -149,6 +180,39 @@ class Served:
     faulty: int = 0
 
 
+class Stage:
+    """When a scan is played, for all devices that play it together: real devices share the time they measure in.
+
+    Parameters
+    ----------
+    speed
+        Seconds of the scan in a second.
+    clock
+        Seconds from anywhere.
+    """
+
+    def __init__(self, *, speed: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
+        self._speed, self._clock = speed, clock
+        self._begun: tuple[int, float | None] = (0, None)  # one value: devices look from threads of their own
+
+    def begin(self) -> None:
+        """Play from the start, now."""
+        self._begun = (self._begun[0] + 1, self._clock())
+
+    def end(self) -> None:
+        """Go back to the start and wait."""
+        self._begun = (self._begun[0], None)
+
+    def now(self) -> tuple[int, float | None]:
+        """How often the scan was begun, and s of the scan since; None while it waits."""
+        number, begun = self._begun
+        return number, None if begun is None else (self._clock() - begun) * self._speed
+
+    def wait_s(self, scan_s: float) -> float:
+        """Seconds that so much of the scan takes."""
+        return scan_s / self._speed
+
+
 class Emulator:
     """Runs a device on a link.
 
@@ -158,10 +222,11 @@ class Emulator:
         What is emulated, and where.
     faults, rng
         What goes wrong, and the numbers that decide when.
-    speed
-        Seconds of the scan in a second; records keep their device times.
-    clock
-        Seconds from anywhere.
+    stage
+        When the scan is played; records keep their device times.
+    leads
+        Each START of this device begins the scan. A device that follows another's stage repeats its first record while
+        it streams and the scan has not begun, as a tracker does whose sensor is held still.
     """
 
     def __init__(
@@ -171,66 +236,91 @@ class Emulator:
         *,
         faults: Faults,
         rng: np.random.Generator,
-        speed: float = 1.0,
-        clock: Callable[[], float] = time.monotonic,
+        stage: Stage | None = None,
+        leads: bool = True,
     ) -> None:
         self._device, self._link = device, link
         self._faults, self._rng = faults, rng
-        self._speed, self._clock = speed, clock
+        self._stage, self._leads = stage or Stage(), leads
         self._waiting = bytearray()
-        self._begun: float | None = None
-        self._next = 0
+        self._starts = device.starts
+        self._round, self._next, self._finished_at = 0, 0, 0.0
+        self._held_at, self._held = time.monotonic(), False
         self.served = Served()
         self.unplugged = False
 
     def run(self, *, once: bool = False) -> Served:
-        """Serve until the cable is pulled, or, with `once`, until a scan has been sent."""
+        """Serve until the cable is pulled, or, with `once`, until a scan has been sent and read."""
         while not self.unplugged:
-            finished = self._step()
-            if once and finished and not self._waiting:
-                break
+            self._step()
+            if once and self._finished_at and self._left_alone():
+                self._link.finish(LINGER_S)
+                self.unplugged = True
         return self.served
 
-    def _step(self) -> bool:
-        """Wait for what comes first, deal with it; True when the scan has been sent."""
+    def _step(self) -> None:
+        """Wait for what comes first, and deal with it."""
         writable = [self._link] if self._waiting else []
         readable, _, _ = select.select([self._link], writable, [], self._patience_s())
         if readable:
             self._hear()
-        self._follow_device()
-        if self._begun is not None:
-            self._send_due((self._clock() - self._begun) * self._speed)
+        self._follow_commands()
+        number, elapsed_s = self._stage.now()
+        if self._device.streaming and self._link.connected():
+            if number != self._round and elapsed_s is not None:
+                self._round, self._next, self._finished_at, self.served = number, 0, 0.0, Served()
+            if elapsed_s is not None:
+                self._send_due(elapsed_s)
+            elif not self._leads:
+                self._hold_still()
         self._pass_on()
-        return self._begun is None and self._next > 0
+
+    def _left_alone(self) -> bool:
+        """Whether the host has what it needs: the device's own END or the host's STOP, or enough time for it."""
+        if self._waiting:
+            return False
+        return self._device.said_end or self._device.stopped or time.monotonic() - self._finished_at > LINGER_S
 
     def _pass_on(self) -> None:
         if self._waiting and not self.unplugged:
             del self._waiting[: self._link.write(bytes(self._waiting))]
 
     def _patience_s(self) -> float:
-        if self._begun is None or self._next >= len(self._device.times_s):
+        times = self._device.times_s
+        if not self._device.streaming or self._next >= len(times):
             return _IDLE_S
-        due = self._begun + float(self._device.times_s[self._next] - self._device.times_s[0]) / self._speed
-        return max(0.0, min(due - self._clock(), _IDLE_S))
+        _, elapsed_s = self._stage.now()
+        if elapsed_s is None:
+            return _HOLD_S
+        return max(0.0, min(self._stage.wait_s(float(times[self._next] - times[0]) - elapsed_s), _IDLE_S))
 
     def _hear(self) -> None:
         was_there = self._link.connected()
-        answer = self._device.hear(self._link.read())
-        self._waiting += answer
-        if was_there and not self._link.connected():
-            self._begun = None
+        self._waiting += self._device.hear(self._link.read())
+        if self._link.connected() and not was_there:
+            self._device.greet()
+        elif was_there and not self._link.connected():
             self._waiting.clear()
 
-    def _follow_device(self) -> None:
-        """Begin with the first record when the device begins to stream, stop when it stops."""
-        streaming = self._device.streaming and self._link.connected()
-        if streaming and self._begun is None and not (self._next and self._next >= len(self._device.times_s)):
-            self._begun, self._next, self.served = self._clock(), 0, Served()
-        elif not streaming and self._begun is not None:
-            self._begun, self._next = None, 0
+    def _follow_commands(self) -> None:
+        """Each START begins anew, also while the device streams; a device that leads takes the others with it."""
+        if self._device.starts != self._starts:
+            self._starts, self._held_at, self._held = self._device.starts, time.monotonic(), False
+            if self._leads:
+                self._stage.begin()
+        elif self._leads and (self._device.stopped or not self._link.connected()):
+            self._stage.end()
+
+    def _hold_still(self) -> None:
+        """Repeat the first record now and then; not just after a START, when the scan is about to begin."""
+        if time.monotonic() - self._held_at > (_HOLD_S if self._held else _SETTLE_S):
+            self._held_at, self._held = time.monotonic(), True
+            self._waiting += self._device.record(0)
 
     def _send_due(self, elapsed_s: float) -> None:
         times = self._device.times_s
+        if self._next >= len(times):
+            return
         while self._next < len(times) and times[self._next] - times[0] <= elapsed_s:
             moment = float(times[self._next] - times[0])
             if self._faults.disconnect_s is not None and moment >= self._faults.disconnect_s:
@@ -241,7 +331,7 @@ class Emulator:
             self._pass_on()  # at once: when this process was late, many are due and must not meet in the buffer
         if self._next >= len(times):
             self._waiting += self._device.end(self.served.sent, self.served.dropped)
-            self._begun = None
+            self._finished_at = time.monotonic()
 
     def _send(self, record: bytes, moment_s: float) -> None:
         if not record:
@@ -257,5 +347,5 @@ class Emulator:
     def _unplug(self) -> None:
         with contextlib.suppress(OSError):
             self._link.write(bytes(self._waiting))
-        self._begun, self.unplugged = None, True
+        self.unplugged = True
         self._link.close()
