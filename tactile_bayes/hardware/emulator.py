@@ -23,6 +23,7 @@ from tactile_bayes.hardware.emulated import Device, Faults
 BUFFER_BYTES: Final = 256 * 1024
 _READ: Final = 4096
 _LOOK_S: Final = 0.01
+_LOOKS: Final = 25
 _IDLE_S: Final = 0.2
 # A follower repeats its first record so often while the scan waits, but not so soon after a START.
 _HOLD_S: Final = 0.01
@@ -89,13 +90,15 @@ class PtyLink:
             return 0
 
     def finish(self, patience_s: float) -> None:
-        """Wait until nothing is left in the terminal's buffer, which goes with the terminal."""
-        end, left = time.monotonic() + patience_s, bytearray(4)
-        while time.monotonic() < end:
-            fcntl.ioctl(self._far, termios.FIONREAD, left)
-            if not any(left):
-                break
+        """Wait until nothing is left in the terminal's buffers, which go with the terminal.
+
+        Only the last of them says how much it holds, so it must have been empty for a while.
+        """
+        end, left, empty = time.monotonic() + patience_s, bytearray(4), 0
+        while time.monotonic() < end and empty < _LOOKS:
             time.sleep(_LOOK_S)
+            fcntl.ioctl(self._far, termios.FIONREAD, left)
+            empty = 0 if any(left) else empty + 1
         self.close()
 
     def close(self) -> None:

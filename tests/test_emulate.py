@@ -1,0 +1,137 @@
+"""Emulated devices: started again, ended when everything was read, and playing one scan together."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from emulated_devices import serving, short_scan
+
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_mcap import write_scan
+from tactile_bayes.hardware import head
+from tactile_bayes.hardware.drivers import TRACKERS
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Faults
+from tactile_bayes.hardware.emulator import Emulator, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.head import HeadParser, encode_command
+from tactile_bayes.hardware.ports import Port
+from tactile_bayes.hardware.readings import EndReading, FrameReading, PoseReading
+
+SCAN = short_scan(0.2)
+START = encode_command(head.START, every=1)
+
+
+def read_until(port: Port, parser, done) -> list:
+    """Readings until ``done(readings)``; fails when nothing comes for a while."""
+    found = []
+    while not done(found):
+        data = port.read_some(5.0)
+        assert data, f"nothing more came after {len(found)} readings"
+        found += parser.feed(data)
+    return found
+
+
+def ended(found) -> bool:
+    return bool(found) and isinstance(found[-1], EndReading)
+
+
+@pytest.mark.parametrize("link_of", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
+def test_a_head_that_has_sent_everything_can_be_started_again(link_of):
+    with serving(EmulatedHead(SCAN), link_of()) as emulator:
+        port = Port(emulator._link.url, baud=9600, role="head")
+        for _ in range(3):
+            port.write(START)
+            found = read_until(port, HeadParser(), ended)
+            assert sum(isinstance(one, FrameReading) for one in found) == len(SCAN.frames)
+        port.close()
+
+
+@pytest.mark.parametrize("protocol", ["fastrak", "liberty", "bird", "open"])
+def test_a_tracker_plays_from_each_start(protocol):
+    driver, number = TRACKERS[protocol], len(SCAN.poses)
+    with serving(EmulatedTracker(SCAN.poses, protocol=protocol), PtyLink()) as emulator:
+        port = Port(emulator._link.url, baud=9600, role="tracker")
+        for _ in range(2):
+            port.write(driver.start)
+            found = read_until(port, driver.parser(), lambda found: len(found) >= number)
+            np.testing.assert_allclose(found[0].position_mm, SCAN.poses.position_mm[0], atol=0.2)
+            np.testing.assert_allclose(found[number - 1].position_mm, SCAN.poses.position_mm[-1], atol=0.2)
+        port.close()
+
+
+def test_a_server_plays_for_each_host_that_connects():
+    with serving(EmulatedTracker(SCAN.poses, protocol="igtlink"), TcpLink("127.0.0.1", 0)) as emulator:
+        for _ in range(2):
+            port = Port(emulator._link.url, baud=9600, role="tracker")
+            read_until(port, TRACKERS["igtlink"].parser(), lambda found: len(found) == len(SCAN.poses))
+            port.close()
+            time.sleep(0.05)
+
+
+@pytest.mark.parametrize("link_of", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
+def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
+    link = link_of()
+    emulator = Emulator(
+        EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1), stage=Stage(speed=10.0)
+    )
+    thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
+    thread.start()
+    port = Port(link.url, baud=9600, role="head")
+    port.write(START)
+    time.sleep(1.0)  # the scan is over long before anything is read
+    found = read_until(port, HeadParser(), ended)
+    assert sum(isinstance(one, FrameReading) for one in found) == len(SCAN.frames)
+    port.close()
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+def test_a_tracker_waits_for_the_head_with_its_first_pose(monkeypatch):
+    monkeypatch.setattr("tactile_bayes.hardware.emulator._SETTLE_S", 0.05)
+    stage, driver = Stage(), TRACKERS["liberty"]
+    tracker = EmulatedTracker(SCAN.poses, protocol="liberty")
+    with (
+        serving(EmulatedHead(SCAN), PtyLink(), stage=stage) as leader,
+        serving(tracker, PtyLink(), stage=stage, leads=False) as follower,
+    ):
+        poses, frames = (Port(one._link.url, baud=9600, role="x") for one in (follower, leader))
+        poses.write(driver.start)
+        parser = driver.parser()
+        held = read_until(poses, parser, lambda found: len(found) >= 5)
+        assert {one.position_mm for one in held} == {held[0].position_mm}
+        frames.write(START)
+        played = read_until(poses, parser, lambda found: any(one.device_ns > 0 for one in found))
+        assert len(read_until(frames, HeadParser(), ended)) == len(SCAN.frames) + 2  # and HELLO and END
+        played += read_until(
+            poses, parser, lambda found: found and found[-1].device_ns >= SCAN.poses.time_s[-1] * 1e9 - 1e6
+        )
+        assert len({one.position_mm for one in played}) == len(SCAN.poses)
+        assert all(isinstance(one, PoseReading) for one in played)
+        poses.close()
+        frames.close()
+
+
+def test_a_replay_in_a_terminal_starts_at_once(tmp_path, child_environment):
+    write_scan(tmp_path / "scan.mcap", SCAN, provenance=Provenance("test", {}))
+    near, far = pty.openpty()
+    done = subprocess.run(
+        [sys.executable, "-m", "tactile_bayes", "replay", "scan.mcap", "-o", "again.mcap"],
+        cwd=tmp_path,
+        env=child_environment,
+        stdin=far,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    os.close(near)
+    os.close(far)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"again.mcap: scan, ended by the head stopped\n40 frames", done.stdout)
+    assert "caution" not in done.stdout
