@@ -192,3 +192,15 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
     z_axis = z_axis / size
     rotation = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis])
     return rigid(rotation, -rotation @ xiphoid_mm)
+
+
+def patient_from_plane(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, plane_from_base: FloatArray) -> FloatArray:
+    """Patient frame, as `patient_from_base`, from two landmarks in `base` and a plane whose z points into the body.
+
+    Returns
+    -------
+    (4, 4) transform from the plane to the patient.
+    """
+    patient = patient_from_base(sternal_notch_mm, xiphoid_mm, normal=plane_from_base[2, :3])
+    transform: FloatArray = patient @ inverse(plane_from_base)
+    return transform

@@ -116,12 +116,31 @@ def test_no_lump_is_an_answer_with_its_reason_and_exit_6(folder: Path, tmp_path:
     assert not output.exists()
 
 
+@pytest.mark.parametrize("option", ["--figure", "--map-figure"])
+def test_without_an_estimate_the_figure_is_the_map_with_what_was_looked_at_and_why(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    from tactile_bayes.report import map_figure
+
+    drawn: list[dict[str, Any]] = []
+    whole = map_figure.map_figure
+    monkeypatch.setattr(map_figure, "map_figure", lambda *given, **more: drawn.append(more) or whole(*given, **more))
+    done = run_here("estimate", "empty.nc", *FAST, option, tmp_path / "f.svg", cwd=folder)
+    assert done.returncode == 6
+    assert (tmp_path / "f.svg").read_bytes().startswith(b"<?xml")
+    (how,) = drawn
+    assert how["note"] == done.stdout.splitlines()[0]
+    assert how["title"] == "Tactile map: empty"
+    assert ("Passed over near" in done.stdout) == bool(how["looked_at"])
+
+
 def test_the_scan_without_a_mass_gives_no_estimate(run_cli: Run, shared_data: Path, tmp_path: Path) -> None:
     source = shared_data / "scans" / "s08_no_mass.npz"
     assert run_cli("import", source, "-o", "s.mcap", cwd=tmp_path).returncode == 0
     assert run_cli("map", "s.mcap", "-o", "m.nc", cwd=tmp_path).returncode == 0
-    done = run_cli("estimate", "m.nc", *FAST, "--json", cwd=tmp_path)
+    done = run_cli("estimate", "m.nc", *FAST, "--json", "--map-figure", "m.png", cwd=tmp_path)
     assert done.returncode == 6
+    assert (tmp_path / "m.png").read_bytes().startswith(b"\x89PNG")
     document = json.loads(done.stdout)
     assert document["status"] == "no_estimate"
     assert document["reason"]
@@ -184,7 +203,9 @@ def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
         (["a.nc", "b.nc", "-o", "p.nc"], 2, "one map at a time"),
         (["a.nc", "b.nc", "a.nc"], 2, "a.nc is given twice"),
         (["a.nc", "-o", "a.nc", "--force"], 2, "is an input"),
-        (["a.nc", "-o", "x", "--figure", "x"], 2, "one name"),
+        (["a.nc", "-o", "x.png", "--figure", "x.png"], 2, "one name"),
+        (["none.nc", "--figure", "f.jpg"], 2, "f.jpg has the suffix '.jpg'; a figure is written as one of .png, .pdf"),
+        (["none.nc", "--map-figure", "f"], 2, "has the suffix 'none'"),
         (["a.nc", "-o", "no/p.nc"], 2, "not a directory"),
         (["a.nc", "--interval", "1"], 2, "--interval"),
         (["a.nc", "--fit-radius-mm", "0"], 2, "--fit-radius-mm"),

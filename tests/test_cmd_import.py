@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
+from in_process import run_here
 
 import tactile_bayes
 from tactile_bayes.files.map_nc import read_map
@@ -39,6 +41,37 @@ def test_a_grid_becomes_a_map(run_cli: Run, tmp_path: Path) -> None:
     np.testing.assert_array_equal(grid.mean, [[1, 1.1, 1], [1, 1.3, np.nan]])
     assert grid.recipe.source == "grid"
     assert grid.background == 1.0
+
+
+def test_the_unit_of_a_grid_is_unknown_unless_told(tmp_path: Path) -> None:
+    (tmp_path / "g.csv").write_text("20,22,20\n21,30,20\n")
+    words = ("import", "g.csv", "--spacing-mm", 1)
+    done = run_here(*words, "-o", "g.nc", cwd=tmp_path)
+    assert "values 20 to 30 (unit unknown: give --units), background level unknown" in done.stdout
+    told = run_here(*words, "-o", "h.nc", "--units", "camera counts", cwd=tmp_path)
+    assert "values 20 to 30 camera counts, background" in told.stdout
+    for name, unit in (("g.nc", "unknown"), ("h.nc", "camera counts")):
+        shown = run_here("show", name, "--json", cwd=tmp_path)
+        assert json.loads(shown.stdout)["units"]["mean"] == unit
+    assert read_map(tmp_path / "h.nc").recipe.units == "camera counts"
+    assert not read_map(tmp_path / "g.nc").few.any()
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--units", "kPa", "--normalise", "mean"), "--units is for values that were not divided"),
+        (("--units", "\x1b[2J"), "is not a unit"),
+        (("--units", ""), "is not a unit"),
+        (("--units", "kPa", "--as", "scan"), "are for maps"),
+    ],
+)
+def test_a_unit_that_is_none_is_a_usage_error(tmp_path: Path, more: tuple[str, ...], words: str) -> None:
+    (tmp_path / "g.csv").write_text("1,1\n1,1\n")
+    done = run_here("import", "g.csv", "-o", "g.nc", "--spacing-mm", 1, *more, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert not (tmp_path / "g.nc").exists()
 
 
 def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ REFUSED = {
     "an unknown way": (["one.mcap", "--normalise", "median"], 2, "'mean', 'gain', 'none'"),
     "no window": (["one.mcap", "--pressure-window-kpa", "9", "3"], 3, "two rising pressures"),
     "no cell": (["one.mcap", "--cell-mm", "0"], 3, "cell_mm is 0.0; it must be positive"),
-    "figure over the map": (["one.mcap", "--figure", "map.nc"], 2, "choose another name"),
+    "figure over the map": (["one.mcap", "--figure", "map.nc"], 2, "written as one of .png, .pdf, .svg"),
     "no directory": (["one.mcap", "--figure", "nowhere/map.png"], 2, "nowhere is not a directory"),
 }
 

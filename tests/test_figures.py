@@ -13,8 +13,10 @@ import pytest
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-from tactile_bayes.report import figures
-from tactile_bayes.report.figures import FitContour, SizeInterval, map_figure, size_figure
+from tactile_bayes.report import map_figure as maps
+from tactile_bayes.report import size_figure as sizes
+from tactile_bayes.report.map_figure import FitContour, Place, map_figure
+from tactile_bayes.report.size_figure import SizeInterval, size_figure
 
 INTERVALS = {
     "max": SizeInterval(12.0, 18.0, 0.95, "equal-tailed"),
@@ -47,24 +49,20 @@ def png_size(path: Path) -> tuple[int, int]:
     return struct.unpack(">II", head[16:24])
 
 
+def _keeping(draw, kept: list):
+    def keep(axes, *more):
+        draw(axes, *more)
+        kept.append(axes)
+
+    return keep
+
+
 @pytest.fixture
 def axes(monkeypatch):
     """The figure that was written last, for looking at what is on it."""
     kept = []
-    original = figures._finish_size
-
-    def keep(one):
-        original(one)
-        kept.append(one)
-
-    monkeypatch.setattr(figures, "_finish_size", keep)
-    values = figures._draw_values
-
-    def keep_map(one, tactile_map):
-        values(one, tactile_map)
-        kept.append(one)
-
-    monkeypatch.setattr(figures, "_draw_values", keep_map)
+    for module, name in ((sizes, "_finish_size"), (maps, "_draw_values")):
+        monkeypatch.setattr(module, name, _keeping(getattr(module, name), kept))
     return kept
 
 
@@ -103,17 +101,86 @@ def test_the_viewer_looks_into_the_tissue_with_the_notch_above(tmp_path, axes, n
     assert axes[0].xaxis_inverted() != axes[0].yaxis_inverted()
 
 
-def test_an_imported_grid_is_drawn_as_it_is(tmp_path, axes):
+def test_an_imported_grid_is_drawn_as_its_file_reads(tmp_path, axes):
     map_figure(replace(bump_map(), plane_from_base=None), tmp_path / "map.png")
     assert not axes[0].xaxis_inverted()
-    assert not axes[0].yaxis_inverted()
+    assert axes[0].yaxis_inverted()
 
 
-def test_the_fit_is_drawn_as_ellipses_of_one_and_two_sigma(tmp_path, axes):
-    map_figure(bump_map(), tmp_path / "map.png", fit=FIT)
+def test_the_size_is_drawn_and_one_sigma_of_the_bump_is_named_as_no_lump(tmp_path, axes):
+    map_figure(bump_map(), tmp_path / "map.png", fit=replace(FIT, size_mm=(14.0, 10.0)))
     ellipses = axes[0].patches
-    assert [(one.width, one.height, one.angle) for one in ellipses] == [(12.0, 8.0, 20.0), (24.0, 16.0, 20.0)]
+    assert [(one.width, one.height, one.angle) for one in ellipses] == [(14.0, 10.0, 20.0), (12.0, 8.0, 20.0)]
     assert {one.center for one in ellipses} == {(3.0, -2.0)}
+    labels = [text.get_text() for text in axes[0].get_legend().get_texts()]
+    assert labels == ["size, median 14.0 by 10.0 mm", "fitted bump, 1 sigma (not the lump's edge)"]
+
+
+def test_an_ellipse_turns_with_a_plane_that_is_shown_by_a_quarter_turn(tmp_path, axes):
+    """With the notch along x the picture has y across: the ellipse's long axis keeps its cells."""
+    to_patient = rigid(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    map_figure(replace(bump_map(), patient_from_plane=to_patient), tmp_path / "map.png", fit=FIT)
+    (ellipse,) = axes[0].patches
+    assert (ellipse.center, ellipse.width, ellipse.height, ellipse.angle) == ((-2.0, 3.0), 8.0, 12.0, -20.0)
+    (image,) = axes[0].images
+    np.testing.assert_array_equal(np.asarray(image.get_array().filled(np.nan)), bump_map().mean.T)
+
+
+def test_a_rib_beside_the_lump_does_not_take_all_colours(tmp_path, axes):
+    ribbed = bump_map()
+    mean = ribbed.mean.copy()
+    mean[-6:] = 4.0
+    map_figure(replace(ribbed, mean=mean), tmp_path / "map.png", fit=replace(FIT, amplitude=0.5))
+    assert axes[0].images[0].get_clim()[1] == pytest.approx(1 + 1.25 * 0.5)
+    map_figure(replace(ribbed, mean=mean), tmp_path / "all.png")
+    assert axes[1].images[0].get_clim()[1] == 4.0
+
+
+def test_places_that_were_looked_at_are_marked_with_their_reasons(tmp_path, axes):
+    places = [Place((float(i), 0.0), f"reason {i}") for i in range(6)]
+    map_figure(bump_map(), tmp_path / "map.png", looked_at=places, note="No estimate: nothing there.")
+    crosses = [line for line in axes[0].lines if line.get_marker() == "x"]
+    assert [line.get_xdata()[0] for line in crosses] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    words = "\n".join(text.get_text() for text in axes[0].figure.axes[1].texts)
+    assert "4  (3, 0) mm: reason 3\nand 2 lower ones" in words
+    assert axes[0].figure.get_suptitle() == "No estimate: nothing there."
+
+
+def test_a_grid_without_counts_is_not_hatched_and_its_unit_is_unknown(tmp_path, axes):
+    whole = bump_map()
+    recipe = MapRecipe("grid", "none", 1.0)
+    grid = replace(whole, count=(whole.count > 0).astype(int), recipe=recipe, plane_from_base=None, background=None)
+    map_figure(grid, tmp_path / "grid.png")
+    left, right, *_ = axes[0].figure.axes
+    assert not hatching(left) + hatching(right)
+    assert left.child_axes[0].get_ylabel() == "value (unit unknown)"
+    map_figure(replace(grid, recipe=replace(recipe, units="counts")), tmp_path / "counts.png")
+    assert axes[1].child_axes[0].get_ylabel() == "value (counts)"
+    known = replace(grid, count=np.where(whole.count > 0, 3, 0))
+    assert known.few.sum() == known.covered.sum()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "begins"), [(".png", b"\x89PNG\r\n"), (".PDF", b"%PDF-1."), (".svg", b"<?xml version")]
+)
+def test_a_figure_is_what_its_suffix_says_in_the_same_bytes_each_time(tmp_path, suffix, begins):
+    for name in ("a", "b"):
+        map_figure(bump_map(), tmp_path / f"{name}{suffix}", fit=FIT)
+        size_figure(draws(0, 15), draws(1, 12), tmp_path / f"size-{name}{suffix}", intervals=INTERVALS)
+    for name in ("", "size-"):
+        written = (tmp_path / f"{name}a{suffix}").read_bytes()
+        assert written.startswith(begins)
+        assert written == (tmp_path / f"{name}b{suffix}").read_bytes()
+        assert b"Matplotlib v" not in written
+        assert b"CreationDate" not in written
+        assert b"<dc:date>" not in written
+
+
+@pytest.mark.parametrize("name", ["map.jpg", "map", "map.png.bak"])
+def test_another_suffix_is_refused(tmp_path, name):
+    with pytest.raises(UsageError, match=r"written as one of \.png, \.pdf, \.svg"):
+        map_figure(bump_map(), tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def few_map() -> TactileMap:
@@ -204,9 +271,20 @@ def test_a_size_is_drawn_with_its_intervals_named(tmp_path, axes):
         size_figure(draws(0, 15), draws(1, 12), tmp_path / name, intervals=INTERVALS, truth=(15.0, 13.0))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert [text.get_text() for text in axes[0].texts] == [
-        "12.0 to 18.0 mm, 95 % equal-tailed interval",
-        "9.0 to 15.0 mm, 95 % equal-tailed interval",
+        "12.0 to 18.0 mm: 95 % interval (equal-tailed)",
+        "9.0 to 15.0 mm: 95 % interval (equal-tailed)",
     ]
+
+
+def test_the_axis_of_sizes_ends_near_its_intervals_and_medians_are_marked(tmp_path, axes):
+    heavy = np.concatenate([draws(0, 15), [90.0, 120.0]])
+    size_figure(heavy, draws(1, 12), tmp_path / "a.png", intervals=INTERVALS, title="Size of the lump: s01")
+    low, high = axes[0].get_xlim()
+    assert 5 < low < 9
+    assert 18 < high < 22
+    assert axes[0].get_title(loc="left") == "Size of the lump: s01"
+    marks = [float(one.get_segments()[0][0][0]) for one in axes[0].collections if hasattr(one, "get_segments")]
+    assert sorted(marks) == pytest.approx(sorted([np.median(heavy), np.median(draws(1, 12))]))
 
 
 def test_densities_have_area_one_and_their_draws_mean(tmp_path, axes):
@@ -243,7 +321,7 @@ def test_no_window_system_is_asked_for(run_python, tmp_path):
         [
             "import sys, numpy as np",
             "from pathlib import Path",
-            "from tactile_bayes.report.figures import size_figure",
+            "from tactile_bayes.report.size_figure import size_figure",
             "r = np.random.default_rng(0)",
             "size_figure(r.normal(15, 1, 99), r.normal(12, 1, 99), Path('s.png'), intervals={})",
             "assert 'matplotlib.pyplot' not in sys.modules, 'pyplot'",
@@ -251,3 +329,26 @@ def test_no_window_system_is_asked_for(run_python, tmp_path):
     )
     done = run_python("-c", code, cwd=tmp_path, env={"MPLBACKEND": "module://nowhere"})
     assert done.returncode == 0, done.stderr
+
+
+def test_every_command_that_draws_refuses_another_suffix_before_any_work():
+    import importlib
+
+    import click
+
+    from tactile_bayes.cli import COMMANDS
+    from tactile_bayes.commands.figure_path import FigurePath
+
+    def commands(command: click.Command) -> list[click.Command]:
+        if not isinstance(command, click.Group):
+            return [command]
+        inner = [command.get_command(click.Context(command), name) for name in command.list_commands(None)]
+        return [one for part in inner for one in commands(part)]
+
+    found = []
+    for module, _ in COMMANDS.values():
+        top = importlib.import_module(f"tactile_bayes.commands.{module}").command
+        for command in commands(top):
+            found += [one.type for one in command.params if one.name in ("figure", "map_figure")]
+    assert len(found) == 6  # map, two of estimate, sbc, tradeoff estimate and forward
+    assert all(isinstance(one, FigurePath) for one in found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import itertools
 import json
 import re
@@ -16,11 +17,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from emulated_devices import short_scan
+from PIL import Image
 from test_hw_live import seen_of
+from test_orientation import UPPER_RIGHT, corner, live_state, lump_in_base
 from websockets.sync.client import ClientConnection, connect
 
 from tactile_bayes.hardware.live import LiveMap
-from tactile_bayes.hardware.serve import LiveServer
+from tactile_bayes.hardware.serve import LiveServer, document
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [
@@ -116,9 +119,44 @@ def test_the_page_shows_the_map_and_its_tone_tells_low_in_range_and_high(page, t
             "if (d[i] > 200 && d[i + 1] > 200 && d[i + 3] === 255) n++; return n; })()"
         )
         assert 0 < bright < np.isfinite(state.tactile_map.mean).sum() / 4
+        sent = document(state)["map"]
+        drawn = page.value(f"Array.from(element('map').getContext('2d').getImageData(0, 0, {columns}, {rows}).data)")
+        shown = np.array(drawn).reshape(rows, columns, 4)
+        known = np.array([one is not None for one in sent["levels"]]).reshape(rows, columns)
+        np.testing.assert_array_equal(shown[..., 3] == 255, known)
+        texts = page.value("Array.from(document.querySelectorAll('#over text')).map((one) => one.textContent)")
+        assert texts[:5] == [*(sent["edges"][side] for side in ("left", "right", "top", "bottom")), "10 mm"]
+        assert page.value("element('words').textContent") == sent["words"]
         shot = base64.b64decode(page.call("Page.captureScreenshot")["data"])
         (tmp_path / "page.png").write_bytes(shot)
         assert len(shot) > 5000
     finally:
         server.close()
     page.until("document.body.dataset.tone === 'off'")
+
+
+@pytest.mark.parametrize("head_deg", [270, 0, None])
+def test_the_page_draws_the_lump_on_the_upper_right(page, head_deg):
+    state = live_state(head_deg)
+    state = replace(state, lump_base_mm=lump_in_base(head_deg))
+    server = LiveServer("127.0.0.1", 0)
+    try:
+        page.call("Page.navigate", url=server.url)
+        page.until("document.readyState === 'complete' && socket.readyState === 1")
+        server.show(state)
+        page.until("document.querySelectorAll('#over text').length > 0")
+        shot = base64.b64decode(page.call("Page.captureScreenshot")["data"])
+        box = page.value(
+            "(() => { const b = element('map').getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })()"
+        )
+    finally:
+        server.close()
+    left, top, width, height = (round(one) for one in box)
+    pixels = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=float)[
+        top : top + height, left : left + width
+    ]
+    rows, columns = np.nonzero(pixels.max(axis=2) > 10)
+    drawn = pixels[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    yellow = (drawn[..., 0] > 180) & (drawn[..., 1] > 180) & (drawn[..., 2] < 100)
+    assert yellow.sum() > 50
+    assert corner(np.where(yellow, 1.0, 0.0)) == UPPER_RIGHT

@@ -15,10 +15,10 @@ from emulated_devices import head_and_tracker, short_scan
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tactile_bayes.commands.live_view import Turn, estimate_text
+from tactile_bayes.commands.live_view import Turn, live_estimate
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.account import Report
-from tactile_bayes.hardware.feed import Feed, FeedReader, SeenFrame, SeenPose
+from tactile_bayes.hardware.feed import Feed, FeedReader, SeenFrame, SeenLandmark, SeenPose
 from tactile_bayes.hardware.live import LiveMap, LiveState, grey_levels
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
@@ -67,8 +67,10 @@ def test_what_is_fed_is_seen(scan, pipe):
     reader, feed = pipe
     feed.frame(scan.frames.counts[3], 15_000_000)
     feed.pose(pose_of(scan, 2), 16_666_667)
+    feed.landmark("xiphoid", np.array([1.0, -2.5, 3.0]))
     feed.told(Report(frames=4, landmarks=["xiphoid"]))
-    frame, pose, report = reader.read(0.0)
+    frame, pose, landmark, report = reader.read(0.0)
+    assert landmark == SeenLandmark("xiphoid", (1.0, -2.5, 3.0))
     np.testing.assert_array_equal(frame.counts, scan.frames.counts[3])
     assert (frame.device_ns, pose.device_ns) == (15_000_000, 16_666_667)
     assert pose.position_mm == pose_of(scan, 2).position_mm
@@ -118,6 +120,34 @@ def test_the_tone_follows_the_window(kpa, tone, said):
     json.dumps(document(state), allow_nan=False)
 
 
+def test_a_view_says_why_there_is_no_size_yet(state):
+    assert "no frames have come" in LiveState().size_words
+    assert "the tracker has sent no pose" in LiveState(frames=9).size_words
+    assert "pressed at 5 to 14 kPa" in LiveState(frames=9, poses=5).size_words
+    assert "the first estimate is being computed" in replace(state, size="").size_words
+    for blank in (LiveState(), replace(state, pressure_kpa=np.nan)):
+        assert "nan" not in live_text(blank, columns=80, lines=24, colour=False)
+        assert "nan" not in live_line(blank)
+
+
+def test_a_screen_names_its_keys_colours_scale_and_the_lump(state):
+    marked = replace(state, lump_base_mm=np.linalg.inv(state.tactile_map.plane_from_base)[:3, 3])
+    text = live_text(marked, columns=100, lines=40, colour=False, keys=True)
+    assert "keys: n sternal notch, x xiphoid, space start, q stop" in text
+    assert "pressure / mean of its frame: dark " in text
+    assert "a character is 1 mm wide; X the lump" in text
+    assert sum(line.count("X") for line in text.splitlines() if line.startswith("    ")) == 1
+    assert "1.0 s, 200 frames" in text
+    assert "keys" not in live_text(state, columns=100, lines=40, colour=False)
+
+
+def test_landmarks_in_one_place_give_a_view_no_patient_axes(scan):
+    live = LiveMap(scan.head, scan.element_calibration)
+    live.take([SeenLandmark(name, (1.0, 2.0, 3.0)) for name in ("sternal_notch", "xiphoid")])
+    live.take(seen_of(scan))
+    assert live.state().tactile_map.patient_from_plane is None
+
+
 @pytest.mark.parametrize(("columns", "lines"), [(110, 40), (60, 20), (30, 8)])
 @pytest.mark.parametrize("colour", [True, False])
 def test_a_screen_fits_and_says_what_matters(state, columns, lines, colour):
@@ -162,7 +192,7 @@ def test_record_shows_a_line_a_second_where_it_cannot_draw(run_cli, tmp_path, sc
         done = run_cli("record", "-o", "a.mcap", *words, cwd=tmp_path, env={"TERM": "dumb"})
     assert done.returncode == 0, done.stderr
     assert "frames lost 0" in done.stdout
-    assert re.search(r"kPa in range; \d+ frames, 0 lost", done.stderr)
+    assert re.search(r"kPa in range; [\d.]+ s, \d+ frames, 0 lost", done.stderr)
     assert re.search(r"live view: http://127\.0\.0\.1:\d+/\?token=\S{32}", done.stderr)
 
 
@@ -250,10 +280,12 @@ def test_the_live_estimate_is_the_estimate(state):
     from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
     from tactile_bayes.posterior.fit import FitOptions
 
-    text = estimate_text(state.tactile_map, None, Turn())
+    text, lump_base_mm = live_estimate(state.tactile_map, None, Turn())
     options = EstimateOptions(method="laplace", fit=FitOptions(rotation="off"))
     found = estimate_map(state.tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     assert text.startswith(f"map width sigma {np.median(widths):.1f} mm (")
     flat = replace(state.tactile_map, mean=np.where(state.tactile_map.covered, 1.0, np.nan))
-    assert estimate_text(flat, None, Turn()).startswith("no estimate: ")
+    assert live_estimate(flat, None, Turn()).text.startswith("no estimate: ")
+    x, y = replace(state, lump_base_mm=lump_base_mm).lump_mm
+    assert (x, y) == pytest.approx((np.median(found.map_posterior.x_mm), np.median(found.map_posterior.y_mm)), abs=0.05)

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
+from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import WholeOrAuto
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
 
 if TYPE_CHECKING:
-    from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.estimate import Estimate
+    pass
 
 _FILE = click.Path(path_type=Path)
 _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
@@ -43,8 +43,15 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 )
 @click.option("-o", "--output", metavar="POST.nc", type=_FILE, help="Write all draws (netCDF that arviz opens).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
-@click.option("--figure", metavar="FIG.png", type=_FILE, help="Draw the size posterior.")
-@click.option("--map-figure", metavar="FIG.png", type=_FILE, help="Draw the map with the fitted ellipse.")
+@click.option(
+    "--figure", metavar=METAVAR, type=FigurePath(), help="Draw the size posterior; the map, where there is none."
+)
+@click.option(
+    "--map-figure",
+    metavar=METAVAR,
+    type=FigurePath(),
+    help="Draw the map with the lump's size, or with the places looked at.",
+)
 @click.option(
     "--background",
     type=click.Choice(["fixed", "free"]),
@@ -189,6 +196,8 @@ def command(
     )
     if checkpoint is not None and len(maps) > 1:
         raise UsageError("--checkpoint takes one map at a time")
+    if figure is not None and size_calibration == "none":
+        raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
     outputs = {"output": output, "figure": figure, "map figure": map_figure}
     _check_outputs([path for path in outputs.values() if path], maps, _named(size_calibration), pool, force=force)
     begun = time.perf_counter()
@@ -248,15 +257,16 @@ def _one_map(
 
     with progress_bar("effective draws") as progress:
         tactile_map, estimate, provenance = run_map(path, settings, progress=progress)
-    if estimate.status == "estimate":
-        if output:
-            from tactile_bayes.files.posterior_nc import write_posterior
+    if output and estimate.status == "estimate":
+        from tactile_bayes.files.posterior_nc import write_posterior
 
-            write_posterior(output, estimate, provenance=provenance, force=force)
-        if figure:
-            _draw_size(estimate, figure, settings.interval, force=force)
-        if map_figure:
-            _draw_map(tactile_map, estimate, map_figure, force=force)
+        write_posterior(output, estimate, provenance=provenance, force=force)
+    if figure or map_figure:
+        from tactile_bayes.commands.estimate_figures import draw_figures
+
+        draw_figures(
+            tactile_map, estimate, figure, map_figure, name=path.stem, probability=settings.interval, force=force
+        )
     return answer_of(tactile_map, estimate, provenance, settings)
 
 
@@ -272,33 +282,6 @@ def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, sche
             partial(answer_map, settings=settings), maps, key=str, executor=executor, progress=progress
         )
     return [o.value if o.value is not None else Answer(None, f"error: {o.key}: {o.error}", 1) for o in outcomes]
-
-
-def _draw_size(estimate: Estimate, path: Path, probability: float, *, force: bool) -> None:
-    from tactile_bayes.posterior.quantity import summarise
-    from tactile_bayes.report.figures import SizeInterval, size_figure
-
-    if estimate.size is None or estimate.draws is None:
-        raise UsageError("the size figure needs --size-calibration; --map-figure draws the fit")
-    draws = {"max": estimate.size.max_size_mm.ravel(), "min": estimate.size.min_size_mm.ravel()}
-    worth = estimate.draws.effective_draws
-    quantities = {n: summarise(d, probability=probability, effective_draws=worth) for n, d in draws.items()}
-    intervals = {n: SizeInterval(q.low, q.high, q.probability, q.kind) for n, q in quantities.items()}
-    size_figure(draws["max"], draws["min"], path, intervals=intervals, force=force)
-
-
-def _draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path, *, force: bool) -> None:
-    import numpy as np
-
-    from tactile_bayes.report.figures import FitContour, map_figure
-
-    posterior = estimate.map_posterior
-    if posterior is None:
-        return
-    names = ("x_mm", "y_mm", "sigma_x_mm", "sigma_y_mm", "angle_rad")
-    x, y, sigma_x, sigma_y, angle = (float(np.median(getattr(posterior, name))) for name in names)
-    contour = FitContour((x, y), sigma_x, sigma_y, float(np.degrees(angle)))
-    map_figure(tactile_map, path, fit=contour, force=force)
 
 
 def _print(maps: tuple[Path, ...], answers: list[Answer], *, as_json: bool) -> None:

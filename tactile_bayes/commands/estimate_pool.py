@@ -68,7 +68,7 @@ def estimate_pool(
     )
     check_document(document, "pooled.schema.json", path=Path("the report"))
     if pooled.size is not None:
-        _write(pooled, settings, output, figure, provenance=provenance, force=force)
+        _write(pooled, maps, settings, output, figure, provenance=provenance, force=force)
     click.echo(dump_json(document) if as_json else pooled_text(document), nl=False)
     return EXIT_DONE if pooled.size is not None else EXIT_NO_ESTIMATE
 
@@ -106,6 +106,7 @@ def _plain(settings: Settings) -> dict[str, Any]:
 
 def _write(
     pooled: PooledEstimate,
+    maps: tuple[Path, ...],
     settings: Settings,
     output: Path | None,
     figure: Path | None,
@@ -120,10 +121,7 @@ def _write(
 
         write_pooled(output, size, provenance=provenance, force=force)
     if figure is not None:
-        from tactile_bayes.posterior.quantity import summarise
-        from tactile_bayes.report.figures import SizeInterval, size_figure
+        from tactile_bayes.commands.estimate_figures import draw_size
 
         draws = {"max": size.max_size_mm.ravel(), "min": size.min_size_mm.ravel()}
-        found = {n: summarise(d, probability=settings.interval, effective_draws=len(d)) for n, d in draws.items()}
-        intervals = {n: SizeInterval(q.low, q.high, q.probability, q.kind) for n, q in found.items()}
-        size_figure(draws["max"], draws["min"], figure, intervals=intervals, force=force)
+        draw_size(draws, figure, name=f"{len(maps)} maps pooled", probability=settings.interval, force=force)

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.scan import Scan
 
+_LONGEST_UNITS = 20
+
 
 @click.command("import")
 @click.argument("source", metavar="SRC", type=click.Path(path_type=Path))
@@ -30,28 +32,53 @@ if TYPE_CHECKING:
     type=click.Choice(NORMALISE),
     help="Map: how the values were divided already; none (the default) if they were not.",
 )
+@click.option(
+    "--units", metavar="TEXT", help="Map: unit of values that were not divided, such as kPa. Default: unknown."
+)
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 def command(
-    *, source: Path, output: Path, kind: str | None, spacing_mm: float | None, normalise: str | None, force: bool
+    *,
+    source: Path,
+    output: Path,
+    kind: str | None,
+    spacing_mm: float | None,
+    normalise: str | None,
+    units: str | None,
+    force: bool,
 ) -> None:
     """Bring other people's data in.
 
     SRC is an .npz of raw counts and poses (a scan), a scan file to repair (what is intact is kept), or a grid of
-    values (a map): .npz with `mean`, .csv, or a grey .tif, .pgm or .png image. Row 0 of a grid is its lowest y.
+    values (a map): .npz with `mean`, .csv, or a grey .tif, .pgm or .png image. The first row of a grid has the lowest
+    y and the first column the lowest x; pictures of the map show the first row on top, as the file reads.
     """
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing
 
     refuse_existing(output, force=force)
     kind = kind or ("scan" if source.suffix.lower() in (".npz", ".mcap") else "map")
-    if kind == "scan" and (spacing_mm is not None or normalise is not None):
-        raise UsageError("--spacing-mm and --normalise are for maps; leave them out or give --as map")
+    if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
+        raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
+    _check_units(units, normalise)
     if kind == "scan":
         lines = _import_scan(source, output, force=force)
     else:
-        lines = _import_map(source, output, spacing_mm=spacing_mm, normalise=normalise or "none", force=force)
+        lines = _import_map(
+            source, output, spacing_mm=spacing_mm, normalise=normalise or "none", units=units or "", force=force
+        )
     for line in (f"{output}: {kind}", *lines, RESEARCH_USE):
         click.echo(line)
+
+
+def _check_units(units: str | None, normalise: str | None) -> None:
+    from tactile_bayes.errors import UsageError
+
+    if units is None:
+        return
+    if normalise not in (None, "none"):
+        raise UsageError(f"--units is for values that were not divided; leave it out or --normalise {normalise}")
+    if not (units.isprintable() and 0 < len(units.strip()) <= _LONGEST_UNITS):
+        raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
 
 
 def _import_scan(source: Path, output: Path, *, force: bool) -> list[str]:
@@ -72,13 +99,15 @@ def _import_scan(source: Path, output: Path, *, force: bool) -> list[str]:
     return [*describe_scan(scan), *(f"lost: {line}" for line in lost)]
 
 
-def _import_map(source: Path, output: Path, *, spacing_mm: float | None, normalise: str, force: bool) -> list[str]:
+def _import_map(
+    source: Path, output: Path, *, spacing_mm: float | None, normalise: str, units: str, force: bool
+) -> list[str]:
     from tactile_bayes.files.grid_import import read_grid
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
 
-    tactile_map = read_grid(source, spacing_mm=spacing_mm, normalise=normalise)
-    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise}
+    tactile_map = read_grid(source, spacing_mm=spacing_mm, normalise=normalise, units=units)
+    settings = {"as": "map", "spacing_mm": tactile_map.recipe.cell_mm, "normalise": normalise, "units": units}
     provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
     write_map(output, tactile_map, provenance=provenance, force=force)
     return _describe_map(tactile_map)
@@ -93,8 +122,15 @@ def _describe_map(tactile_map: TactileMap) -> list[str]:
     level = "unknown" if tactile_map.background is None else f"{tactile_map.background:g}"
     return [
         f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
-        f"values {low:.4g} to {high:.4g}, background level {level} (normalise {tactile_map.recipe.normalise})",
+        f"values {low:.4g} to {high:.4g}{_unit(tactile_map)}, background level {level} "
+        f"(normalise {tactile_map.recipe.normalise})",
     ]
+
+
+def _unit(tactile_map: TactileMap) -> str:
+    """Of the values, after them; nothing where they were divided."""
+    unit = tactile_map.recipe.value_unit
+    return "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
 
 
 def describe_scan(scan: Scan) -> list[str]:

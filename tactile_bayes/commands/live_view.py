@@ -18,12 +18,13 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.hardware.live import LiveMap, LiveState
     from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.posterior.estimate import MapPosterior
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
     from tactile_bayes.posterior.size_calibration import SizeCalibration
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
@@ -54,6 +55,7 @@ def live_view(
         "head": head_document(head),
         "calibration": calibration_document(calibration),
         "terminal": terminal,
+        "keys": sys.stdin.isatty(),
         "serve": serve,
         "size_calibration": _calibration_file(size_calibration),
     }
@@ -76,15 +78,30 @@ def live_view(
             process.wait()
 
 
+class LiveAnswer(NamedTuple):
+    """What one look at the map came to; nothing where the answer before stands.
+
+    Parameters
+    ----------
+    text
+        The size in a line, or why there is none.
+    lump_base_mm : (3,) array or None
+        Centre of the lump in `base`.
+    """
+
+    text: str = ""
+    lump_base_mm: FloatArray | None = None
+
+
 class Estimator:
     """Estimates the size of the newest map in a process of its own, again and again."""
 
     def __init__(self, calibration: str | None) -> None:
         self._calibration = calibration
         self._pool: ProcessPoolExecutor | None = None
-        self._running: Future[str] | None = None
+        self._running: Future[LiveAnswer] | None = None
         self._begun: float = 0.0
-        self.text = ""
+        self.answer = LiveAnswer()
         self.done = 0
         self.seconds = 0.0
 
@@ -93,14 +110,14 @@ class Estimator:
         import multiprocessing
 
         self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
-        self._running, self._begun = self._pool.submit(str), time.monotonic()
+        self._running, self._begun = self._pool.submit(LiveAnswer), time.monotonic()
 
     def look(self, tactile_map: TactileMap | None) -> None:
         """Take the answer that has come, and ask anew."""
         if self._running is not None and self._running.done():
             with contextlib.suppress(Exception):  # the estimate's process died: the view goes on without
                 answer = self._running.result()
-                self.text, self.done = answer or self.text, self.done + 1
+                self.answer, self.done = answer if answer.text else self.answer, self.done + 1
             self.seconds, self._running = time.monotonic() - self._begun, None
         if self._running is None and tactile_map is not None:
             self._ask(tactile_map)
@@ -109,7 +126,7 @@ class Estimator:
         self._begun = time.monotonic()
         with contextlib.suppress(RuntimeError):  # a broken pool takes no work
             if self._pool is not None:
-                self._running = self._pool.submit(estimate_text, tactile_map, self._calibration)
+                self._running = self._pool.submit(live_estimate, tactile_map, self._calibration)
 
     def close(self) -> None:
         """Let its process go."""
@@ -176,8 +193,8 @@ def _calibration_of(path: str) -> SizeCalibration | LogQuadratic:
     return read_size_calibration(Path(path))
 
 
-def estimate_text(tactile_map: TactileMap, calibration_path: str | None, turn: Turn = _TURN) -> str:
-    """The size in a line, by the quick method; the reason when there is none, nothing when the line before stands."""
+def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: Turn = _TURN) -> LiveAnswer:
+    """The size by the quick method and where the lump is; the reason when there is none."""
     import numpy as np
 
     from tactile_bayes.errors import TactileBayesError
@@ -189,7 +206,7 @@ def estimate_text(tactile_map: TactileMap, calibration_path: str | None, turn: T
     try:
         centres = candidate_centres(tactile_map)
         if not centres:
-            return "no estimate: nothing rises above the background"
+            return LiveAnswer("no estimate: nothing rises above the background")
         centre = centres[turn.of(len(centres))]
         calibration = _calibration_of(calibration_path) if calibration_path else None
         # whether an ellipse is turned is a question for afterwards, and takes a third of the time
@@ -200,16 +217,30 @@ def estimate_text(tactile_map: TactileMap, calibration_path: str | None, turn: T
         options = EstimateOptions(method="laplace", fit=fit, draws=LIVE_DRAWS)
         found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
     except TactileBayesError as error:
-        return f"no estimate: {error}" if turn.tell(lump=False) else ""
+        return LiveAnswer(f"no estimate: {error}" if turn.tell(lump=False) else "")
     width = None if found.fit is None else float(np.sqrt(np.prod(found.fit.widths()[:2])))
     if not turn.tell(lump=found.status == "estimate", width_mm=width):
-        return ""
+        return LiveAnswer()
     if found.status != "estimate" or found.map_posterior is None:
-        return f"no estimate: the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
+        why = f"the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
+        return LiveAnswer(f"no estimate: {why}")
+    lump = _in_base(tactile_map, found.map_posterior)
     if found.size is not None:
-        return _interval("largest size", found.size.max_size_mm, INTERVAL)
+        return LiveAnswer(_interval("largest size", found.size.max_size_mm, INTERVAL), lump)
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
-    return _interval("map width sigma", widths, INTERVAL)
+    return LiveAnswer(_interval("map width sigma", widths, INTERVAL), lump)
+
+
+def _in_base(tactile_map: TactileMap, posterior: MapPosterior) -> FloatArray | None:
+    """The lump's centre in `base`, where it stays when the plane of the map changes."""
+    import numpy as np
+
+    from tactile_bayes.geometry import apply, inverse
+
+    if tactile_map.plane_from_base is None:
+        return None
+    centre = np.array([np.median(posterior.x_mm), np.median(posterior.y_mm), 0.0])
+    return apply(inverse(tactile_map.plane_from_base), centre)
 
 
 def _interval(name: str, draws: FloatArray, probability: float) -> str:
@@ -241,7 +272,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
             print(f"live view: {server.url}", file=sys.stderr, flush=True)
             showing.append(server.show)
         if setup["terminal"]:
-            showing.append(stack.enter_context(terminal_view()))
+            showing.append(stack.enter_context(terminal_view(keys=setup["keys"])))
         began = time.monotonic()
         drawings = _look(reader, live, estimator, showing)
         if not sys.stderr.isatty():
@@ -259,7 +290,7 @@ def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callab
         if now - drawn < 1 / DRAWINGS_PER_S:
             continue
         drawn, drawings = now, drawings + 1
-        state = live.state(size=estimator.text)
+        state = live.state(size=estimator.answer.text, lump_base_mm=estimator.answer.lump_base_mm)
         newest = state.tactile_map
         for show in showing:
             show(state)
@@ -267,8 +298,11 @@ def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callab
 
 
 @contextlib.contextmanager
-def terminal_view() -> Iterator[Callable[[LiveState], None]]:
-    """Draws on a terminal; a line a second where it cannot be drawn on."""
+def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]]:
+    """Draws on a terminal; a line a second where it cannot be drawn on.
+
+    `keys` says whether the recording's keys can be pressed there.
+    """
     from tactile_bayes.report.live_text import colours_wanted, live_line, live_text
 
     out = sys.stderr
@@ -287,7 +321,7 @@ def terminal_view() -> Iterator[Callable[[LiveState], None]]:
 
     def draw(state: LiveState) -> None:
         columns, lines = shutil.get_terminal_size()
-        text = live_text(state, columns=columns - 1, lines=lines - 1, colour=colour)
+        text = live_text(state, columns=columns - 1, lines=lines - 1, colour=colour, keys=keys)
         out.write("\x1b[H" + text.replace("\n", "\x1b[K\r\n") + "\x1b[J")
         out.flush()
 

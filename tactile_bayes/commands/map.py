@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import NumberOr
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
 
 if TYPE_CHECKING:
-    from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.scan import Scan
 
 _FILE = click.Path(path_type=Path)
@@ -59,7 +59,7 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "--register-strokes", is_flag=True, help="Shift the strokes onto each other, for a lump that follows the head."
 )
-@click.option("--figure", metavar="FIG.png", type=_FILE, help="Draw the map and its coverage.")
+@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the map and its coverage.")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 @click.option("-v", "--verbose", is_flag=True, help="Say on stderr how long each step took.")
 def command(
@@ -119,7 +119,9 @@ def command(
     inputs = hash_inputs(**{f"scan_{number}": path for number, path in enumerate(scans, start=1)})
     write_map(output, tactile_map, provenance=Provenance("map", settings, inputs), force=force)
     if figure:
-        _draw(tactile_map, figure, force=force)
+        from tactile_bayes.report.map_figure import map_figure
+
+        map_figure(tactile_map, figure, title=f"Tactile map: {output.stem}", force=force)
     clock.tell("write")
     click.echo(map_text(tactile_map, lost=lost), nl=False)
 
@@ -151,12 +153,6 @@ def _read(paths: tuple[Path, ...]) -> tuple[list[Scan], list[str]]:
         scans.append(file.scan)
         lost += [f"scan {number}: {line}" for line in (*file.lost, *file.cautions())]
     return scans, lost
-
-
-def _draw(tactile_map: TactileMap, path: Path, *, force: bool) -> None:
-    from tactile_bayes.report.figures import map_figure
-
-    map_figure(tactile_map, path, force=force)
 
 
 class _Clock:

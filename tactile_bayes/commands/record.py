@@ -187,7 +187,7 @@ def _record(request: Request) -> tuple[Report, bool]:
             rate_hz=hello.rate_hz / request.every,
             observer=observer,
         )
-        _place(landmarks, writer)
+        _place(landmarks, writer, observer)
         stopper = stack.enter_context(Stopper(recorder))
         try:
             report = _run(recorder, stopper, head, request)
@@ -259,11 +259,15 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
         click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
 
 
-def _place(landmarks: Landmarks | None, writer: Any) -> None:
+def _place(landmarks: Landmarks | None, writer: Any, observer: Observer | None) -> None:
+    """Write the landmarks that a file gave, and show them to the live view."""
     if landmarks is None:
         return
     for name in ("sternal_notch", "xiphoid"):
-        writer.add_landmark(name, getattr(landmarks, f"{name}_mm"), device_ns=0, host_ns=0)
+        position_mm = getattr(landmarks, f"{name}_mm")
+        writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
+        if observer is not None:
+            observer.landmark(name, position_mm)
 
 
 def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import WholeOrAuto
 from tactile_bayes.presets import MOST_FIELD_COSINES
 
@@ -44,7 +45,7 @@ _FILE = click.Path(path_type=Path)
 @click.option(
     "-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write truths and ranks; with it a run can be resumed."
 )
-@click.option("--figure", metavar="FIG.png", type=_FILE, help="Draw the ECDFs of the ranks with their bands.")
+@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the ECDFs of the ranks with their bands.")
 @click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 def command(

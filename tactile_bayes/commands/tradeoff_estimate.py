@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.presets import FIT_RADIUS_MM
 
 _FILE = click.Path(path_type=Path)
@@ -13,7 +14,7 @@ _FILE = click.Path(path_type=Path)
 
 @click.command("estimate")
 @click.argument("map_file", metavar="MAP.nc", type=_FILE)
-@click.option("--figure", metavar="OUT.png", type=_FILE, help="Draw error against time.")
+@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error against time.")
 @click.option(
     "--fit-radius-mm",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -80,6 +81,16 @@ def command(
             progress=progress,
         )
     if isinstance(found, str):
+        if figure is not None and tactile_map.covered.any():
+            from tactile_bayes.report.map_figure import map_figure
+
+            map_figure(
+                tactile_map,
+                figure,
+                title=f"Tactile map: {map_file.stem}",
+                note=f"Nothing to compare: {found}.",
+                force=force,
+            )
         click.echo(f"Nothing to compare: {found}.")
         raise click.exceptions.Exit(EXIT_NO_ESTIMATE)
     if figure is not None:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.figure_path import METAVAR, FigurePath
+
 if TYPE_CHECKING:
     from tactile_bayes.forward.tradeoff import LumpCase, Measured
     from tactile_bayes.report.size_rules import SizeRule
@@ -25,7 +27,7 @@ LEARNED = "learned"
     help="For the sizes: one that comes with the program, yours, or Eq 6 learned on the spot; "
     "if nothing is said, each model's own.",
 )
-@click.option("--figure", metavar="OUT.png", type=_FILE, help="Draw error in size against time.")
+@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error in size against time.")
 @click.option(
     "--tolerance-percent",
     type=click.FloatRange(min=0.0, min_open=True),

@@ -1,8 +1,9 @@
 """A grid or an image straight to a map: for other people's maps and for pictures of a Gaussian.
 
-Orientation: arrays keep their order. Column 0 is the lowest x and row 0 the lowest y, also for an image, whose row 0 is
-its top: an image is therefore seen upside down when y is drawn upwards, and a lump's angle has the other sign. Cell
-centres are placed about the centre of the grid, so x and y run from -(n-1)/2 to (n-1)/2 cells.
+Orientation: arrays keep their order. Column 0 is the lowest x and row 0 the lowest y, so y runs down an image, whose
+row 0 is its top; a lump's angle is positive from x towards y, clockwise on the image. Pictures of such a map show it as
+the file reads, first row on top and first column on the left (see `mapping.orientation`). Cell centres are placed about
+the centre of the grid, so x and y run from -(n-1)/2 to (n-1)/2 cells.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ TABLE_SUFFIXES: Final = (".csv", ".txt")
 _NORMALISED_MEDIAN: Final = (0.2, 5.0)
 
 
-def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "none") -> TactileMap:
+def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "none", units: str = "") -> TactileMap:
     """Read a grid of values as a map.
 
     Parameters
@@ -41,6 +42,8 @@ def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "
     normalise
         What was done to the values already: ``"mean"`` or ``"gain"`` when 1 is the level far from a lump, ``"none"``
         when the level is not known. Nothing is divided here.
+    units
+        Of the values, where nothing was divided, for labels; empty if unknown.
 
     Raises
     ------
@@ -51,7 +54,8 @@ def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "
     try:
         if suffix == ".npz":
             arrays = load_npz(path, required=["mean"], optional=("count", "variance", "spacing_mm"))
-            return _map(arrays, spacing_mm=_spacing(arrays.get("spacing_mm"), given=spacing_mm), normalise=normalise)
+            spacing = _spacing(arrays.get("spacing_mm"), given=spacing_mm)
+            return _map(arrays, spacing_mm=spacing, normalise=normalise, units=units)
         if suffix in IMAGE_SUFFIXES:
             mean = _image(path)
         elif suffix in TABLE_SUFFIXES:
@@ -59,7 +63,7 @@ def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "
         else:
             known = ", ".join((".npz", *TABLE_SUFFIXES, *IMAGE_SUFFIXES))
             raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=f"grids are read from {known}")
-        return _map({"mean": mean}, spacing_mm=_spacing(None, given=spacing_mm), normalise=normalise)
+        return _map({"mean": mean}, spacing_mm=_spacing(None, given=spacing_mm), normalise=normalise, units=units)
     except BadDataError as error:
         raise error.at(path) from None
 
@@ -87,7 +91,7 @@ def _spacing(held: np.ndarray[Any, Any] | None, *, given: float | None) -> float
     return value
 
 
-def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: str) -> TactileMap:
+def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: str, units: str) -> TactileMap:
     mean = _numbers(arrays["mean"], name="mean")
     if mean.ndim != 2 or 0 in mean.shape:
         raise BadDataError(f"mean has shape {mean.shape}", way_out="it must be (ny, nx)")
@@ -100,7 +104,7 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
         count=count,
         x_mm=_centres(mean.shape[1], spacing_mm),
         y_mm=_centres(mean.shape[0], spacing_mm),
-        recipe=MapRecipe(source="grid", normalise=normalise, cell_mm=spacing_mm),
+        recipe=MapRecipe(source="grid", normalise=normalise, cell_mm=spacing_mm, units=units),
         background=None if normalise == "none" else 1.0,
         frame_count=0,
     )

@@ -13,6 +13,7 @@ from tactile_bayes.files.reading import open_input
 
 if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
+    from tactile_bayes.mapping.tactile_map import TactileMap
 
 _MCAP = b"\x89MCAP0\r\n"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -74,6 +75,11 @@ def _posterior(group: Group) -> dict[str, Any]:
     }
 
 
+def _value_unit(tactile_map: TactileMap) -> str:
+    unit = tactile_map.recipe.value_unit
+    return "1 is the background" if unit == "1" else unit or "unknown"
+
+
 def _map(path: Path) -> dict[str, Any]:
     from dataclasses import asdict
 
@@ -87,7 +93,7 @@ def _map(path: Path) -> dict[str, Any]:
         "kind": "map",
         "shape": {"ny": ny, "nx": nx},
         "extent_mm": {"x": nx * tactile_map.recipe.cell_mm, "y": ny * tactile_map.recipe.cell_mm},
-        "units": {"x": "mm", "y": "mm", "mean": "kPa" if tactile_map.background is None else "1 is the background"},
+        "units": {"x": "mm", "y": "mm", "mean": _value_unit(tactile_map)},
         "covered_cells": int(tactile_map.covered.sum()),
         "background": tactile_map.background,
         "frames": tactile_map.frame_count,

@@ -115,9 +115,8 @@ def read_map_header(path: Path) -> dict[str, Any]:
 
 def _units(tactile_map: TactileMap) -> dict[str, str]:
     """Units of the variables whose unit hangs on the recipe."""
-    if tactile_map.recipe.normalise == "none":
-        return {"mean": "kPa", "variance": "kPa2"}
-    return {"mean": "1", "variance": "1"}
+    unit = tactile_map.recipe.value_unit
+    return {"mean": unit, "variance": unit if unit in ("", "1") else f"{unit}2" if unit.isalpha() else f"({unit})2"}
 
 
 def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, str]:
@@ -208,8 +207,17 @@ def _recipe(fields: dict[str, Any]) -> MapRecipe:
     for name, value in later.items():
         if not isinstance(value, bool):
             raise BadDataError(f"recipe.{name} is {_short(value)}", way_out=_WAY_OUT)
+    units = fields.get("units", "")  # nor this
+    if not isinstance(units, str) or not units.isprintable():
+        raise BadDataError(f"recipe.units is {_short(units)}", way_out=_WAY_OUT)
     return MapRecipe(
-        fields["source"], fields["normalise"], float(fields["cell_mm"]), ends, float(fields["latency_ms"]), **later
+        fields["source"],
+        fields["normalise"],
+        float(fields["cell_mm"]),
+        ends,
+        float(fields["latency_ms"]),
+        **later,
+        units=units,
     )
 
 

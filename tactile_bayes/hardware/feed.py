@@ -19,6 +19,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware.account import Report
 from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.streams import PIPE_BYTES
@@ -26,9 +27,11 @@ from tactile_bayes.hardware.streams import PIPE_BYTES
 FRAME: Final = 1
 POSE: Final = 2
 REPORT: Final = 3
+LANDMARK: Final = 4
 _HEADER: Final = struct.Struct("<BI")
 _TIMES: Final = struct.Struct("<qq")  # device ns, host ns (monotonic)
 _POSE: Final = struct.Struct("<q7d")
+_POINT: Final = struct.Struct("<3d")
 
 
 class SeenFrame(NamedTuple):
@@ -47,7 +50,14 @@ class SeenPose(NamedTuple):
     quaternion_wxyz: tuple[float, ...]
 
 
-Seen = SeenFrame | SeenPose | dict[str, Any]
+class SeenLandmark(NamedTuple):
+    """One landmark, ``sternal_notch`` or ``xiphoid``, in `base`."""
+
+    name: str
+    position_mm: tuple[float, ...]
+
+
+Seen = SeenFrame | SeenPose | SeenLandmark | dict[str, Any]
 
 
 class Feed:
@@ -74,6 +84,10 @@ class Feed:
     def pose(self, pose: PoseReading, device_ns: int) -> None:
         """A pose was recorded."""
         self._send(POSE, _POSE.pack(device_ns, *pose.position_mm, *pose.quaternion_wxyz))
+
+    def landmark(self, name: str, position_mm: FloatArray) -> None:
+        """A landmark was touched, or is known from a file."""
+        self._send(LANDMARK, _POINT.pack(*position_mm.tolist()) + name.encode())
 
     def told(self, report: Report) -> None:
         """The account so far."""
@@ -145,4 +159,6 @@ def _decode(kind: int, payload: bytes) -> Seen:
     if kind == POSE:
         device_ns, *values = _POSE.unpack(payload)
         return SeenPose(device_ns, tuple(values[:3]), tuple(values[3:]))
+    if kind == LANDMARK:
+        return SeenLandmark(payload[_POINT.size :].decode(), _POINT.unpack_from(payload))
     return dict(json.loads(payload))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.hardware.feed import Seen, SeenFrame, SeenPose
+from tactile_bayes.geometry import FloatArray, apply, patient_from_plane
+from tactile_bayes.hardware.feed import Seen, SeenFrame, SeenLandmark, SeenPose
 from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.poses import poses_at
 from tactile_bayes.mapping.tactile_map import TactileMap
@@ -20,6 +20,7 @@ from tactile_bayes.scan import ElementCalibration, HeadGeometry, TrackerPoses
 
 # Frames used after which the plane is fitted anew: the first ones lie on a line.
 REFIT_AT: Final = (100, 200, 400, 800, 1600)
+LANDMARKS: Final = ("sternal_notch", "xiphoid")
 _KEPT_POSES: Final = 400
 _PATIENCE_NS: Final = 150_000_000
 
@@ -31,7 +32,7 @@ class LiveState:
     Parameters
     ----------
     tactile_map
-        So far; None before there is one.
+        So far, with the patient's axes once both landmarks are known; None before there is one.
     pressure_kpa
         Mean of the last frame; NaN before the first.
     window_kpa
@@ -46,6 +47,8 @@ class LiveState:
         From the recorder to this state, of its youngest frame.
     size
         The current estimate in words.
+    lump_base_mm : (3,) array or None
+        Where the estimate's lump lies, in `base`: the plane changes while the map grows.
     """
 
     tactile_map: TactileMap | None = None
@@ -58,6 +61,34 @@ class LiveState:
     used_share: float = 0.0
     latency_ms: float = 0.0
     size: str = ""
+    lump_base_mm: FloatArray | None = None
+
+    @property
+    def size_words(self) -> str:
+        """The estimate, or why there is none yet."""
+        if self.size:
+            return self.size
+        if self.tactile_map is not None:
+            return "no size yet: the first estimate is being computed"
+        if not self.frames:
+            return "no size yet: no frames have come"
+        if not self.poses:
+            return "no size yet: the tracker has sent no pose"
+        low, high = self.window_kpa
+        return f"no size yet: no frame with a pose was pressed at {low:g} to {high:g} kPa"
+
+    @property
+    def pressure_words(self) -> str:
+        """Mean pressure of the last frame; empty where there is none."""
+        return f"{self.pressure_kpa:.1f} kPa" if np.isfinite(self.pressure_kpa) else ""
+
+    @property
+    def lump_mm(self) -> tuple[float, float] | None:
+        """Centre of the estimate's lump on the present map's plane."""
+        if self.lump_base_mm is None or self.tactile_map is None or self.tactile_map.plane_from_base is None:
+            return None
+        x, y, _ = apply(self.tactile_map.plane_from_base, self.lump_base_mm).tolist()
+        return x, y
 
     @property
     def tone(self) -> str:
@@ -91,6 +122,7 @@ class LiveMap:
     _frames: list[SeenFrame] = field(default_factory=list)
     _poses: list[SeenPose] = field(default_factory=list)
     _report: dict[str, Any] = field(default_factory=dict)
+    _landmarks: dict[str, FloatArray] = field(default_factory=dict)
     _map: MapAccumulator | None = None
     _refits: int = 0
     _pressure_kpa: float = float("nan")
@@ -106,6 +138,8 @@ class LiveMap:
                     youngest = one
                 case SeenPose():
                     self._poses.append(one)
+                case SeenLandmark():
+                    self._landmarks[one.name] = np.array(one.position_mm)
                 case dict():
                     self._report = one
         if youngest is not None:
@@ -151,12 +185,25 @@ class LiveMap:
         except BadDataError:
             return  # still too nearly a line: the plane under the head will do until the next time
 
-    def state(self, *, size: str = "") -> LiveState:
+    def _snapshot(self) -> TactileMap | None:
+        """The map so far, with the patient's axes where they are known."""
+        if self._map is None or not self._map.figures["frames_used"]:
+            return None
+        found = self._map.snapshot()
+        if found.plane_from_base is None or len(self._landmarks) < len(LANDMARKS):
+            return found
+        notch, xiphoid = (self._landmarks[name] for name in LANDMARKS)
+        try:
+            return replace(found, patient_from_plane=patient_from_plane(notch, xiphoid, found.plane_from_base))
+        except BadDataError:
+            return found  # two landmarks in one place give no axes
+
+    def state(self, *, size: str = "", lump_base_mm: FloatArray | None = None) -> LiveState:
         """As it is now."""
         figures = self._map.figures if self._map else {"frames_used": 0.0, "frames_total": 0.0}
         report = self._report
         return LiveState(
-            tactile_map=self._map.snapshot() if self._map and figures["frames_used"] else None,
+            tactile_map=self._snapshot(),
             pressure_kpa=self._pressure_kpa,
             window_kpa=self.window_kpa,
             frames=report.get("frames", 0),
@@ -166,15 +213,25 @@ class LiveMap:
             used_share=figures["frames_used"] / max(1.0, figures["frames_total"]),
             latency_ms=(time.monotonic_ns() - self._host_ns) / 1e6 if self._host_ns else 0.0,
             size=size,
+            lump_base_mm=lump_base_mm,
         )
 
 
-def grey_levels(values: FloatArray) -> FloatArray:
-    """Map values to 0..1 between their 2 % and 98 % quantiles; NaN stays."""
+def colour_limits(values: FloatArray) -> tuple[float, float] | None:
+    """The 2 % and 98 % quantiles of the finite values, between which the colours run; None where there are none."""
     finite = values[np.isfinite(values)]
     if not finite.size:
+        return None
+    low, high = np.quantile(finite, [0.02, 0.98]).tolist()
+    return low, high
+
+
+def grey_levels(values: FloatArray) -> FloatArray:
+    """Map values to 0..1 between their `colour_limits`; NaN stays."""
+    limits = colour_limits(values)
+    if limits is None:
         return np.full(values.shape, np.nan)
-    low, high = (float(q) for q in np.quantile(finite, [0.02, 0.98]))
+    low, high = limits
     scaled: FloatArray = (
         np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.where(np.isfinite(values), 0.5, np.nan)
     )

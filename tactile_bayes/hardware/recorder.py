@@ -51,6 +51,9 @@ class Sink(Protocol):
 class Observer(Protocol):
     """Who looks on while a recording runs; must not wait."""
 
+    def landmark(self, name: str, position_mm: FloatArray) -> None:
+        """A landmark was touched."""
+
     def frame(self, counts: CountArray, device_ns: int) -> None:
         """A frame was recorded."""
 
@@ -268,6 +271,8 @@ class Recorder:
         self.report.landmarks.append(str(touch))
         device_ns = max(0, self._pose_ns)
         self._sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
+        if self._observer is not None:
+            self._observer.landmark(touch.name, touch.position_mm)
         self._note(str(touch), "tracker", device_ns, host_ns, serious=not touch.steady)
 
     def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:

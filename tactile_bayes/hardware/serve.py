@@ -20,7 +20,8 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.hardware.live import LiveState, grey_levels
+from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
+from tactile_bayes.mapping.orientation import orientation_of
 
 _PAGE: Final = Path(__file__).with_name("live_page.html")
 _SECURITY: Final = (
@@ -154,17 +155,32 @@ def document(state: LiveState) -> dict[str, Any]:
             f"{state.duration_s:.1f} s, {state.frames} frames, {state.frames_lost} lost, {state.poses} poses, "
             f"{state.covered_mm2 / 100:.1f} cm² covered"
         ),
-        "size": state.size or "no size estimate yet",
+        "size": state.size_words,
         "map": _map_document(state),
     }
 
 
 def _map_document(state: LiveState) -> dict[str, Any] | None:
-    if state.tactile_map is None:
+    """The picture row by row from its top left corner, with all that is drawn over it, in cells from that corner."""
+    tactile_map = state.tactile_map
+    if tactile_map is None:
         return None
-    levels = grey_levels(state.tactile_map.mean)
+    view = orientation_of(tactile_map)
+    levels = view.screen(grey_levels(tactile_map.mean))
     rows, columns = levels.shape
     known = np.isfinite(levels)
     whole = np.rint(np.where(known, levels, 0.0) * 255).astype(int)
     cells = [value if shown else None for value, shown in zip(whole.ravel().tolist(), known.ravel(), strict=True)]
-    return {"rows": rows, "columns": columns, "levels": cells}
+    limits = colour_limits(tactile_map.mean)
+    return {
+        "rows": rows,
+        "columns": columns,
+        "levels": cells,
+        "cell_mm": tactile_map.recipe.cell_mm,
+        "edges": dict(view.edges),
+        "words": view.words,
+        "notch": None if view.notch is None else [round(part, 4) for part in view.notch],
+        "lump": None if state.lump_mm is None else [round(at, 2) for at in view.place(tactile_map, state.lump_mm)],
+        "limits": None if limits is None else [float(f"{end:.3g}") for end in limits],
+        "values": tactile_map.recipe.value_words,
+    }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.geometry import FloatArray, Plane, inverse, patient_from_base
+from tactile_bayes.geometry import FloatArray, Plane, patient_from_plane
 from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress, sources_of
 from tactile_bayes.mapping.convention import check_convention, hint
 from tactile_bayes.mapping.engine import Engine, choose_engine
@@ -278,8 +278,7 @@ def _patient_from_plane(scans: list[Scan], plane: Plane) -> tuple[FloatArray | N
             f"the scans' landmarks lie up to {shift:.0f} mm from their mean",
             way_out="the patient or the tracker moved between them: make one map a scan",
         )
-    base = patient_from_base(mean[0], mean[1], normal=plane.plane_from_base[2, :3])
-    transform: FloatArray = base @ inverse(plane.plane_from_base)
+    transform = patient_from_plane(mean[0], mean[1], plane.plane_from_base)
     repeats = [marks.spread_mm for marks in touched if marks.spread_mm is not None]
     repeats += [shift] if len(touched) > 1 else []
     return transform, {"landmark_spread_mm": max(repeats)} if repeats else {}

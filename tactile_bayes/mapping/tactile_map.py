@@ -35,6 +35,8 @@ class MapRecipe:
         Whether the head's own response was taken off.
     registered
         Whether the strokes were shifted onto each other.
+    units
+        Of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa.
     """
 
     source: str
@@ -44,6 +46,23 @@ class MapRecipe:
     latency_ms: float = 0.0
     flat_field: bool = False
     registered: bool = False
+    units: str = ""
+
+    @property
+    def value_unit(self) -> str:
+        """Unit of the map's values: ``"1"`` where they were divided by a level, empty where it is unknown."""
+        if self.normalise != "none":
+            return "1"
+        return "kPa" if self.source == "scan" else self.units
+
+    @property
+    def value_words(self) -> str:
+        """The map's values in a few words, for the label of a colour bar."""
+        if self.normalise == "none":
+            name = "mean pressure" if self.source == "scan" else "value"
+            return f"{name} ({self.value_unit or 'unit unknown'})"
+        name = "pressure" if self.source == "scan" else "value"
+        return f"{name} / {'mean of its frame' if self.normalise == 'mean' else 'level beside a lump'}"
 
     @property
     def flat_field_known(self) -> bool | None:
@@ -119,7 +138,14 @@ class TactileMap:
         return covered
 
     @property
+    def counts_known(self) -> bool:
+        """Whether `count` says how many readings a cell has: an imported grid without counts has 1 everywhere."""
+        return self.recipe.source == "scan" or bool((self.count > 1).any())
+
+    @property
     def few(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """(ny, nx) True for cells with data from fewer than `FEW_READINGS` readings."""
+        """(ny, nx) True for cells with data from fewer than `FEW_READINGS` readings; none where counts are unknown."""
         few: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & (self.count < FEW_READINGS)
+        if not self.counts_known:
+            few = np.zeros_like(few)
         return few

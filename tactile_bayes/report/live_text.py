@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tactile_bayes.hardware.live import grey_levels
+from tactile_bayes.hardware.live import colour_limits, grey_levels
+from tactile_bayes.mapping.orientation import Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.hardware.live import LiveState
+    from tactile_bayes.mapping.tactile_map import TactileMap
 
 # Dark blue over green to yellow, even in lightness (viridis by five of its colours).
 _COLOURS: Final = np.array(
@@ -25,7 +27,12 @@ _SHADES: Final = " .:-=+*#%@"
 _FULL_BAR_KPA: Final = 20.0
 _SAID: Final = {"low": "press harder", "in": "in range", "high": "press less", "off": "waiting for the head"}
 _TINT: Final = {"low": "94", "in": "92", "high": "91", "off": "90"}
-_TEXT_LINES: Final = 6
+KEYS: Final = "keys: n sternal notch, x xiphoid, space start, q stop"
+_EDGE_WORDS: Final = {"H": "H (head)", "F": "F (feet)"}
+_LEGEND_LINES: Final = 3
+_LEAST_ROWS: Final = 6
+_MARGIN: Final = 4
+_MARK: Final = "X"
 _STEPS: Final = 256
 
 
@@ -34,24 +41,29 @@ def colours_wanted(environment: Mapping[str, str]) -> bool:
     return not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
 
 
-def live_text(state: LiveState, *, columns: int, lines: int, colour: bool) -> str:
-    """One screen, its lines joined by newlines, none longer than `columns`."""
-    rows = [_pressure(state, columns, colour=colour), _figures(state)[:columns], _size(state)[:columns]]
-    room = max(2, lines - _TEXT_LINES)
-    picture = _picture(state, columns, room, colour=colour)
-    return "\n".join([*rows, "", *picture, RESEARCH_USE[:columns]])
+def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys: bool = False) -> str:
+    """One screen, its lines joined by newlines, none longer than `columns`.
+
+    `keys` says whether the recording's keys can be pressed on this terminal.
+    """
+    above = [_pressure(state, columns, colour=colour), _figures(state)[:columns], state.size_words[:columns]]
+    below = [RESEARCH_USE[:columns]]
+    if keys:
+        below.insert(0, KEYS[:columns])
+    room = max(2, lines - len(above) - len(below) - 1)
+    return "\n".join([*above, "", *_picture(state, columns, room, colour=colour), *below])
 
 
 def live_line(state: LiveState) -> str:
     """The same in one line, for a terminal that cannot be drawn on."""
-    pressure = f"{state.pressure_kpa:.1f} kPa {_SAID[state.tone]}"
+    pressure = f"{state.pressure_words} {_SAID[state.tone]}".strip()
     behind = f"view {state.latency_ms:.0f} ms behind"
-    return f"{state.duration_s:.1f} s, {pressure}; {_figures(state)}; {_size(state)}; {behind}"
+    return f"{pressure}; {_figures(state)}; {state.size_words}; {behind}"
 
 
 def _pressure(state: LiveState, columns: int, *, colour: bool) -> str:
     low, high = state.window_kpa
-    words = f" {state.pressure_kpa:4.1f} kPa  {_SAID[state.tone]}"
+    words = f" {state.pressure_words:>8}  {_SAID[state.tone]}"
     width = max(10, min(40, columns - len(words) - 2))
     level = 0.0 if not np.isfinite(state.pressure_kpa) else state.pressure_kpa
     cells = ["#" if (i + 0.5) * _FULL_BAR_KPA / width <= level else "-" for i in range(width)]
@@ -63,24 +75,53 @@ def _pressure(state: LiveState, columns: int, *, colour: bool) -> str:
 
 def _figures(state: LiveState) -> str:
     return (
-        f"{state.frames} frames, {state.frames_lost} lost, {state.poses} poses, {state.covered_mm2 / 100:.1f} cm2 "
-        f"covered, {100 * state.used_share:.0f} % used"
+        f"{state.duration_s:.1f} s, {state.frames} frames, {state.frames_lost} lost, {state.poses} poses, "
+        f"{state.covered_mm2 / 100:.1f} cm2 covered, {100 * state.used_share:.0f} % used"
     )
 
 
-def _size(state: LiveState) -> str:
-    return state.size or "no size estimate yet"
-
-
 def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> list[str]:
+    """The map between the names of its edges, as `orientation_of` says it is seen; below it what its colours mean."""
     if state.tactile_map is None:
         return ["no map yet: move the head over the lump within the pressure window"[:columns]]
-    # Row 0 of a map is its lowest y; a screen begins at the top.
-    values = grey_levels(state.tactile_map.mean)[::-1]
+    view, values = orientation_of(state.tactile_map), grey_levels(state.tactile_map.mean)
+    legend_lines = _LEGEND_LINES if lines >= _LEGEND_LINES + _LEAST_ROWS else 0
+    wide, high = columns - 2 * _MARGIN, max(1, lines - 2 - legend_lines)
+    pixels = view.screen(values)
     # A character is twice as high as wide: two cells of the map share one, one above the other.
-    step = max(1, -(-values.shape[1] // columns), -(-values.shape[0] // (2 * lines)))
-    small = _shrunk(values, step)
-    return _blocks(small) if colour else _shades(small)
+    step = max(1, -(-pixels.shape[1] // wide), -(-pixels.shape[0] // (2 * high)))
+    small = _shrunk(pixels, step)
+    rows = _blocks(small) if colour else _shades(small)
+    if state.lump_mm is not None:
+        across, down = view.place(state.tactile_map, state.lump_mm)
+        _mark(rows, int(down / step / 2), int(across / step), colour=colour)
+    legend = _legend(state.tactile_map, view, step, marked=state.lump_mm is not None)[:legend_lines]
+    return [*_framed(rows, view, columns, colour=colour), *(line[:columns] for line in legend)]
+
+
+def _mark(rows: list[list[str]], row: int, column: int, *, colour: bool) -> None:
+    """Put the lump's mark where its centre is."""
+    if 0 <= row < len(rows) and 0 <= column < len(rows[row]):
+        rows[row][column] = f"\x1b[0;1;97m{_MARK}" if colour else _MARK
+
+
+def _framed(rows: list[list[str]], view: Orientation, columns: int, *, colour: bool) -> list[str]:
+    """The picture with what lies beyond each of its edges."""
+    edges, width = view.edges, len(rows[0])
+    top, bottom = (_EDGE_WORDS.get(edges[side], edges[side]).center(width).rstrip() for side in ("top", "bottom"))
+    end = "\x1b[0m" if colour else ""
+    lines = [" " * _MARGIN + "".join(row) + end for row in rows]
+    middle = len(rows) // 2
+    lines[middle] = f"{edges['left']:>{_MARGIN - 1}} {lines[middle][_MARGIN:]} {edges['right']}"
+    return [(" " * _MARGIN + top)[:columns], *lines, (" " * _MARGIN + bottom)[:columns]]
+
+
+def _legend(tactile_map: TactileMap, view: Orientation, step: int, *, marked: bool) -> list[str]:
+    """Which way round the picture is, what its colours stand for, how long a character is."""
+    limits = colour_limits(tactile_map.mean)
+    low, high = limits if limits is not None else (np.nan, np.nan)
+    scale = f"a character is {step * tactile_map.recipe.cell_mm:g} mm wide" + (f"; {_MARK} the lump" if marked else "")
+    return [view.words, f"{tactile_map.recipe.value_words}: dark {low:.3g} to bright {high:.3g}", scale]
 
 
 def _shrunk(values: FloatArray, step: int) -> FloatArray:
@@ -96,13 +137,13 @@ def _shrunk(values: FloatArray, step: int) -> FloatArray:
     return small
 
 
-def _blocks(values: FloatArray) -> list[str]:
-    """Half blocks: the upper cell is the ink, the lower one the paper."""
+def _blocks(values: FloatArray) -> list[list[str]]:
+    """Half blocks: the upper cell is the ink, the lower one the paper. A string a character."""
     if len(values) % 2:
         values = np.vstack([values, np.full((1, values.shape[1]), np.nan)])
     colours, shown = _colours(values), np.isfinite(values)
     pairs = zip(colours[::2], colours[1::2], shown[::2], shown[1::2], strict=True)
-    return ["".join(map(_cell, *(one.tolist() for one in pair))) + "\x1b[0m" for pair in pairs]
+    return [list(map(_cell, *(one.tolist() for one in pair))) for pair in pairs]
 
 
 def _cell(top: str, bottom: str, shown_top: bool, shown_bottom: bool) -> str:
@@ -125,8 +166,8 @@ def _palette() -> NDArray[np.object_]:
     return np.array([";".join(map(str, colour)) for colour in zip(*channels, strict=True)], dtype=object)
 
 
-def _shades(values: FloatArray) -> list[str]:
+def _shades(values: FloatArray) -> list[list[str]]:
     """Plain characters, every second row left out because characters are high."""
     index = np.nan_to_num(np.rint(values[::2] * (len(_SHADES) - 2)) + 1).astype(int)
     index[~np.isfinite(values[::2])] = 0
-    return ["".join(_SHADES[i] for i in row).rstrip() for row in index]
+    return [[_SHADES[i] for i in row] for row in index]

@@ -22,7 +22,6 @@ _MUCH_GATED = 0.2
 _UNITS = {
     "mean": "times the mean of their frames (normalise mean)",
     "gain": "times the level beside a lump (normalise gain)",
-    "none": "kPa (normalise none)",
 }
 _DROPPED = (
     ("dropped_low", "mean pressure below the window"),
@@ -54,7 +53,12 @@ def _what(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     yield "map", f"{columns * cell:g} x {rows * cell:g} mm (across x along the head), cells of {cell:g} mm"
     values = tactile_map.mean[tactile_map.covered]
     if values.size:
-        yield "values", f"{values.min():.3g} to {values.max():.3g} {_UNITS[tactile_map.recipe.normalise]}"
+        yield "values", f"{values.min():.3g} to {values.max():.3g} {_units(tactile_map)}"
+
+
+def _units(tactile_map: TactileMap) -> str:
+    recipe = tactile_map.recipe
+    return _UNITS.get(recipe.normalise, f"{recipe.value_unit or 'of unknown unit'} (normalise none)")
 
 
 def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:

@@ -153,14 +153,14 @@ def sbc_figure(maps: Sequence[MapRanks], path: Path, *, force: bool = False) -> 
     UsageError
         When `path` exists and `force` is false.
     """
-    from tactile_bayes.report.figures import _figure as png_figure
+    from tactile_bayes.report.figure_file import figure_file
 
     found = [one.ranks for one in maps if one.ranks is not None]
     names = RANKED[: len(found[0])] if found else RANKED
     ranks = np.array(found).reshape(-1, len(names))
     n, at = len(ranks), np.arange(1, DRAWS + 1) / (DRAWS + 1)
     inside = {test.name: test.inside for test in rank_tests(list(maps))}
-    with png_figure(path, size_in=(2.2 * len(names), 2.9), force=force) as figure:
+    with figure_file(path, size_in=(2.2 * len(names), 2.9), force=force) as figure:
         all_axes = figure.subplots(1, len(names), sharey=True)
         for axes, name, column in zip(all_axes, names, ranks.T, strict=True):
             if n:

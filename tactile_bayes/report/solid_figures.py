@@ -30,7 +30,7 @@ from tactile_bayes.forward.tables import PHANTOMS
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.figures import _figure as png_figure
+from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.report.study_figures import _COLOURS, _MARKS, _finish
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def solid_figures(
 def figure_5(settings: SolidSettings, path: Path, *, seat: float, force: bool = False) -> None:
     """Frames through the middle of the head: far from the lump on fat of several thicknesses, and over three lumps."""
     s = settings.head.surface_mm()[:, 0, 0]
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         for colour, fat in zip(_COLOURS, _FAT_MM, strict=False):
             left.plot(s, _across(_plain_frame(settings, fat)), color=colour, label=f"fat {fat:g} mm")
@@ -103,7 +103,7 @@ def figure_6(settings: SolidSettings, path: Path, *, seat: float, build: Build, 
     """The map of the first phantom, and its sections along both axes of the head."""
     d, h = PHANTOMS[_PHANTOM]
     made = build(_raster(settings, d, h, seat, HARD_RATIO))
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         read_x, read_y = made.covered.any(axis=0), made.covered.any(axis=1)
         x, y, mean = made.x_mm[read_x], made.y_mm[read_y], made.mean[np.ix_(read_y, read_x)]
@@ -130,7 +130,7 @@ def figure_7(
     d, h = _SMALL
     body = settings.body(d, h, seat=seat)
     head, condensed = settings.on(body), settings.condensed(body)
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         for colour, ratio in zip(_COLOURS, _RATIOS, strict=False):
             frames = raster_frames(head, settings.placed(condensed, ratio), settings)
@@ -154,7 +154,7 @@ def figure_7(
 def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> None:
     """Width change against amplitude and width against diameter, each with its line, for both axes of the head."""
     hard = hard_cases(rows)
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         for i, (axis, words) in enumerate(_AXES.items()):
             _draw_eq_6(left, right, hard, axis, words, i)

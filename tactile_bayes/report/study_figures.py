@@ -24,7 +24,7 @@ from tactile_bayes.forward.study import (
 from tactile_bayes.forward.tables import PHANTOMS, Curves, Scene, mean_squared_difference, scene_curves
 from tactile_bayes.forward.tactile_line import build_line, press_layers
 from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE
-from tactile_bayes.report.figures import _figure as png_figure
+from tactile_bayes.report.figure_file import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +79,7 @@ def study_figures(
 
 def figure_5(settings: StudySettings, path: Path, *, seat: float, force: bool = False) -> None:
     """Frames far from the lump on fat of several thicknesses with Eq 1, and frames over three lumps with Eq 3."""
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         for colour, fat in zip(_COLOURS, _FAT_MM, strict=False):
             layers = Layers(fat, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
@@ -106,7 +106,7 @@ def figure_6(settings: StudySettings, path: Path, *, seat: float, force: bool = 
     """Frames and map of the first phantom, elastic and empirical; the paper's rubber data are not ours to draw."""
     d, h = PHANTOMS[_PHANTOM]
     curves = scene_curves(Scene(_PHANTOM, d, h, seat), settings)
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         for colour, place in zip(_COLOURS, _FRAME_PLACES_MM, strict=False):
             left.plot(curves.elastic.s_mm, curves.elastic.at(place), color=colour, label=f"head at {place:g} mm")
@@ -123,7 +123,7 @@ def figure_7(
     """Maps of a small lump of several stiffnesses, and how little the width depends on stiffness."""
     d, h = _SMALL
     surface = settings.surface(settings.body(d, h, seat=seat))
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         for colour, ratio in zip(_COLOURS, _RATIOS, strict=False):
             line = build_line(settings.frames(surface, ratio))
@@ -155,7 +155,7 @@ def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> No
     """Width change against amplitude with its power law, and width against diameter with its line."""
     hard = hard_cases(rows)
     learned = learn_as_printed(rows)
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         change = width_changes(hard)
         for i, d in enumerate(dict.fromkeys(row.d_mm for row in hard)):

@@ -111,9 +111,9 @@ def draw_tradeoff(found: Tradeoff, path: Path, *, tolerance_sd: float, force: bo
     UsageError
         When the file exists and `force` is false.
     """
-    from tactile_bayes.report.figures import _figure as png_figure
+    from tactile_bayes.report.figure_file import figure_file
 
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         axes = figure.subplots()
         for method, mark in _MARKS.items():
             shown = [one for one in found.measured if one.method == method and not one.failed]

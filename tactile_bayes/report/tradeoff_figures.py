@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.forward.tradeoff import EMPIRICAL, PLANE, SOLID
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.figures import _figure as png_figure
+from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.report.study_figures import _COLOURS, _MARKS, _finish
 from tactile_bayes.report.tradeoff_text import TradeoffReport
 
@@ -26,7 +26,7 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
     UsageError
         When the file exists and `force` is false.
     """
-    with png_figure(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
         axes = figure.subplots()
         taken: Counter[tuple[int, int]] = Counter()
         for i, model in enumerate((EMPIRICAL, PLANE, SOLID)):

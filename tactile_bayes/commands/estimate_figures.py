@@ -1,0 +1,99 @@
+"""The figures of `estimate`: the size posterior, and the map with what was found or looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.posterior.estimate import Estimate
+    from tactile_bayes.report.map_figure import FitContour
+
+
+def draw_figures(
+    tactile_map: TactileMap,
+    estimate: Estimate,
+    figure: Path | None,
+    map_figure: Path | None,
+    *,
+    name: str,
+    probability: float,
+    force: bool,
+) -> None:
+    """Draw what was asked for. Without a size both are the map, with the places looked at and why there is no number.
+
+    Parameters
+    ----------
+    figure, map_figure
+        Where to; None draws nothing. A map without data cannot be drawn.
+    name
+        Of the map, for the titles.
+    probability
+        Of the interval of the size.
+    """
+    if figure is not None and estimate.size is not None and estimate.draws is not None:
+        draws = {"max": estimate.size.max_size_mm.ravel(), "min": estimate.size.min_size_mm.ravel()}
+        worth = estimate.draws.effective_draws
+        draw_size(draws, figure, name=name, probability=probability, effective_draws=worth, force=force)
+        figure = None
+    if tactile_map.covered.any():
+        for path in (figure, map_figure):
+            if path is not None:
+                _draw_map(tactile_map, estimate, path, name=name, force=force)
+
+
+def draw_size(
+    draws_mm: Mapping[str, FloatArray],
+    path: Path,
+    *,
+    name: str,
+    probability: float,
+    effective_draws: float | None = None,
+    force: bool,
+) -> None:
+    """The posterior of the largest (``max``) and the smallest (``min``) size with their intervals."""
+    from tactile_bayes.posterior.quantity import summarise
+    from tactile_bayes.report.size_figure import SizeInterval, size_figure
+
+    quantities = {
+        which: summarise(draws, probability=probability, effective_draws=effective_draws or len(draws))
+        for which, draws in draws_mm.items()
+    }
+    intervals = {which: SizeInterval(q.low, q.high, q.probability, q.kind) for which, q in quantities.items()}
+    title = f"Size of the lump: {name}"
+    size_figure(draws_mm["max"], draws_mm["min"], path, intervals=intervals, title=title, force=force)
+
+
+def _draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path, *, name: str, force: bool) -> None:
+    from tactile_bayes.report.map_figure import Place, map_figure
+
+    places = [Place(one.centre_mm, one.fault) for one in estimate.candidates if one.fault]
+    why = {"no_estimate": f"No estimate: {estimate.reason}.", "estimate": f"No size: {estimate.reason}."}
+    note = why[estimate.status] if estimate.reason and estimate.size is None else ""
+    map_figure(
+        tactile_map,
+        path,
+        fit=_contour(estimate),
+        looked_at=places,
+        title=f"Tactile map: {name}",
+        note=note,
+        force=force,
+    )
+
+
+def _contour(estimate: Estimate) -> FitContour | None:
+    """Medians of the posterior's ellipse and of the size."""
+    import numpy as np
+
+    from tactile_bayes.report.map_figure import FitContour
+
+    found, size = estimate.map_posterior, estimate.size
+    if found is None:
+        return None
+    names = ("x_mm", "y_mm", "sigma_x_mm", "sigma_y_mm", "angle_rad", "background", "amplitude")
+    x, y, sigma_x, sigma_y, angle, level, amplitude = (float(np.median(getattr(found, name))) for name in names)
+    sizes = None if size is None else (float(np.nanmedian(size.d_x_mm)), float(np.nanmedian(size.d_y_mm)))
+    return FitContour((x, y), sigma_x, sigma_y, float(np.degrees(angle)), sizes, level, amplitude)

@@ -1,0 +1,67 @@
+"""Figures as files: PNG, PDF or SVG by the name's suffix, equal input in equal bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.atomic import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI: Final = 150
+# Suffix -> what would be written about the program and the time, each None: left out.
+FORMATS: Final[dict[str, dict[str, None]]] = {
+    ".png": {"Software": None},
+    ".pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    ".svg": {"Creator": None, "Date": None, "Format": None, "Type": None},
+}
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a name that says neither PNG, PDF nor SVG.
+
+    Raises
+    ------
+    UsageError
+        Naming the suffix and those that are known.
+    """
+    if path.suffix.lower() not in FORMATS:
+        known = ", ".join(FORMATS)
+        raise UsageError(f"{path} has the suffix {path.suffix or 'none'!r}; a figure is written as one of {known}")
+
+
+@contextmanager
+def figure_file(path: Path, *, size_in: tuple[float, float], force: bool) -> Iterator[Figure]:
+    """A figure that is written when the block ends; the user's own matplotlib settings do not reach it.
+
+    Parameters
+    ----------
+    path
+        Its suffix says the format.
+    size_in
+        Width and height in inches.
+    force
+        Overwrite an existing file.
+
+    Raises
+    ------
+    UsageError
+        When the suffix is unknown, or `path` exists and `force` is false.
+    """
+    check_suffix(path)
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(), atomic_path(path, force=force) as partial:
+        matplotlib.rcdefaults()
+        matplotlib.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
+        figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
+        figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))  # type: ignore[union-attr,call-arg]
+        yield figure
+        suffix = path.suffix.lower()
+        figure.savefig(partial, format=suffix.removeprefix("."), dpi=DPI, metadata=FORMATS[suffix])

@@ -1,0 +1,379 @@
+"""The picture of a tactile map: its values beside its coverage, and what a fit saw on it."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.mapping.orientation import Orientation, orientation_of
+from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.figure_file import figure_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SCALE_BAR_MM = 10.0
+# Lines of hatching across the longer side of the map.
+_HATCHES = 60
+# The colours span at least this share of the level below and above it, so that noise alone does not look like a lump.
+_LEAST_COLOURS = (0.9, 1.3)
+# With a fit they end so many amplitudes above the level, so that a rib beside the lump does not take them all.
+_AMPLITUDES_SHOWN = 1.25
+_AXIS_WORDS: Final = {"x": "across the head, x (mm)", "y": "along the head, y (mm)"}
+# Places that were looked at in vain: so many are explained, the others are only marked.
+_EXPLAINED_PLACES: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class FitContour:
+    """Where a fit saw the lump on the map.
+
+    Parameters
+    ----------
+    centre_mm
+        x and y on the plane.
+    sigma_x_mm, sigma_y_mm
+        Widths along the fit's own axes.
+    angle_deg
+        From the plane's x axis to the fit's, positive from x towards y.
+    size_mm
+        The lump's size along the same axes; None where the fit gave no size.
+    level, amplitude
+        Of the fitted bump, in the map's values; None leaves the colours to the map.
+    """
+
+    centre_mm: tuple[float, float]
+    sigma_x_mm: float
+    sigma_y_mm: float
+    angle_deg: float = 0.0
+    size_mm: tuple[float, float] | None = None
+    level: float = 1.0
+    amplitude: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place of the map that was looked at, and why no lump was measured there."""
+
+    centre_mm: tuple[float, float]
+    reason: str
+
+
+def map_figure(
+    tactile_map: TactileMap,
+    path: Path,
+    *,
+    fit: FitContour | None = None,
+    looked_at: Sequence[Place] = (),
+    title: str = "",
+    note: str = "",
+    force: bool = False,
+) -> None:
+    """Draw a map in mm beside its coverage, and write it as PNG, PDF or SVG by the suffix.
+
+    It is shown as `orientation_of` says, with the patient's sides or the plane's axes named at its edges. Cells with
+    fewer than `FEW_READINGS` readings are hatched in both panels, where the readings of cells are known.
+
+    Parameters
+    ----------
+    fit
+        Drawn as an ellipse of the lump's size, and dashed as one of the fitted bump's sigmas.
+    looked_at
+        Drawn as numbered crosses, the first few with their reasons below the coverage.
+    title
+        Above the map; nothing that identifies a person.
+    note
+        A sentence above the whole figure, for example why there is no estimate.
+
+    Raises
+    ------
+    BadDataError
+        When no cell holds data.
+    UsageError
+        When `path` exists and `force` is false, or its suffix is unknown.
+    """
+    if not tactile_map.covered.any():
+        raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")
+    view = orientation_of(tactile_map)
+    height_in = 5.4 if looked_at else 4.5
+    with figure_file(path, size_in=(10.0, height_in), force=force) as figure:
+        left, right = figure.subplots(1, 2, width_ratios=(1.55, 1.0))
+        _draw_values(left, tactile_map, view, fit)
+        _draw_coverage(right, tactile_map, view)
+        for axes in (left, right):
+            _hatch_few(axes, tactile_map, view)
+            _orient(axes, view, tactile_map)
+        if fit:
+            _draw_fit(left, fit, view)
+        _draw_scale_bar(left)
+        _draw_edges(left, view)
+        _draw_notch(left, view)
+        _draw_places(left, looked_at, view)
+        _explain(right, tactile_map, looked_at)
+        left.set_title(title or "Tactile map", loc="left", fontsize=11)
+        if note:
+            figure.suptitle(textwrap.fill(note, 130), x=0.01, ha="left", fontsize=9.5)
+        figure.text(0.01, 0.01, _caption(tactile_map, view), fontsize=7.5, color="0.3")
+
+
+def _pair(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:
+    """What belongs to the axis across the picture, and what to the axis up it."""
+    return (y, x) if view.swapped else (x, y)
+
+
+def _extent(tactile_map: TactileMap, view: Orientation) -> tuple[float, float, float, float]:
+    """Ends of the axis across the picture and of the one up it, with the outer halves of the cells."""
+    half = tactile_map.recipe.cell_mm / 2
+    across, up = _pair(view, tactile_map.x_mm, tactile_map.y_mm)
+    return (float(across[0]) - half, float(across[-1]) + half, float(up[0]) - half, float(up[-1]) + half)
+
+
+def _draw_cells(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientation, **how: Any) -> Any:
+    """The cells' values as an image; those that are masked stay grey."""
+    axes.set_facecolor("0.85")
+    across = values.T if view.swapped else values
+    return axes.imshow(across, origin="lower", extent=_extent(tactile_map, view), interpolation="nearest", **how)
+
+
+def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, fit: FitContour | None) -> None:
+    """The heat map."""
+    lowest, highest = _colour_range(tactile_map)
+    top = highest
+    if fit is not None and fit.amplitude is not None:
+        top = min(highest, max(_LEAST_COLOURS[1] * fit.level, fit.level + _AMPLITUDES_SHOWN * fit.amplitude))
+    values = np.ma.masked_where(~tactile_map.covered, tactile_map.mean)
+    image = _draw_cells(axes, values, tactile_map, view, cmap="viridis", vmin=lowest, vmax=top)
+    _colour_bar(axes, image, tactile_map.recipe.value_words, extend="max" if top < highest else "neither")
+
+
+def _colour_range(tactile_map: TactileMap) -> tuple[float, float]:
+    """Cells with few readings do not set the range: one noisy edge cell would wash out the lump."""
+    well = tactile_map.covered & (~tactile_map.few)
+    values = tactile_map.mean[well if well.any() else tactile_map.covered]
+    level = float(np.median(values))
+    return min(float(values.min()), _LEAST_COLOURS[0] * level), max(float(values.max()), _LEAST_COLOURS[1] * level)
+
+
+def _draw_coverage(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
+    """Readings per cell: where the map can be trusted."""
+    counts = np.ma.masked_equal(tactile_map.count, 0)
+    image = _draw_cells(axes, counts, tactile_map, view, cmap="cividis", vmin=0)
+    if tactile_map.counts_known:
+        _colour_bar(axes, image, "readings per cell")
+        axes.set_title("Coverage", loc="left", fontsize=11)
+    else:
+        axes.set_title("Coverage (readings per cell unknown)", loc="left", fontsize=11)
+
+
+def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
+    """White lines with black edges over the cells with few readings: to be seen on every colour, and without any."""
+    if not tactile_map.few.any():
+        return
+    from matplotlib import patheffects
+    from matplotlib.collections import LineCollection
+    from matplotlib.path import Path as Outline
+
+    half = tactile_map.recipe.cell_mm / 2
+    rows, columns = np.nonzero(tactile_map.few)
+    middle = np.stack(_pair(view, tactile_map.x_mm[columns], tactile_map.y_mm[rows]), axis=1)
+    corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    codes = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
+    cells = Outline((middle[:, None] + corners).reshape(-1, 2), np.tile(codes, len(middle)))
+    left, right, bottom, top = _extent(tactile_map, view)
+    height = top - bottom
+    starts = np.arange(left - height, right, max(right - left, height) / _HATCHES)
+    lines = LineCollection(
+        [[(start, bottom), (start + height, top)] for start in starts],
+        colors="white",
+        linewidths=0.7,
+        path_effects=[patheffects.withStroke(linewidth=1.6, foreground="black")],
+    )
+    axes.add_collection(lines, autolim=False)
+    lines.set_clip_path(cells, axes.transData)
+
+
+def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[Place]) -> None:
+    """Below the coverage, where it hides no cell: what the hatching means, and what was found at each place."""
+    lines = [f"{number}  {_at(place)}: {place.reason}" for number, place in enumerate(places, start=1)]
+    wrapped = [textwrap.wrap(line, 66, subsequent_indent="    ", max_lines=2) for line in lines[:_EXPLAINED_PLACES]]
+    shown = ["\n".join(line) for line in wrapped]
+    if len(lines) > len(shown):
+        shown.append(f"and {len(lines) - len(shown)} lower ones")
+    if shown:
+        axes.annotate(
+            "\n".join(shown),
+            (0.0, 0.0),
+            xycoords="axes fraction",
+            xytext=(0, -54),
+            textcoords="offset points",
+            va="top",
+            fontsize=7,
+        )
+    if not tactile_map.few.any():
+        return
+    from matplotlib.patches import Patch
+
+    sample = Patch(facecolor="0.35", edgecolor="white", hatch="////", linewidth=0)
+    label = f"fewer than {FEW_READINGS} readings: noisy"
+    axes.legend([sample], [label], loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=8, frameon=False)
+
+
+def _at(place: Place) -> str:
+    return "({:.0f}, {:.0f}) mm".format(*place.centre_mm)
+
+
+def _colour_bar(axes: Axes, image: Any, label: str, *, extend: Any = "neither") -> None:
+    """As high as the panel, whatever its shape."""
+    bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.02, 0.0, 0.035, 1.0)), extend=extend)
+    bar.set_label(label, fontsize=9)
+    bar.ax.tick_params(labelsize=8)
+
+
+def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
+    """Name the plane's axes and turn them as the view has them."""
+    axes.set_anchor("N")
+    words = _AXIS_WORDS if tactile_map.recipe.source == "scan" else {"x": "x (mm)", "y": "y (mm)"}
+    axes.set_xlabel(words[view.right[1]], fontsize=9)
+    axes.set_ylabel(words[view.up[1]], fontsize=9)
+    axes.tick_params(labelsize=8)
+    if view.right[0] == "-":
+        axes.invert_xaxis()
+    if view.up[0] == "-":
+        axes.invert_yaxis()
+
+
+def _outlined(width: float) -> list[Any]:
+    """A black edge, so that white shows on every colour."""
+    from matplotlib import patheffects
+
+    return [patheffects.withStroke(linewidth=width, foreground="black")]
+
+
+def _draw_edges(axes: Axes, view: Orientation) -> None:
+    """What lies beyond each edge."""
+    places = {"left": (0.015, 0.5), "right": (0.985, 0.5), "top": (0.5, 0.975), "bottom": (0.5, 0.025)}
+    aligned = {"left": ("left", "center"), "right": ("right", "center"), "top": ("center", "top")}
+    for side, name in view.edges.items():
+        across, up = aligned.get(side, ("center", "bottom"))
+        axes.text(
+            *places[side],
+            name,
+            transform=axes.transAxes,
+            ha=across,
+            va=up,
+            color="white",
+            fontsize=10,
+            path_effects=_outlined(2.5),
+        )
+
+
+def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
+    """The lump's size where there is one, and dashed how wide the fitted bump is, which is not the lump's edge."""
+    from matplotlib.patches import Ellipse
+
+    bump = (2 * fit.sigma_x_mm, 2 * fit.sigma_y_mm)
+    ellipses = [(bump, "--", 1.2, "fitted bump, 1 sigma (not the lump's edge)")]
+    if fit.size_mm is not None:
+        ellipses.insert(0, (fit.size_mm, "-", 1.8, "size, median {:.1f} by {:.1f} mm".format(*fit.size_mm)))
+    centre = _pair(view, *fit.centre_mm)
+    for (along_x, along_y), dash, width, label in ellipses:
+        ellipse = Ellipse(
+            centre,
+            *_pair(view, along_x, along_y),
+            angle=-fit.angle_deg if view.swapped else fit.angle_deg,
+            fill=False,
+            edgecolor="white",
+            linewidth=width,
+            linestyle=dash,
+            label=label,
+        )
+        ellipse.set_path_effects(_outlined(width + 1.6))
+        axes.add_patch(ellipse)
+    axes.plot(*centre, "+", color="white", markersize=9, markeredgewidth=1.6, path_effects=_outlined(3.2))
+    place = (0.0, -0.13)  # below the picture, where it hides no cell
+    axes.legend(loc="upper left", bbox_to_anchor=place, ncols=2, fontsize=8, facecolor="0.5", labelcolor="white")
+
+
+def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None:
+    """A numbered cross wherever a lump was looked for in vain."""
+    for number, place in enumerate(places, start=1):
+        at = _pair(view, *place.centre_mm)
+        axes.plot(*at, "x", color="white", markersize=6, markeredgewidth=1.4, path_effects=_outlined(3.0))
+        if number <= _EXPLAINED_PLACES:
+            axes.annotate(
+                str(number),
+                at,
+                xytext=(6, 0),
+                textcoords="offset points",
+                va="center",
+                color="white",
+                fontsize=9,
+                path_effects=_outlined(2.5),
+            )
+
+
+def _draw_scale_bar(axes: Axes) -> None:
+    """10 mm, whatever way the axes run."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    sign = 1.0 if right > left else -1.0
+    start = left + 0.05 * (right - left)
+    height = bottom + 0.06 * (top - bottom)
+    ends = [start, start + sign * _SCALE_BAR_MM]
+    axes.plot(ends, [height, height], color="white", linewidth=3, path_effects=_outlined(4))
+    axes.annotate(
+        f"{_SCALE_BAR_MM:g} mm",
+        (start + sign * _SCALE_BAR_MM / 2, height),
+        xytext=(0, 4),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        color="white",
+        fontsize=8,
+        path_effects=_outlined(2),
+    )
+
+
+def _draw_notch(axes: Axes, view: Orientation) -> None:
+    """An arrow towards the sternal notch."""
+    if view.notch is None:
+        return
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    tail, length = (0.86, 0.08), 0.16
+    across, up = view.notch
+    tip = (tail[0] + length * across * abs((top - bottom) / (right - left)), tail[1] + length * up)
+    axes.annotate(
+        "",
+        tip,
+        tail,
+        xycoords="axes fraction",
+        arrowprops={"arrowstyle": "-|>", "color": "white", "linewidth": 1.8, "path_effects": _outlined(3)},
+    )
+    axes.annotate(
+        "to sternal\nnotch",
+        tip,
+        xycoords="axes fraction",
+        xytext=(0, 3),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        color="white",
+        fontsize=8,
+        path_effects=_outlined(2),
+    )
+
+
+def _caption(tactile_map: TactileMap, view: Orientation) -> str:
+    recipe = tactile_map.recipe
+    facts = [f"cells {recipe.cell_mm:g} mm", f"normalise {recipe.normalise}"]
+    if recipe.pressure_window_kpa:
+        facts.append("window {:g} to {:g} kPa".format(*recipe.pressure_window_kpa))
+    if tactile_map.frame_count:
+        facts.append(f"{tactile_map.frame_count} frames")
+    return f"{view.words}.  {', '.join(facts)}.  {RESEARCH_USE}"
