@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import stat
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
@@ -23,7 +25,7 @@ from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-STORE_SCHEMA = "tactile-bayes.batch/1"
+STORE_SCHEMA = "tactile-bayes.batch/2"
 # Items handed to the executor ahead of their results; bounds the memory that waiting items take.
 _WINDOW = 1024
 
@@ -186,10 +188,11 @@ def _one_line(error: BaseException) -> str:
 
 
 class BatchStore:
-    """Results on disk, one JSON line each, so that an interrupted batch resumes from what it has.
+    """Results on disk, one line each, so that an interrupted batch resumes from what it has.
 
-    Open it with `open_store`. The first line names the settings; each further line is one item's result. A line half
-    written when the program was killed is dropped.
+    Open it with `open_store`. The first line names the settings; each further line is one item's result. A line is
+    JSON and its CRC-32, so that no damaged result is taken for a sound one. A line half written when the program was
+    killed is dropped.
 
     Parameters
     ----------
@@ -218,7 +221,7 @@ class BatchStore:
     def add(self, name: str, value: object) -> Any:
         """Append one result and return it as it will be read back."""
         line = json.dumps({"key": name, "value": self._encode(value)}, ensure_ascii=False)
-        self._append(line)
+        self._append(_sealed(line))
         self.values[name] = self._decode(json.loads(line)["value"])
         return self.values[name]
 
@@ -226,7 +229,7 @@ class BatchStore:
         """Read what an earlier run left, or write the header of a new store; see `open_store` for the errors."""
         text = _read_all(self._descriptor)
         whole = text[: text.rfind(b"\n") + 1]
-        first = json.dumps(header, sort_keys=True, ensure_ascii=False)
+        first = _sealed(json.dumps(header, sort_keys=True, ensure_ascii=False))
         if not whole and first.encode().startswith(text):
             os.ftruncate(self._descriptor, 0)
             self._append(first)
@@ -273,11 +276,14 @@ def open_store(
     BadDataError
         When the file is something else, or a line in its middle is damaged.
     """
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        descriptor = os.open(path, flags, 0o600)
     except OSError as error:
         raise UsageError(f"{path} cannot be opened ({error.strerror}); choose another place") from None
     try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise UsageError(f"{path} is no regular file; choose another name")
         _lock(descriptor, path)
         store = BatchStore(descriptor, path, encode=encode, decode=decode)
         store.load({"schema": STORE_SCHEMA, "settings": json.loads(json.dumps(settings))})
@@ -302,11 +308,24 @@ def _read_all(descriptor: int) -> bytes:
         return file.read()
 
 
+def _sealed(text: str) -> str:
+    """A line of a store: the text and its checksum."""
+    return f"{text} {zlib.crc32(text.encode()):08x}"
+
+
+def _unsealed(line: str) -> Any:
+    """What a line holds; `ValueError` where it is damaged."""
+    text = line.rpartition(" ")[0]
+    if _sealed(text) != line:
+        raise ValueError("its checksum does not match")
+    return json.loads(text)
+
+
 def _check_header(line: str, wanted: Mapping[str, Any], *, path: Path) -> None:
     try:
-        found = json.loads(line)
+        found, _ = json.JSONDecoder().raw_decode(line)  # that of another schema may have another checksum, or none
         schema, settings = found["schema"], dict(found["settings"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise BadDataError("not a store of batch results", way_out="choose another name", path=str(path)) from None
     if schema != wanted["schema"]:
         raise BadDataError(
@@ -314,6 +333,8 @@ def _check_header(line: str, wanted: Mapping[str, Any], *, path: Path) -> None:
             way_out="finish it with the version that began it, or choose another name",
             path=str(path),
         )
+    if _sealed(line.rpartition(" ")[0]) != line:
+        raise BadDataError("line 1 is damaged", way_out="choose another name", path=str(path))
     new = dict(wanted["settings"])
     differ = sorted(name for name in settings.keys() | new.keys() if settings.get(name) != new.get(name))
     if differ:
@@ -326,9 +347,9 @@ def _check_header(line: str, wanted: Mapping[str, Any], *, path: Path) -> None:
 
 def _parse_line(line: str, *, number: int, path: Path) -> tuple[str, Any]:
     try:
-        record = json.loads(line)
+        record = _unsealed(line)
         return str(record["key"]), record["value"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise BadDataError(
             f"line {number} is damaged", way_out="remove that line: its item will be run again", path=str(path)
         ) from None

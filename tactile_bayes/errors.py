@@ -52,7 +52,8 @@ class BadDataError(TactileBayesError, ValueError):
 
     def __str__(self) -> str:
         head = f"{self.path}: {self.what}" if self.path else self.what
-        return f"{head}; {self.way_out}" if self.way_out else head
+        text = f"{head}; {self.way_out}" if self.way_out else head
+        return "\\n".join(text.splitlines())  # names and values from a file may hold newlines
 
     def at(self, path: object) -> BadDataError:
         """The same error, naming the file it was found in."""

@@ -90,7 +90,7 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
     [
         (["x.npz", "-o", "a.mcap", "--spacing-mm", "1"], 2, "are for maps"),
         (["g.csv", "-o", "g.nc"], 2, "--spacing-mm"),
-        (["g.csv", "-o", "g.csv", "--spacing-mm", "1"], 2, "--force"),
+        (["g.csv", "-o", "g.csv", "--spacing-mm", "1"], 2, "is an input"),
         (["g.csv", "-o", "no/g.nc", "--spacing-mm", "1"], 2, "not a directory"),
         (["none.npz", "-o", "a.mcap"], 3, "cannot be read"),
         (["g.csv", "-o", "a.mcap", "--as", "scan"], 3, "not an .npz file"),

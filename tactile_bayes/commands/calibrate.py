@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.learn_size import SizeTable, StudyCases
     from tactile_bayes.posterior.size_calibration import LeftOutErrors
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 
 
 @click.group("calibrate")

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import METHODS, RESEARCH_USE
 
@@ -18,7 +19,7 @@ EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.tom
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=FilePath(),
     default=Path("tactile-bayes-demo"),
     show_default=True,
     metavar="DIR",

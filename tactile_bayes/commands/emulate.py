@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import BadDataError, UsageError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ _SHARE = click.FloatRange(0.0, 1.0)
 
 @click.command("emulate")
 @click.argument("kind", metavar="head|tracker|both", type=click.Choice(["head", "tracker", "both"]))
-@click.argument("scan", metavar="SCAN.mcap", type=click.Path(path_type=Path))
+@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
 @click.option("--protocol", type=click.Choice(PROTOCOLS), default="open", show_default=True, help="Of the tracker.")
 @click.option(
     "--tcp",

@@ -12,13 +12,14 @@ import click
 from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import WholeOrAuto
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
 
 if TYPE_CHECKING:
     pass
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 
 

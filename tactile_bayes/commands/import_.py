@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import NORMALISE, RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -18,8 +19,8 @@ _LONGEST_UNITS = 20
 
 
 @click.command("import")
-@click.argument("source", metavar="SRC", type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .mcap or .nc.")
+@click.argument("source", metavar="SRC", type=FilePath())
+@click.option("-o", "--output", required=True, type=FilePath(), help="File to write: .mcap or .nc.")
 @click.option(
     "--as",
     "kind",

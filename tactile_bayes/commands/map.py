@@ -11,13 +11,14 @@ import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import NumberOr
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
 
 if TYPE_CHECKING:
     from tactile_bayes.scan import Scan
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 
 
 @click.command("map")
@@ -127,17 +128,12 @@ def command(
 
 
 def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:
-    """Stop before any work is done if an output cannot be written or would destroy an input."""
+    """Stop before any work is done if an output cannot be written or a scan is given twice."""
     from tactile_bayes.files.atomic import refuse_existing
 
-    outputs = [output, *([figure] if figure else [])]
-    if len({path.absolute() for path in outputs}) < len(outputs):
-        raise UsageError(f"{output} is given for the map and for the figure; choose another name for one")
     if len({path.absolute() for path in scans}) < len(scans):
         raise UsageError("a scan is given twice; its frames would count twice")
-    for path in outputs:
-        if any(path.exists() and scan.exists() and path.samefile(scan) for scan in scans):
-            raise UsageError(f"{path} is an input of this command; choose another name for the output")
+    for path in [output, *([figure] if figure else [])]:
         refuse_existing(path, force=force)
 
 

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 
 if TYPE_CHECKING:
     from tactile_bayes.trial.planning import PlanCase
 
 SCHEMA = "tactile-bayes/plan/1"
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 _SD = click.FloatRange(0)
 _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other_miss")
 

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.measure import MassRow
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 
 
 @click.command("population")

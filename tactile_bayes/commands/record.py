@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from tactile_bayes.hardware.recorder import Line, Observer, Recorder
     from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 _CODE = "A code, not a name."
 
 

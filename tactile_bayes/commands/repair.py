@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
 
 @click.command("repair")
-@click.argument("scan", metavar="SCAN.mcap", type=click.Path(path_type=Path))
-@click.option("-o", "--output", metavar="OUT.mcap", type=click.Path(path_type=Path), help="Write there instead.")
+@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
+@click.option("-o", "--output", metavar="OUT.mcap", type=FilePath(), help="Write there instead.")
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 def command(*, scan: Path, output: Path | None, force: bool) -> None:
     """Rewrite a scan that was cut off or damaged: what is intact is kept, what is lost is told.

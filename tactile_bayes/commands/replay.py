@@ -11,9 +11,10 @@ from pathlib import Path
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import DeviceError
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 
 
 @click.command("replay")

@@ -12,6 +12,7 @@ import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import WholeOrAuto
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import MOST_FIELD_COSINES
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
     from tactile_bayes.posterior.sbc import MapRanks
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 
 
 @click.command("sbc")

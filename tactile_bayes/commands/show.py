@@ -8,11 +8,12 @@ from typing import Any
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
 
 @click.command("show")
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=FilePath())
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(file: Path, as_json: bool) -> None:
     """Say what any of our files is: schema, shape, units, quality, provenance.
@@ -28,9 +29,13 @@ def command(file: Path, as_json: bool) -> None:
     if as_json:
         click.echo(dump_json(found), nl=False)
         return
-    for line in _lines(found):
-        click.echo(line)
+    click.echo(shown(found))
     click.echo(RESEARCH_USE)
+
+
+def shown(found: dict[str, Any]) -> str:
+    """What a file is, one fact a line."""
+    return "\n".join(_lines(found))
 
 
 def _lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
@@ -16,8 +18,8 @@ if TYPE_CHECKING:
 
 
 @click.command("simulate")
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Scan file to write (.mcap).")
+@click.argument("scene", type=FilePath())
+@click.option("-o", "--output", required=True, type=FilePath(), help="Scan file to write (.mcap).")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the random numbers, in place of the scene's.")
 @click.option(
     "--fidelity",

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from concurrent.futures import Executor
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
     from tactile_bayes.forward.tactile_line import TactileLine
     from tactile_bayes.geometry import FloatArray
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 _ABOVE_0 = click.FloatRange(min=0.0, min_open=True)
 # The line is a map that does not change in y: a bump of this width there.
 _NO_CHANGE_MM = 1e6

@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 
 
 @click.command("estimate")

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
+from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
     from tactile_bayes.forward.tradeoff import LumpCase, Measured
     from tactile_bayes.report.size_rules import SizeRule
     from tactile_bayes.report.tradeoff_text import TradeoffReport
 
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 LEARNED = "learned"
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from tactile_bayes.trial.summary import TrialReport
 
 SCHEMA = "tactile-bayes/validate/1"
-_FILE = click.Path(path_type=Path)
+_FILE = FilePath()
 
 
 @dataclass(frozen=True, slots=True)

@@ -155,7 +155,7 @@ def decoding(what: str, *, way_out: str) -> Iterator[None]:
     """
     try:
         yield
-    except TactileBayesError:
+    except (TactileBayesError, MemoryError):
         raise
     except Exception as error:
         why = " ".join(str(error).split())[:200] or type(error).__name__

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.atomic import atomic_path
+from tactile_bayes.files.atomic import refuse_existing, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,11 +58,14 @@ def figure_file(path: Path, *, size_in: tuple[float, float], force: bool) -> Ite
     import matplotlib
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(), atomic_path(path, force=force) as partial:
+    refuse_existing(path, force=force)
+    with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
         figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
         figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))  # type: ignore[union-attr,call-arg]
         yield figure
         suffix = path.suffix.lower()
-        figure.savefig(partial, format=suffix.removeprefix("."), dpi=DPI, metadata=FORMATS[suffix])
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=suffix.removeprefix("."), dpi=DPI, metadata=FORMATS[suffix])
+    write_bytes(path, buffer.getvalue(), force=force)

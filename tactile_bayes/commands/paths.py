@@ -1,0 +1,71 @@
+"""Paths on the command line: no output may be an input of the same command, or another output of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from tactile_bayes.errors import UsageError
+
+WRITTEN: Final = frozenset({"output", "figure", "map_figure", "figures", "html", "checkpoint"})
+"""The options that name what a command writes; every other path is read."""
+_SEEN: Final = "tactile_bayes.paths"
+
+
+class FilePath(click.Path):
+    """A path that is compared with the other paths of the same call before the command runs.
+
+    Symbolic and hard links to one file are that file.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path.
+
+        Raises
+        ------
+        UsageError
+            When it is written and another argument of the command reads or writes it.
+        """
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        if ctx is not None and param is not None:
+            written = param.name in WRITTEN
+            seen: list[tuple[Path, bool]] = ctx.meta.setdefault(_SEEN, [])
+            for other, other_written in seen:
+                if written and other_written:
+                    refuse_same([path], [other], what="two outputs of this command")
+                elif written or other_written:
+                    refuse_same([path], [other])
+            seen.append((path, written))
+        return path
+
+
+def refuse_same(
+    outputs: Iterable[Path | None], inputs: Iterable[Path], *, what: str = "an input of this command"
+) -> None:
+    """Refuse an output that is one of the inputs, by whatever name.
+
+    Parameters
+    ----------
+    outputs
+        None where there is none.
+    what
+        What the file is besides, for the error.
+    """
+    read = list(inputs)
+    for path in outputs:
+        if path is not None and any(_same(path, one) for one in read):
+            raise UsageError(f"{path} is {what}; choose another name for the output")
+
+
+def _same(one: Path, other: Path) -> bool:
+    try:
+        return os.path.realpath(one) == os.path.realpath(other) or one.samefile(other)
+    except OSError:  # one of them does not exist, or its name is too long: opening it says so
+        return False
