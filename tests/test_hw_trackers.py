@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import struct
 
 import numpy as np
@@ -12,8 +13,9 @@ from hypothesis import strategies as st
 
 from tactile_bayes.geometry import quaternion_from_rotation, rotation_from_quaternion
 from tactile_bayes.hardware.bird import BirdParser, record_bytes
+from tactile_bayes.hardware.crc64 import crc64
 from tactile_bayes.hardware.head import HeadParser, encode_pose
-from tactile_bayes.hardware.igtlink import IgtlinkParser, crc64, encode_transform
+from tactile_bayes.hardware.igtlink import IgtlinkParser, encode_transform
 from tactile_bayes.hardware.polhemus import (
     FASTRAK_ASCII,
     FASTRAK_DEFAULT,
@@ -187,6 +189,19 @@ def test_bird_words_are_fourteen_bits():
 
 def test_the_checksum_of_a_transform_is_the_published_one():
     assert crc64(b"123456789") == 0x6C40DF5F0B497347
+
+
+@pytest.mark.parametrize("size", [0, 1, 7, 8, 9, 63, 64, 65, 2047, 2048, 2049, 4096, 100_003])
+def test_the_checksum_of_a_long_message_is_the_remainder_of_its_polynomial(size):
+    data = random.Random(size).randbytes(size)
+    remainder = int.from_bytes(data + bytes(8), "big")  # times x^64, divided by long division
+    divisor = 1 << 64 | 0x42F0E1EBA9EA3693
+    while (high := remainder.bit_length()) > 64 and size < 3000:
+        remainder ^= divisor << high - 65
+    if size < 3000:
+        assert crc64(data) == remainder
+    split = size // 3  # and linear: the parts' checksums give the whole's
+    assert crc64(data) == crc64(data[:split] + bytes(size - split)) ^ crc64(data[split:])
 
 
 def test_other_messages_and_other_devices_are_passed_over():

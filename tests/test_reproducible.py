@@ -69,13 +69,13 @@ WRITE_FOREVER = """
 import sys
 from pathlib import Path
 from tactile_bayes.files.atomic import atomic_path
-print("ready", flush=True)
 n = 0
 while True:
     n += 1
     with atomic_path(Path("out.txt"), force=True) as partial, partial.open("w") as file:
         for _ in range(2000):
             file.write(f"{n % 10}" * 100 + "\\n")
+    print("ready", flush=True)
 """
 WRITE_AND_WAIT = """
 import time
@@ -88,11 +88,12 @@ with atomic_path(Path("out.txt"), force=True) as partial:
 """
 
 
-def killed(code: str, place: Path, environment: dict[str, str], *, after_s: float) -> None:
-    """Run a writer in `place` and kill it some time after it says that it is ready."""
+def killed(code: str, place: Path, environment: dict[str, str], *, after_s: float, times: int = 1) -> None:
+    """Run a writer in `place` and kill it some time after it has said so many times that it is ready."""
     with subprocess.Popen([sys.executable, "-c", code], cwd=place, env=environment, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        assert process.stdout.readline() == b"ready\n"
+        for _ in range(times):
+            assert process.stdout.readline() == b"ready\n"
         time.sleep(after_s)
         process.kill()
         assert process.wait() == -signal.SIGKILL
@@ -136,8 +137,8 @@ def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(
 def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path: Path, child_environment: dict[str, str]) -> None:
     chance = random.Random(96)
     seen = set()
-    for _ in range(10):
-        killed(WRITE_FOREVER, tmp_path, child_environment, after_s=0.05 + chance.uniform(0, 0.03))
+    for times in range(1, 11):  # however long a write takes here, the kills come during different ones
+        killed(WRITE_FOREVER, tmp_path, child_environment, times=times, after_s=chance.uniform(0, 0.03))
         lines = (tmp_path / "out.txt").read_text().splitlines()
         assert len(lines) == 2000
         assert len(set(lines)) == 1

@@ -129,13 +129,19 @@ class Estimator:
                 self._running = self._pool.submit(live_estimate, tactile_map, self._calibration)
 
     def close(self) -> None:
-        """Let its process go."""
+        """End its process, in the middle of an estimate too."""
         if self._pool is not None:
+            import multiprocessing
+
             self._pool.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():
+                child.terminate()
 
 
 def _prepare() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from tactile_bayes.batch import prepare_worker
+
+    prepare_worker()
     import tactile_bayes.files.size_json
     import tactile_bayes.posterior.estimate  # noqa: F401
 
@@ -335,3 +341,5 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
 
 if __name__ == "__main__":
     run(int(sys.argv[1]), json.load(sys.stdin))
+    sys.stderr.flush()
+    os._exit(0)  # threads that still talk to browsers would be waited for

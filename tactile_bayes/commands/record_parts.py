@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
@@ -164,7 +165,8 @@ class Keys:
         if self._terminal:
             import termios
 
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
+            with contextlib.suppress(termios.error):  # the terminal was closed
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
 
     def look(self) -> None:
         """Do what the keys say that were pressed since, and tell of landmarks."""
@@ -173,7 +175,12 @@ class Keys:
             self._told += 1
         if not self._terminal or not select.select([sys.stdin], [], [], 0)[0]:
             return
-        for key in os.read(sys.stdin.fileno(), 64).decode("latin-1"):
+        keys = b""
+        with contextlib.suppress(OSError):  # a closed terminal is at its end, or fails
+            keys = os.read(sys.stdin.fileno(), 64)
+        if not keys:
+            self._recorder.stop("a closed terminal")
+        for key in keys.decode("latin-1"):
             self._press(key)
 
     def _press(self, key: str) -> None:

@@ -21,6 +21,7 @@ _PORT_STATUS: Final = 0x31  # a tool in the port, initialised and enabled
 _START: Final = 0xA5C4
 _BAD_CRC, _UNKNOWN, _NOT_NOW = 0x04, 0x01, 0x0C
 _POLYNOMIAL: Final = 0xA001
+_LONGEST: Final = 4096
 
 
 def crc16(data: bytes) -> int:
@@ -72,7 +73,8 @@ class EmulatedNdi:
 
     def hear(self, data: bytes) -> bytes:
         """Take commands; the answers."""
-        *lines, self._rest = (self._rest + data).split(b"\r")
+        *lines, rest = (self._rest + data).split(b"\r")
+        self._rest = rest[-_LONGEST:]
         return b"".join(self._answer(line) for line in lines)
 
     def greet(self) -> None:

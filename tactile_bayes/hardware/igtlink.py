@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from tactile_bayes.geometry import quaternion_from_rotation
+from tactile_bayes.hardware.crc64 import crc64
 from tactile_bayes.hardware.readings import PoseReading, Reading
 
 PORT: Final = 18944
@@ -19,30 +20,8 @@ _HEADER: Final = struct.Struct(">H12s20sIIQQ")  # version, type, device, s, frac
 _BODY: Final = struct.Struct(">12f")
 _KIND_AT: Final = 2
 _TRANSFORM: Final = b"TRANSFORM\0\0\0"
-_POLYNOMIAL: Final = 0x42F0E1EBA9EA3693
 _LONGEST: Final = 1 << 20
 _RIGID_SLACK: Final = 0.02
-
-
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 56
-        for _ in range(8):
-            crc = (crc << 1 ^ (_POLYNOMIAL if crc >> 63 else 0)) & 0xFFFF_FFFF_FFFF_FFFF
-        table.append(crc)
-    return tuple(table)
-
-
-_TABLE: Final = _crc_table()
-
-
-def crc64(data: bytes) -> int:
-    """CRC-64 (ECMA-182) with initial value 0, as OpenIGTLink uses it."""
-    crc = 0
-    for byte in data:
-        crc = (crc << 8 ^ _TABLE[crc >> 56 ^ byte]) & 0xFFFF_FFFF_FFFF_FFFF
-    return crc
 
 
 class IgtlinkParser:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +23,8 @@ ANSWER_S = 2.5
 _SHOWN_BYTES: Final = 12
 # One read waits so long at most. It is never changed: with rfc2217 that would be negotiated anew each time.
 _READ_S: Final = 0.01
+# What a device that vanishes ends a call with; a terminal's own error is no OSError.
+GONE: Final = (OSError, serial.SerialException, termios.error)
 
 
 class Port:
@@ -59,7 +62,7 @@ class Port:
         try:
             self._serial.write(data)
             self._serial.flush()
-        except (OSError, serial.SerialException) as error:
+        except GONE as error:
             raise DeviceError(f"{self.name}: cannot be written to ({_reason(error)}); check its cable") from None
 
     def read_some(self, timeout_s: float) -> bytes:
@@ -72,7 +75,7 @@ class Port:
                     return data + bytes(self._serial.read(self._serial.in_waiting))
                 if time.monotonic() >= end:
                     return b""
-        except (OSError, serial.SerialException) as error:
+        except GONE as error:
             raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); check its cable") from None
 
     def drain(self, quiet_s: float = 0.05) -> int:
@@ -103,7 +106,7 @@ class Port:
 
     def close(self) -> None:
         """Close; nothing is wrong if it has gone already."""
-        with contextlib.suppress(OSError, serial.SerialException):
+        with contextlib.suppress(*GONE):
             self._serial.close()
         if self._relayed is not None:
             self._relayed.close()
@@ -121,7 +124,7 @@ def _open(url: str, baud: int, role: str) -> Any:
         raise DeviceError(
             f"{role} {url}: not a port ({error}); give /dev/ttyUSB0, socket://HOST:PORT or rfc2217://HOST:PORT"
         ) from None
-    except (OSError, serial.SerialException) as error:
+    except GONE as error:
         raise DeviceError(
             f"{role} {url}: cannot be opened ({_reason(error)}); `tactile-bayes devices` lists what is there"
         ) from None
@@ -136,7 +139,7 @@ def _descriptor_of(port: Any) -> int | None:
 
 
 def _relay(port: Any, sink: socket.socket) -> None:
-    with contextlib.suppress(OSError, serial.SerialException, TypeError):
+    with contextlib.suppress(*GONE, TypeError):
         while True:
             data = port.read(1)
             if data:
@@ -145,7 +148,7 @@ def _relay(port: Any, sink: socket.socket) -> None:
 
 def _reason(error: Exception) -> str:
     """The system's words without pyserial's around them."""
-    number = getattr(error, "errno", None)
+    number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
     return os.strerror(number) if isinstance(number, int) else str(error).split(": ")[-1].strip("[]'\" ")
 
 

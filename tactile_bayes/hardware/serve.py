@@ -6,11 +6,13 @@ is open in the browser can look on.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import ipaddress
 import json
 import math
 import secrets
+import socket
 import threading
 from http import HTTPStatus
 from pathlib import Path
@@ -24,6 +26,8 @@ from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
 from tactile_bayes.mapping.orientation import orientation_of
 
 _PAGE: Final = Path(__file__).with_name("live_page.html")
+# How long pages may take to say goodbye.
+CLOSE_S: Final = 0.5
 _SECURITY: Final = (
     "default-src 'none'; connect-src 'self' ws://{host}; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
     "frame-ancestors 'none'; base-uri 'none'"
@@ -72,6 +76,7 @@ class LiveServer:
         self._token = token or secrets.token_urlsafe(24)
         self._news = threading.Condition()
         self._text, self._number, self._over = "", 0, False
+        self._pages: set[Any] = set()
         try:
             self._server = serve(self._talk, host, port, process_request=self._admit, compression=None)
         except OSError as error:
@@ -93,11 +98,19 @@ class LiveServer:
             self._news.notify_all()
 
     def close(self) -> None:
-        """Tell the pages that it is over, and stop."""
+        """Tell the pages that it is over, and stop; pages that do not read are cut off."""
         with self._news:
             self._over = True
             self._news.notify_all()
-        self._server.shutdown()
+        closing = threading.Thread(target=self._server.shutdown, daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+        with self._news:
+            pages = list(self._pages)
+        for page in pages:
+            with contextlib.suppress(OSError):
+                page.socket.shutdown(socket.SHUT_RDWR)
+        closing.join(CLOSE_S)
 
     def _admit(self, connection: Any, request: Any) -> Any:
         """The page or a refusal; None lets a websocket through."""
@@ -105,13 +118,13 @@ class LiveServer:
         given = parse_qs(address.query).get("token", [""])[0]
         if not hmac.compare_digest(given.encode(), self._token.encode()):
             return connection.respond(HTTPStatus.FORBIDDEN, "give the whole address that `record` printed\n")
-        if request.headers.get("Host") != self._authority:
+        if request.headers.get_all("Host") != [self._authority]:
             return connection.respond(HTTPStatus.FORBIDDEN, "not under this name\n")
         if address.path == "/":
             return self._page(connection)
         if address.path != "/live":
             return connection.respond(HTTPStatus.NOT_FOUND, "nothing here\n")
-        if request.headers.get("Origin") != f"http://{self._authority}":
+        if request.headers.get_all("Origin") != [f"http://{self._authority}"]:
             return connection.respond(HTTPStatus.FORBIDDEN, "not from another site\n")
         return None
 
@@ -128,6 +141,15 @@ class LiveServer:
 
     def _talk(self, connection: Any) -> None:
         """Send each new state until the page or the recording goes."""
+        with self._news:
+            self._pages.add(connection)
+        try:
+            self._send_news(connection)
+        finally:
+            with self._news:
+                self._pages.discard(connection)
+
+    def _send_news(self, connection: Any) -> None:
         from websockets.exceptions import ConnectionClosed
 
         seen = 0
