@@ -12,6 +12,7 @@ import json
 import os
 import stat
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
@@ -19,8 +20,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from tactile_bayes import __version__
-from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
+from tactile_bayes.errors import BadDataError, UsageError, one_line
+from tactile_bayes.executors import InlineExecutor, LocalWorkers
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -28,6 +29,14 @@ Result = TypeVar("Result")
 STORE_SCHEMA = "tactile-bayes.batch/2"
 # Items handed to the executor ahead of their results; bounds the memory that waiting items take.
 _WINDOW = 1024
+# Items named in a line on a fault they share.
+_LISTED = 3
+
+
+DIED_TWICE = (
+    "its process ended twice without an answer (killed, perhaps for lack of memory); run it again with fewer --workers"
+)
+CLUSTER_LOST = "the dask scheduler was lost before an answer came; start it again and run what is missing"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +63,39 @@ class Outcome(Generic[Result]):
         return not self.error
 
 
+class BatchInterrupted(KeyboardInterrupt):
+    """Ctrl-C, with what was finished.
+
+    Parameters
+    ----------
+    outcomes
+        Of the finished items, in their order.
+    total
+        How many items there were.
+    store
+        Where the results are kept for the next run; None where nothing keeps them.
+    """
+
+    def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None) -> None:
+        self.outcomes = list(outcomes)
+        kept = "" if store is None else f"; {store} keeps them, run again to go on"
+        super().__init__(f"{len(self.outcomes)} of {total} done{kept}")
+
+
+def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:
+    """A line for each fault, with the names of the items that have it; many items are counted, not listed."""
+    names: dict[str, list[str]] = {}
+    for one in outcomes:
+        if not one.ok:
+            names.setdefault(one.error, []).append(one.key)
+    return [f"{_listed(keys)}: {error}" for error, keys in names.items()]
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
 def run_batch(
     function: Callable[[Item], Result],
     items: Iterable[Item],
@@ -65,8 +107,9 @@ def run_batch(
 ) -> list[Outcome[Result]]:
     """Apply `function` to every item and return the outcomes in the order of the items.
 
-    An item that raises is reported by its key and one line, and the others go on. Ctrl-C, or any fault of the store,
-    cancels what has not begun, keeps what is finished and goes on up.
+    An item that raises is reported by its key and one line, and the others go on, also where a worker process was
+    killed: the items it may have held are run again, and one whose process ends twice is at fault. Ctrl-C, or any fault
+    of the store, cancels what has not begun, keeps what is finished and goes on up.
 
     Parameters
     ----------
@@ -87,6 +130,8 @@ def run_batch(
     ------
     BadDataError
         When two items have the same key.
+    BatchInterrupted
+        On Ctrl-C, with the outcomes so far.
     """
     work = dict(_named(items, key))
     kept = {} if store is None else store.values
@@ -100,7 +145,11 @@ def run_batch(
     if progress is not None:
         progress(len(outcomes), len(work))
     todo = [(name, item) for name, item in work.items() if name not in outcomes]
-    _run_all(function, todo, executor=executor or InlineExecutor(), keep=keep)
+    try:
+        _Run(function, todo, executor=executor or InlineExecutor(), keep=keep).run()
+    except KeyboardInterrupt:
+        done = [outcomes[name] for name in work if name in outcomes]
+        raise BatchInterrupted(done, total=len(work), store=None if store is None else store.path) from None
     return [outcomes[name] for name in work]
 
 
@@ -121,46 +170,89 @@ def _stored(outcome: Outcome[Result], store: BatchStore) -> Outcome[Result]:
     try:
         return Outcome(outcome.key, value=store.add(outcome.key, outcome.value))
     except (TypeError, ValueError) as error:  # not JSON, or refused by the store's encoder
-        return Outcome(outcome.key, error=_one_line(error))
+        return Outcome(outcome.key, error=one_line(error))
 
 
-def _run_all(
-    function: Callable[[Item], Result],
-    todo: Sequence[tuple[str, Item]],
-    *,
-    executor: Executor,
-    keep: Callable[[Outcome[Result]], None],
-) -> None:
-    """Submit all items, at most `_WINDOW` ahead, and keep each outcome as it arrives."""
-    waiting: dict[Future[tuple[Result | None, str]], str] = {}
-    finished: SimpleQueue[Future[tuple[Result | None, str]]] = SimpleQueue()
-    try:
-        for name, item in todo:
-            future = _submit(executor, function, item)
-            waiting[future] = name
-            future.add_done_callback(finished.put)
-            while not finished.empty() or len(waiting) >= _WINDOW:
-                done = finished.get()
-                keep(_settle(waiting.pop(done), done))
-        while waiting:
-            done = finished.get()
-            keep(_settle(waiting.pop(done), done))
-    except BaseException:
-        for future in list(waiting):
+class _Run(Generic[Item, Result]):
+    """Hands items out, few ahead of their results, and keeps each outcome as it arrives.
+
+    When worker processes are lost they are replaced. Whatever was handed out then is run again, one item at a time, so
+    that an item that ends its process again is known to be at fault.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Item], Result],
+        todo: Iterable[tuple[str, Item]],
+        *,
+        executor: Executor,
+        keep: Callable[[Outcome[Result]], None],
+    ) -> None:
+        self._function, self._executor, self._keep = function, executor, keep
+        self._workers = executor if isinstance(executor, LocalWorkers) else None
+        self._rest: deque[tuple[str, Item]] = deque(todo)
+        self._suspects: deque[tuple[str, Item]] = deque()
+        self._waiting: dict[Future[tuple[Result | None, str]], tuple[str, Item]] = {}
+        self._finished: SimpleQueue[Future[tuple[Result | None, str]]] = SimpleQueue()
+        self._alone = self._broken = False
+
+    def run(self) -> None:
+        """Run all items; on the way out of an interruption or a fault keep what is finished."""
+        try:
+            while self._rest or self._suspects or self._waiting:
+                self._hand_out()
+                self._take()
+        except BaseException:
+            self._abandon()
+            raise
+
+    def _hand_out(self) -> None:
+        """Submit what may run now: a suspect alone, or else the next few items."""
+        if not self._waiting and self._broken and self._workers is not None:
+            self._workers.renew()
+            self._broken = False
+        if not self._waiting:
+            self._alone = bool(self._suspects)
+            if self._alone:
+                self._submit(self._suspects.popleft())
+        ahead = _WINDOW if self._workers is None else self._workers.ahead
+        while self._rest and not (self._alone or self._broken) and len(self._waiting) < ahead:
+            self._submit(self._rest.popleft())
+            if not self._finished.empty():
+                return
+
+    def _submit(self, work: tuple[str, Item]) -> None:
+        try:
+            future = self._executor.submit(_attempt, self._function, work[1])
+        except BrokenExecutor as error:
+            future = Future()
+            future.set_exception(error)
+        self._waiting[future] = work
+        future.add_done_callback(self._finished.put)
+
+    def _take(self) -> None:
+        """Wait for one result."""
+        done = self._finished.get()
+        work = self._waiting.pop(done)
+        if self._workers is None or done.cancelled() or not isinstance(done.exception(), BrokenExecutor):
+            self._keep(_settle(work[0], done))
+            return
+        self._broken = True
+        if self._alone:
+            self._keep(Outcome(work[0], error=DIED_TWICE))
+        else:
+            self._suspects.append(work)
+
+    def _abandon(self) -> None:
+        """Cancel what has not begun, keep what is finished, and do not wait for what is under way."""
+        for future in list(self._waiting):
             future.cancel()
-        for future in [future for future in waiting if future.done() and not future.cancelled()]:
-            keep(_settle(waiting.pop(future), future))
-        raise
-
-
-def _submit(executor: Executor, function: Callable[[Item], Result], item: Item) -> Future[tuple[Result | None, str]]:
-    """The item's future; where the workers are lost, one that says so."""
-    try:
-        return executor.submit(_attempt, function, item)
-    except BrokenExecutor as error:
-        lost: Future[tuple[Result | None, str]] = Future()
-        lost.set_exception(error)
-        return lost
+        for future in [one for one in self._waiting if one.done() and not one.cancelled()]:
+            name, _ = self._waiting.pop(future)
+            if not isinstance(future.exception(), BrokenExecutor):
+                self._keep(_settle(name, future))
+        if self._workers is not None:
+            self._workers.stop()
 
 
 def _attempt(function: Callable[[Item], Result], item: Item) -> tuple[Result | None, str]:
@@ -168,23 +260,18 @@ def _attempt(function: Callable[[Item], Result], item: Item) -> tuple[Result | N
     try:
         return function(item), ""
     except Exception as error:
-        return None, _one_line(error)
+        return None, one_line(error)
 
 
 def _settle(name: str, future: Future[tuple[Result | None, str]]) -> Outcome[Result]:
     """The outcome of a finished future; a lost worker or a result that cannot travel is a fault of its item."""
     try:
         value, error = future.result()
-    except (Exception, CancelledError) as fault:
-        return Outcome(name, error=_one_line(fault))
+    except CancelledError:
+        return Outcome(name, error=CLUSTER_LOST)
+    except Exception as fault:
+        return Outcome(name, error=one_line(fault))
     return Outcome(name, value=value, error=error)
-
-
-def _one_line(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    if isinstance(error, TactileBayesError) and text:
-        return text
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 class BatchStore:
@@ -353,107 +440,3 @@ def _parse_line(line: str, *, number: int, path: Path) -> tuple[str, Any]:
         raise BadDataError(
             f"line {number} is damaged", way_out="remove that line: its item will be run again", path=str(path)
         ) from None
-
-
-class InlineExecutor(Executor):
-    """Runs each item in this process when it is submitted."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """The finished future of ``fn(*args, **kwargs)``; Ctrl-C is not caught."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-@contextlib.contextmanager
-def open_executor(*, workers: int = 1, cluster: str | None = None) -> Iterator[Executor]:
-    """What ``--workers`` and ``--cluster`` mean: a cluster when an address is given, else local processes."""
-    chosen = local_executor(workers) if cluster is None else cluster_executor(cluster)
-    with chosen as executor:
-        yield executor
-
-
-def local_executor(workers: int) -> Executor:
-    """Executor over `workers` processes of this machine; 0 or 1 runs in this process, with the same results.
-
-    Processes are spawned, not forked: libraries with threads of their own do not survive a fork. A worker leaves
-    Ctrl-C to its parent and ends when the parent does, even if that was killed.
-    """
-    if workers < 0:
-        raise UsageError(f"workers is {workers}; give 0 or 1 for this process, more for that many processes")
-    if workers <= 1:
-        return InlineExecutor()
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_worker)
-
-
-def prepare_worker() -> None:
-    """In a worker: leave Ctrl-C to the parent, and end when the parent does, even if that was killed."""
-    import multiprocessing
-    import signal
-    import threading
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-
-    def end_with_parent() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-@contextlib.contextmanager
-def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Executor]:
-    """Executor over the workers of a running dask scheduler, for example ``tcp://10.0.0.5:8786``.
-
-    The workers must have this version of the program installed: another one could give other results.
-
-    Raises
-    ------
-    UsageError
-        When the extra is not installed, the scheduler does not answer, or its workers do not fit.
-    """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise UsageError(
-            "a cluster needs the package distributed; install it with pip install 'tactile-bayes[cluster]'"
-        ) from None
-    with contextlib.ExitStack() as stack:
-        try:
-            client = stack.enter_context(Client(address, timeout=timeout_s, set_as_default=False))
-        except (OSError, ValueError) as error:
-            raise UsageError(
-                f"no dask scheduler answers at {address} ({_one_line(error)}); start one with `dask scheduler` and "
-                "give the address it prints"
-            ) from None
-        _check_workers(client, address)
-        yield stack.enter_context(client.get_executor(pure=False))
-
-
-def _check_workers(client: Any, address: str) -> None:
-    try:
-        versions = client.run(_worker_version)
-    except ImportError as error:
-        raise UsageError(
-            f"a worker of {address} cannot import this program ({_one_line(error)}); install it there"
-        ) from None
-    if not versions:
-        raise UsageError(f"the scheduler at {address} has no workers; start one with `dask worker {address}`")
-    for worker, version in versions.items():
-        if version != __version__:
-            raise UsageError(
-                f"worker {worker} has version {version}, this program is {__version__}; install the same version"
-            )
-
-
-def _worker_version() -> str:
-    return __version__

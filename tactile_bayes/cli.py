@@ -96,8 +96,9 @@ def main() -> None:
         status = cli.main(prog_name="tactile-bayes", standalone_mode=False)
         if sys.stdout is not None:
             sys.stdout.flush()
-    except click.Abort:
-        click.echo("interrupted", err=True)
+    except click.Abort as error:
+        told = str(error.__cause__ or "")  # a batch says how far it came
+        click.echo(f"interrupted: {told}" if told else "interrupted", err=True)
         sys.exit(EXIT_INTERRUPTED)
     except click.ClickException as error:
         error.show()

@@ -82,3 +82,11 @@ class NotConvergedError(TactileBayesError):
     def __init__(self, message: str, *, diagnostics: dict[str, float] | None = None) -> None:
         super().__init__(message)
         self.diagnostics = diagnostics or {}
+
+
+def one_line(error: BaseException) -> str:
+    """An error in one line; the class is named where it is none of this program's."""
+    text = " ".join(str(error).split())
+    if isinstance(error, TactileBayesError) and text:
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

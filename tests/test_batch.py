@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -19,9 +20,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes import batch
-from tactile_bayes.batch import InlineExecutor, cluster_executor, local_executor, open_executor, open_store, run_batch
+from tactile_bayes import batch, executors
+from tactile_bayes.batch import BatchInterrupted, fault_lines, open_store, run_batch
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.executors import InlineExecutor, cluster_executor, local_executor, open_executor
 
 
 def draw(seed: int) -> tuple[int, float]:
@@ -129,13 +131,64 @@ def test_an_error_that_cannot_travel_is_still_one_line(workers):
     assert outcome.error == "LocalError: cannot travel 7"
 
 
-def test_a_lost_worker_is_a_fault_of_items_not_of_the_batch(monkeypatch):
-    monkeypatch.setattr(batch, "_WINDOW", 4)
+def die_once(work: tuple[int, Path]) -> int:
+    """Item 3 kills its worker the first time it is run, as one does who runs out of memory beside others."""
+    item, folder = work
+    if item == 3 and not (folder / "died").exists():
+        (folder / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
+def test_a_killed_worker_costs_no_result(tmp_path):
+    with local_executor(2) as executor:
+        outcomes = run_batch(die_once, [(i, tmp_path) for i in range(8)], key=repr, executor=executor)
+    assert (tmp_path / "died").exists()
+    assert [outcome.value for outcome in outcomes] == list(range(8))
+
+
+def test_an_item_whose_worker_dies_twice_is_at_fault_and_no_other():
     with local_executor(2) as executor:
         outcomes = run_batch(die_on_three, range(8), key=str, executor=executor)
-    assert len(outcomes) == 8
-    assert "BrokenProcessPool" in outcomes[3].error
-    assert all(outcome.value == int(outcome.key) for outcome in outcomes if outcome.ok)
+    assert [outcome.value for outcome in outcomes] == [0, 1, 2, None, 4, 5, 6, 7]
+    assert outcomes[3].error == batch.DIED_TWICE
+
+
+def test_ctrl_c_carries_what_is_done_and_does_not_wait_for_workers(tmp_path):
+    """The second of two workers never ends by itself; it is gone when the batch has been left."""
+
+    def interrupt(done: int, _total: int) -> None:
+        if done == 1:
+            wait_until((tmp_path / "pid").exists)
+            raise KeyboardInterrupt
+
+    with local_executor(2) as executor, pytest.raises(BatchInterrupted) as stop:
+        run_batch(
+            sleep_for_ever,
+            [(0, tmp_path), (1, tmp_path)],
+            key=lambda w: str(w[0]),
+            executor=executor,
+            progress=interrupt,
+        )
+    assert [(one.key, one.value) for one in stop.value.outcomes] == [("0", 0)]
+    assert str(stop.value) == "1 of 2 done"
+    pid = int((tmp_path / "pid").read_text())
+    wait_until(lambda: not is_running(pid))
+
+
+def sleep_for_ever(work: tuple[int, Path]) -> int:
+    item, folder = work
+    if item:
+        (folder / "writing").write_text(str(os.getpid()))
+        (folder / "writing").rename(folder / "pid")
+        time.sleep(1e6)
+    return item
+
+
+def test_items_of_one_fault_share_a_line():
+    outcomes = [batch.Outcome(str(i), error="lost") for i in range(5)]
+    lines = fault_lines([*outcomes, batch.Outcome("x", error="odd"), batch.Outcome("y", value=1)])
+    assert lines == ["0, 1, 2 and 2 more: lost", "x: odd"]
 
 
 def test_negative_workers_are_refused():
@@ -351,7 +404,8 @@ def test_a_killed_batch_resumes_and_its_workers_end(tmp_path, child_environment)
             """
             import os, sys, time
             from pathlib import Path
-            from tactile_bayes.batch import local_executor, open_store, run_batch
+            from tactile_bayes.batch import open_store, run_batch
+            from tactile_bayes.executors import local_executor
 
             def slow(item):
                 (Path(sys.argv[1]) / f"pid-{os.getpid()}").touch()
@@ -466,8 +520,52 @@ def test_a_cluster_gives_the_same_results_and_names_what_failed(cluster):
 
 
 @pytest.mark.slow
+def test_a_scheduler_killed_in_the_middle_is_one_line_and_what_is_done_is_kept(child_environment, tmp_path):
+    pytest.importorskip("distributed", reason="the [cluster] extra is not installed")
+    script = tmp_path / "run.py"
+    script.write_text(
+        textwrap.dedent(
+            """
+            import sys, time
+            from tactile_bayes.batch import fault_lines, run_batch
+            from tactile_bayes.executors import open_executor
+
+            def slow(item):
+                time.sleep(0.3)
+                return item
+
+            with open_executor(cluster=sys.argv[1]) as executor:
+                told = lambda done, total: print(done, flush=True)
+                outcomes = run_batch(slow, range(40), key=str, executor=executor, progress=told)
+            print([one.value for one in outcomes if one.ok], fault_lines(outcomes))
+            """
+        )
+    )
+    with running(child_environment, "scheduler", "--host", "127.0.0.1", "--port", "0") as scheduler:
+        address = address_in(scheduler, "Scheduler at:")
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
+        with running(child_environment, "worker", address, *options) as worker:
+            address_in(worker, "Registered to:")
+            command = [sys.executable, str(script), address]
+            process = subprocess.Popen(
+                command, env=child_environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            assert process.stdout is not None
+            while process.stdout.readline() != "3\n":
+                pass
+            scheduler.kill()
+            output, errors = process.communicate(timeout=60)
+            worker.kill()
+    assert process.returncode == 0
+    assert errors == ""
+    kept, told = output.splitlines()[-1].split("] ", 1)
+    assert kept.startswith("[0, 1, 2")
+    assert re.fullmatch(rf"\['\d+, \d+, \d+ and \d+ more: {batch.CLUSTER_LOST}'\]", told)
+
+
+@pytest.mark.slow
 def test_a_cluster_of_another_version_is_refused(cluster, monkeypatch):
-    monkeypatch.setattr(batch, "__version__", "0.0.0")
+    monkeypatch.setattr(executors, "__version__", "0.0.0")
     with pytest.raises(UsageError, match="install the same version"), cluster_executor(cluster[0]):
         pass
 

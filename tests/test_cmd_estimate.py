@@ -116,6 +116,50 @@ def test_no_lump_is_an_answer_with_its_reason_and_exit_6(folder: Path, tmp_path:
     assert not output.exists()
 
 
+def kill_worker_of_b(path: Path, *, settings: Any) -> Any:
+    """`answer_map` in a worker that is killed whenever it has b.nc."""
+    import os
+    import signal
+
+    from tactile_bayes.commands.estimate_run import answer_map
+
+    if path.name == "b.nc":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return answer_map(path, settings=settings)
+
+
+def test_a_killed_worker_loses_no_other_map(folder: Path, alone: dict[str, str], monkeypatch: Any) -> None:
+    from tactile_bayes.commands import estimate
+
+    monkeypatch.setattr(estimate, "answer_map", kill_worker_of_b)
+    words = ("b.nc", "empty.nc", "a.nc", *FAST, "--size-calibration", "size.json", "--json", "--workers", 2)
+    done = run_here("estimate", *words, cwd=folder)
+    assert done.returncode == 1
+    assert json.loads(done.stdout) == [json.loads(alone[name]) for name in ("empty", "a")]
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: b.nc: its process ended twice without an answer")
+
+
+def test_ctrl_c_prints_the_maps_that_are_done(folder: Path, alone: dict[str, str], monkeypatch: Any) -> None:
+    from tactile_bayes.commands import estimate
+
+    def interrupted(path: Path, *, settings: Any) -> Any:
+        if path.name == "b.nc":
+            raise KeyboardInterrupt
+        return answer_map(path, settings=settings)
+
+    answer_map = estimate.answer_map
+    monkeypatch.setattr(estimate, "answer_map", interrupted)
+    words = ("a.nc", "b.nc", "empty.nc", *FAST, "--size-calibration", "size.json")
+    done = run_here("estimate", *words, "--json", cwd=folder)
+    assert done.returncode == 130
+    assert json.loads(done.stdout) == [json.loads(alone["a"])]
+    assert "interrupted: 1 of 3 done" in done.stderr
+    text = run_here("estimate", *words, cwd=folder)
+    assert text.stdout.startswith("a.nc\n")
+    assert "b.nc" not in text.stdout
+
+
 @pytest.mark.parametrize("option", ["--figure", "--map-figure"])
 def test_without_an_estimate_the_figure_is_the_map_with_what_was_looked_at_and_why(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str

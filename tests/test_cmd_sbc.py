@@ -99,6 +99,22 @@ def test_maps_that_all_abstain_leave_nothing_to_rank(tmp_path: Path, monkeypatch
     assert "nothing to rank" in done.stdout
 
 
+def test_ctrl_c_reports_the_maps_that_are_done_where_nothing_keeps_them(tmp_path: Path, monkeypatch) -> None:
+    def interrupted(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
+        if index == 2:
+            raise KeyboardInterrupt
+        return quick(index, method=method, seed=seed, cosines=cosines)
+
+    monkeypatch.setattr(command, "ranks_of_map", interrupted)
+    done = run_here("sbc", "--maps", 5, "--json", cwd=tmp_path)
+    assert done.returncode == 130
+    assert json.loads(done.stdout)["maps"] == 2
+    assert "interrupted: 2 of 5 done" in done.stderr
+    kept = run_here("sbc", "--maps", 5, "-o", "s.csv", cwd=tmp_path)
+    assert (kept.returncode, kept.stdout) == (130, "")
+    assert "interrupted: 2 of 5 done; s.csv.unfinished keeps them, run again to go on" in kept.stderr
+
+
 def test_a_map_that_fails_is_named_and_the_others_count(tmp_path: Path, monkeypatch) -> None:
     def failing(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
         if index == 1:
@@ -107,7 +123,9 @@ def test_a_map_that_fails_is_named_and_the_others_count(tmp_path: Path, monkeypa
 
     monkeypatch.setattr(command, "ranks_of_map", failing)
     done = run_here("sbc", "--maps", 3, "-o", "s.csv", cwd=tmp_path)
-    assert "map 1 could not be estimated: ValueError: no such thing" in done.stderr
+    assert "could not be estimated: map 1: ValueError: no such thing" in done.stderr
+    assert "error: 1 of 3 maps are missing from this report" in done.stderr
+    assert done.returncode == 1
     assert (tmp_path / "s.csv.unfinished").exists()
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +15,11 @@ from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, an
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import WholeOrAuto
 from tactile_bayes.commands.paths import FilePath
-from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
 
 if TYPE_CHECKING:
-    pass
+    from tactile_bayes.batch import Outcome
 
 _FILE = FilePath()
 _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
@@ -212,10 +214,11 @@ def command(
     if len(maps) == 1:
         answers = [_one_map(maps[0], settings, output, figure, map_figure, force=force)]
     else:
-        answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
+        with _printed_if_interrupted(maps, as_json=as_json):
+            answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
     if verbose:
         print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
-    _print(maps, answers, as_json=as_json)
+    _print(maps, answers, as_json=as_json, listed=len(maps) > 1)
     ctx.exit(_exit_code(answers))
 
 
@@ -274,32 +277,60 @@ def _one_map(
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
     from functools import partial
 
-    from tactile_bayes.batch import cluster_executor, local_executor, run_batch
+    from tactile_bayes.batch import run_batch
     from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.executors import cluster_executor, local_executor
 
     chosen = cluster_executor(scheduler) if scheduler else local_executor(min(workers, len(maps)))
     with chosen as executor, progress_bar("maps") as progress:
         outcomes = run_batch(
             partial(answer_map, settings=settings), maps, key=str, executor=executor, progress=progress
         )
-    return [o.value if o.value is not None else Answer(None, f"error: {o.key}: {o.error}", 1) for o in outcomes]
+    return _answers(outcomes)
 
 
-def _print(maps: tuple[Path, ...], answers: list[Answer], *, as_json: bool) -> None:
+def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
+    """The maps' answers; maps that have one fault of the batch are named together, in the first one's answer."""
+    from tactile_bayes.batch import fault_lines
+
+    found = list(outcomes)
+    lines = dict(zip(dict.fromkeys(one.error for one in found if not one.ok), fault_lines(found), strict=True))
+    faults = (lines.pop(one.error, "") if not one.ok else "" for one in found)
+    return [
+        one.value if one.value is not None else Answer(None, f"error: {fault}" if fault else "", EXIT_FAULT)
+        for one, fault in zip(found, faults, strict=True)
+    ]
+
+
+@contextmanager
+def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool) -> Iterator[None]:
+    """On Ctrl-C print the answers of the maps that are done, and go on up."""
+    from tactile_bayes.batch import BatchInterrupted
+
+    try:
+        yield
+    except BatchInterrupted as stop:
+        done = {one.key for one in stop.outcomes}
+        _print([path for path in maps if str(path) in done], _answers(stop.outcomes), as_json=as_json, listed=True)
+        raise
+
+
+def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, listed: bool) -> None:
+    """Errors on stderr, answers on stdout; `listed` where several maps were given."""
     from tactile_bayes.files.schema import check_document, dump_json
 
     for answer in answers:
-        if answer.document is None:
+        if answer.document is None and answer.text:
             click.echo(answer.text, err=True)
     if as_json:
         documents = [answer.document for answer in answers if answer.document is not None]
         for document in documents:
             check_document(document, "estimate.schema.json", path=Path("the report"))
-        click.echo(dump_json(documents[0] if len(maps) == 1 else documents), nl=False)
+        click.echo(dump_json(documents if listed else documents[0]), nl=False)
         return
     for path, answer in zip(maps, answers, strict=True):
         if answer.document is not None:
-            click.echo((f"{path}\n" if len(maps) > 1 else "") + answer.text, nl=len(maps) > 1)
+            click.echo((f"{path}\n" if listed else "") + answer.text, nl=listed)
 
 
 def _exit_code(answers: list[Answer]) -> int:

@@ -139,7 +139,7 @@ class Estimator:
 
 
 def _prepare() -> None:
-    from tactile_bayes.batch import prepare_worker
+    from tactile_bayes.executors import prepare_worker
 
     prepare_worker()
     import tactile_bayes.files.size_json

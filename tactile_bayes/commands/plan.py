@@ -109,9 +109,10 @@ def _from_pilot(pilot: Path, excision: Path, against: str) -> dict[str, float]:
 
 
 def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
-    from tactile_bayes.batch import open_executor, run_batch
+    from tactile_bayes.batch import run_batch
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.errors import BadDataError
+    from tactile_bayes.executors import open_executor
     from tactile_bayes.trial.planning import run_case
 
     with open_executor(workers=workers) as executor, progress_bar("designs") as progress:

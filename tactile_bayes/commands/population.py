@@ -60,8 +60,10 @@ def command(
     """
     from functools import partial
 
-    from tactile_bayes.batch import open_executor, open_store, run_batch
+    from tactile_bayes.batch import fault_lines, open_store, run_batch
     from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import TactileBayesError
+    from tactile_bayes.executors import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
     from tactile_bayes.presets import RESEARCH_USE
@@ -92,13 +94,18 @@ def command(
     rows = [row for outcome in outcomes for row in outcome.value or []]
     write_text(output, table_text(rows), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
-    for outcome in failed:
-        click.echo(f"mass {outcome.key} could not be simulated: {outcome.error}", err=True)
+    for line in fault_lines(failed):
+        click.echo(f"could not be simulated: mass {line}", err=True)
     if not failed:
         kept.unlink(missing_ok=True)
     found = sum(row.detected for row in rows)
-    click.echo(f"{output}: {masses + centred} masses, {len(rows)} exams, a lump found in {found}, seed {seed}")
+    done = len(outcomes) - len(failed)
+    click.echo(f"{output}: {done} masses, {len(rows)} exams, a lump found in {found}, seed {seed}")
     click.echo(RESEARCH_USE)
+    if failed:
+        raise TactileBayesError(
+            f"{len(failed)} of {len(outcomes)} masses are missing; {kept} keeps the others: run again"
+        )
 
 
 def rows_of_mass(

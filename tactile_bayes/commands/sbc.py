@@ -74,6 +74,8 @@ def command(
     """
     from time import monotonic
 
+    from tactile_bayes.batch import BatchInterrupted
+    from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.files.schema import dump_json
     from tactile_bayes.report.sbc_text import sbc_document, sbc_figure, sbc_text, table_text
@@ -82,16 +84,27 @@ def command(
         if path is not None:
             refuse_existing(path, force=force)
     begun = monotonic()
-    outcomes, made = _run(maps, method, seed, field_cosines, workers=workers, scheduler=scheduler, output=output)
+
+    def report(found: list[MapRanks], speed: float | None) -> None:
+        document = sbc_document(found, method=method, seed=seed, maps_per_s=speed, cosines=field_cosines)
+        click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
+
+    try:
+        outcomes, made = _run(maps, method, seed, field_cosines, workers=workers, scheduler=scheduler, output=output)
+    except BatchInterrupted as stop:
+        if output is None:  # else the next run goes on
+            report([one.value for one in stop.outcomes if one.value is not None], None)
+        raise
     speed = made / (monotonic() - begun) if made else None
     found = [outcome.value for outcome in outcomes if outcome.value is not None]
     if output is not None:
         write_text(output, table_text(found), force=force)
     if figure is not None:
         sbc_figure(found, figure, force=force)
-    _finish(outcomes, output)
-    document = sbc_document(found, method=method, seed=seed, maps_per_s=speed, cosines=field_cosines)
-    click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
+    failed = _finish(outcomes, output)
+    report(found, speed)
+    if failed:
+        raise TactileBayesError(f"{failed} of {len(outcomes)} maps are missing from this report")
 
 
 def _run(
@@ -100,8 +113,9 @@ def _run(
     """Every map's outcome, and how many of them this run made."""
     from functools import partial
 
-    from tactile_bayes.batch import open_executor, run_batch
+    from tactile_bayes.batch import run_batch
     from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.executors import open_executor
     from tactile_bayes.files.shipped import DEFAULT
     from tactile_bayes.posterior.sbc import settings
 
@@ -157,13 +171,16 @@ def _open_kept(output: Path | None, settings: dict[str, Any]) -> Iterator[BatchS
         yield store
 
 
-def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> None:
-    """Name the maps that failed; without any, what was kept for resuming is no longer needed."""
+def _finish(outcomes: list[Outcome[MapRanks]], output: Path | None) -> int:
+    """Name the maps that failed and count them; without any, what was kept for resuming is no longer needed."""
+    from tactile_bayes.batch import fault_lines
+
     failed = [outcome for outcome in outcomes if not outcome.ok]
-    for outcome in failed:
-        click.echo(f"map {outcome.key} could not be estimated: {outcome.error}", err=True)
+    for line in fault_lines(failed):
+        click.echo(f"could not be estimated: map {line}", err=True)
     if output is not None and not failed:
         _kept(output).unlink(missing_ok=True)
+    return len(failed)
 
 
 def _encode(one: MapRanks) -> dict[str, Any]:

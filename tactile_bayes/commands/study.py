@@ -10,10 +10,10 @@ import click
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from concurrent.futures import Executor
 
-    from tactile_bayes.batch import BatchStore
+    from tactile_bayes.batch import BatchStore, Outcome
     from tactile_bayes.forward.solid_study import SolidSettings
     from tactile_bayes.forward.study import Geometry, LineFit, StudyRow, StudySettings
     from tactile_bayes.forward.tactile_line import TactileLine
@@ -99,7 +99,7 @@ def command(
 
     Example: tactile-bayes study --model solid --seat resting -o study.csv
     """
-    from tactile_bayes.batch import open_executor
+    from tactile_bayes.executors import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.forward.body import parse_seat
     from tactile_bayes.forward.study import paper_grid
@@ -241,24 +241,36 @@ def _run_all(
     executor: Executor,
     store: BatchStore | None,
 ) -> list[StudyRow]:
-    from tactile_bayes.batch import run_batch
+    from tactile_bayes.batch import BatchInterrupted, run_batch
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.errors import TactileBayesError
 
-    with progress_bar("geometries") as progress:
-        outcomes = run_batch(
-            _rows_of(settings),
-            geometries,
-            key=lambda geometry: geometry.key,
-            executor=executor,
-            store=store,
-            progress=progress,
-        )
+    try:
+        with progress_bar("geometries") as progress:
+            outcomes = run_batch(
+                _rows_of(settings),
+                geometries,
+                key=lambda geometry: geometry.key,
+                executor=executor,
+                store=store,
+                progress=progress,
+            )
+    except BatchInterrupted as stop:
+        if store is None:
+            click.echo(table_text(_rows(stop.outcomes)), nl=False)
+        raise
     failed = [outcome for outcome in outcomes if not outcome.ok]
     if failed:
+        if store is None:
+            click.echo(table_text(_rows(outcomes)), nl=False)
         raise TactileBayesError(
             f"{len(failed)} of {len(outcomes)} geometries failed, the first ({failed[0].key}): {failed[0].error}"
         )
+    return _rows(outcomes)
+
+
+def _rows(outcomes: Iterable[Outcome[list[StudyRow]]]) -> list[StudyRow]:
+    """Of the geometries that are done; without an output file they are printed also when others are missing."""
     return [row for outcome in outcomes for row in outcome.value or []]
 
 

@@ -47,10 +47,11 @@ def run_tables(seat: float, *, workers: int) -> tuple[list[Agreement], list[Agre
     """Agreement of both models over the cases of the tables, and over the phantoms."""
     from functools import partial
 
-    from tactile_bayes.batch import open_executor, run_batch
+    from tactile_bayes.batch import run_batch
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.study import fit_line
     from tactile_bayes.errors import TactileBayesError
+    from tactile_bayes.executors import open_executor
     from tactile_bayes.forward.study import StudySettings
     from tactile_bayes.forward.tables import compare, phantom_scenes, table_scenes
 

@@ -1,0 +1,183 @@
+"""Where the items of a batch run: in this process, in worker processes of this machine or on a dask cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes import __version__
+from tactile_bayes.errors import UsageError, one_line
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
+
+class LocalWorkers(Executor):
+    """Processes that are spawned, not forked: libraries with threads of their own do not survive a fork.
+
+    A worker leaves Ctrl-C to its parent and ends when the parent does, even if that was killed. When one is killed,
+    all items that were handed out come back with `BrokenExecutor`; then `renew` and hand them out again.
+
+    Parameters
+    ----------
+    workers
+        How many processes; they start when there is work for them.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self._workers = workers
+        self._start()
+
+    @property
+    def ahead(self) -> int:
+        """Items to hand out at a time: few, because all of them are run again when a worker is lost."""
+        return 2 * self._workers
+
+    def _start(self) -> None:
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor
+
+        context = multiprocessing.get_context("spawn")
+        theirs, self._leash = context.Pipe(duplex=False)
+        self._pool = ProcessPoolExecutor(
+            self._workers, mp_context=context, initializer=prepare_worker, initargs=(theirs,)
+        )
+        self._theirs = theirs
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """The future of ``fn(*args, **kwargs)`` in one of the processes."""
+        return self._pool.submit(fn, *args, **kwargs)
+
+    def stop(self) -> None:
+        """End all processes now; what they were doing is lost."""
+        self._leash.close()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def renew(self) -> None:
+        """New processes in place of those that are lost."""
+        self.stop()
+        self._theirs.close()
+        self._start()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the processes end when their work is done."""
+        self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
+        self._leash.close()
+        self._theirs.close()
+
+
+def prepare_worker(leash: Connection | None = None) -> None:
+    """In a worker: leave Ctrl-C to the parent, and end when the parent does, even if that was killed.
+
+    With a `leash`, the reading end of a pipe, the worker ends when the parent closes the other end, by its death too.
+    """
+    import multiprocessing
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def end_with_parent() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            if leash is not None:
+                leash.recv()
+            elif parent is not None:
+                parent.join()
+        os._exit(1)
+
+    if leash is not None or parent is not None:
+        threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+class InlineExecutor(Executor):
+    """Runs each item in this process when it is submitted."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """The finished future of ``fn(*args, **kwargs)``; Ctrl-C is not caught."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextlib.contextmanager
+def open_executor(*, workers: int = 1, cluster: str | None = None) -> Iterator[Executor]:
+    """What ``--workers`` and ``--cluster`` mean: a cluster when an address is given, else local processes."""
+    chosen = local_executor(workers) if cluster is None else cluster_executor(cluster)
+    with chosen as executor:
+        yield executor
+
+
+def local_executor(workers: int) -> Executor:
+    """Executor over `workers` processes of this machine; 0 or 1 runs in this process, with the same results.
+
+    Processes that are killed are replaced; see `LocalWorkers`.
+    """
+    if workers < 0:
+        raise UsageError(f"workers is {workers}; give 0 or 1 for this process, more for that many processes")
+    return InlineExecutor() if workers <= 1 else LocalWorkers(workers)
+
+
+@contextlib.contextmanager
+def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Executor]:
+    """Executor over the workers of a running dask scheduler, for example ``tcp://10.0.0.5:8786``.
+
+    The workers must have this version of the program installed: another one could give other results.
+
+    Raises
+    ------
+    UsageError
+        When the extra is not installed, the scheduler does not answer, or its workers do not fit.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise UsageError(
+            "a cluster needs the package distributed; install it with pip install 'tactile-bayes[cluster]'"
+        ) from None
+    _silence("distributed")
+    with contextlib.ExitStack() as stack:
+        try:
+            client = stack.enter_context(Client(address, timeout=timeout_s, set_as_default=False))
+        except (OSError, ValueError) as error:
+            raise UsageError(
+                f"no dask scheduler answers at {address} ({one_line(error)}); start one with `dask scheduler` and "
+                "give the address it prints"
+            ) from None
+        _check_workers(client, address)
+        yield stack.enter_context(client.get_executor(pure=False))
+
+
+def _silence(library: str) -> None:
+    """No log of a library on stderr: what matters of it is told in the outcomes, in one line."""
+    import logging
+
+    for name in list(logging.root.manager.loggerDict):
+        if name == library or name.startswith(f"{library}."):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
+def _check_workers(client: Any, address: str) -> None:
+    try:
+        versions = client.run(_worker_version)
+    except ImportError as error:
+        raise UsageError(
+            f"a worker of {address} cannot import this program ({one_line(error)}); install it there"
+        ) from None
+    if not versions:
+        raise UsageError(f"the scheduler at {address} has no workers; start one with `dask worker {address}`")
+    for worker, version in versions.items():
+        if version != __version__:
+            raise UsageError(
+                f"worker {worker} has version {version}, this program is {__version__}; install the same version"
+            )
+
+
+def _worker_version() -> str:
+    return __version__
