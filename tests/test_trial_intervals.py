@@ -54,7 +54,7 @@ def test_jackknife_refuses_with_the_reason() -> None:
         constant([1.0] * 10)
     with pytest.raises(UndefinedError, match="has no logarithm"):
         constant([1.0] * 9 + [0.0])
-    with pytest.raises(UndefinedError, match="double precision"):
+    with pytest.raises(UndefinedError, match="more than a factor of 1000"):
         constant([1e-300] * 5 + [1e300] * 5)
 
 

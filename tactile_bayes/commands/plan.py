@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 
@@ -16,31 +17,42 @@ if TYPE_CHECKING:
 
 SCHEMA = "tactile-bayes/plan/1"
 _FILE = FilePath()
-_SD = click.FloatRange(0)
+# ln size: 3 is a factor of 20.
+_BIAS, _SD = FiniteRange(-3, 3), FiniteRange(0, 3)
 _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other_miss")
 
 
 @click.command("plan")
 @click.option(
     "--patients",
-    type=click.IntRange(8),
+    type=click.IntRange(8, 10_000),
     multiple=True,
     default=(16, 24, 32, 48),
     show_default=True,
     help="With one mass each.",
 )
 @click.option(
-    "--maps", type=click.IntRange(1), multiple=True, default=(1, 3, 5), show_default=True, help="Tactile maps a mass."
+    "--maps",
+    type=click.IntRange(1, 1000),
+    multiple=True,
+    default=(1, 3, 5),
+    show_default=True,
+    help="Tactile maps a mass.",
 )
-@click.option("--tactile-bias", type=float, default=0.02, show_default=True, help="Mean of ln(size / ex vivo).")
+@click.option("--tactile-bias", type=_BIAS, default=0.02, show_default=True, help="Mean of ln(size / ex vivo).")
 @click.option("--mass-sd", type=_SD, default=0.18, show_default=True, help="SD of ln size shared by a mass's maps.")
 @click.option("--map-sd", type=_SD, default=0.15, show_default=True, help="SD of ln size of single maps.")
-@click.option("--other-bias", type=float, default=-0.08, show_default=True, help="Of the modality compared with.")
+@click.option("--other-bias", type=_BIAS, default=-0.08, show_default=True, help="Of the modality compared with.")
 @click.option("--other-sd", type=_SD, default=0.40, show_default=True, help="SD of ln size of that modality.")
 @click.option(
-    "--other-miss", type=click.FloatRange(0, 1), default=0.04, show_default=True, help="Share of masses it misses."
+    "--other-miss", type=FiniteRange(0, 1), default=0.04, show_default=True, help="Share of masses it misses."
 )
-@click.option("--pilot", metavar="TRIAL.csv", type=_FILE, help="Take the errors from this trial; needs --excision.")
+@click.option(
+    "--pilot",
+    metavar="TRIAL.csv",
+    type=_FILE,
+    help="Take the errors from this trial, but for those given by options; needs --excision.",
+)
 @click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
 @click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot compared with.")
 @click.option("--trials", type=click.IntRange(50), default=1000, show_default=True, help="Simulated for each design.")
@@ -76,36 +88,65 @@ def command(
 
     if output:
         refuse_existing(output, force=force)
+    typed = _typed()
     files: dict[str, Path] = {}
     if pilot is not None:
         if excision is None:
             raise UsageError("--pilot needs --excision; give the pilot's excision table")
-        errors, files = _from_pilot(pilot, excision, against), {"pilot": pilot, "excision": excision}
+        if against == "tactile":
+            raise UsageError("--against tactile compares tactile sizes with themselves; name another modality")
+        given = {name: errors[name] for name in _ERRORS if name in typed}
+        errors, files = _from_pilot(pilot, excision, against, given), {"pilot": pilot, "excision": excision}
+    elif unused := [name for name in ("excision", "against") if name in typed]:
+        raise UsageError(f"--{unused[0]} says how a pilot is read; give --pilot TRIAL.csv, or leave it out")
     cases = list(designs(sorted(set(patients)), sorted(set(maps)), **errors, trials=trials, seed=seed))
-    document = _document(cases, _simulate(cases, workers=workers), errors, files)
+    sources = _sources(typed, pilot=pilot is not None)
+    document = _document(cases, _simulate(cases, workers=workers), errors, sources, files)
     check_document(document, "plan.schema.json", path=output or Path("the plan"))
     if output:
         write_text(output, dump_json(document), force=force)
     click.echo(dump_json(document) if as_json else _text(document), nl=False)
 
 
-def _from_pilot(pilot: Path, excision: Path, against: str) -> dict[str, float]:
+def _sources(typed: set[str], *, pilot: bool) -> dict[str, str]:
+    """Where each assumed error comes from: an option, the pilot or the default."""
+    return {name: "option" if name in typed else "pilot" if pilot else "default" for name in _ERRORS}
+
+
+def _typed() -> set[str]:
+    """The options that were given on the command line."""
+    context = click.get_current_context()
+    return {
+        name for name in context.params if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+    }
+
+
+def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, float]) -> dict[str, float]:
+    """The pilot's errors, but for those that options give."""
+    import numpy as np
+
     from tactile_bayes.commands.trial_inputs import load_trial
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.trial.planning import assumptions_from
+    from tactile_bayes.trial.plausibility import unit_doubts
     from tactile_bayes.trial.readings import gather
 
     inputs = load_trial(pilot, excision, None)
     sizes = gather(inputs.readings, inputs.ex_vivo_mm)
+    for doubt in unit_doubts(sizes, np.array(list(inputs.ex_vivo_mm.values()))):
+        click.echo(f"{pilot}: doubtful: {doubt}", err=True)
     for name in ("tactile", against):
         if name not in sizes:
             way_out = f"it has {', '.join(sizes)}; choose one with --against"
             raise BadDataError(f"holds no readings by {name}", way_out=way_out, path=str(pilot))
-    found = assumptions_from(sizes["tactile"], sizes[against])
+    found = assumptions_from(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
     if found is None:
         way_out = "give the errors by options"
         raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(pilot))
-    return found
+    if "map_sd" not in found:
+        what = "has no mass with two tactile readings, so the SD of single maps is unknown"
+        raise BadDataError(what, way_out="give it with --map-sd", path=str(pilot))
+    return found | given
 
 
 def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
@@ -124,7 +165,11 @@ def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
 
 
 def _document(
-    cases: list[PlanCase], results: list[dict[str, Any]], errors: dict[str, float], files: dict[str, Path]
+    cases: list[PlanCase],
+    results: list[dict[str, Any]],
+    errors: dict[str, float],
+    sources: dict[str, str],
+    files: dict[str, Path],
 ) -> dict[str, Any]:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.presets import RESEARCH_USE
@@ -132,10 +177,11 @@ def _document(
 
     by_design = {(case.patients, case.maps): result for case, result in zip(cases, results, strict=True)}
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
-    settings = {"trials": cases[0].trials, "errors": assumed}
+    settings = {"trials": cases[0].trials, "errors": assumed, "errors_from": sources}
     return {
         "schema": SCHEMA,
         "errors": assumed,
+        "errors_from": sources,
         "designs": [{"patients": n, "maps": m, **result} for (n, m), result in by_design.items()],
         "gains": map_gains(by_design),
         "provenance": Provenance("plan", settings, hash_inputs(**files), seed=cases[0].seed).as_dict(),

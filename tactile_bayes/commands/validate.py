@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 
@@ -26,7 +27,7 @@ _FILE = FilePath()
 class Settings:
     """How the analysis is made; each enters the provenance."""
 
-    intervals: Literal["jackknife", "percentile", "bca"]
+    intervals: Literal["corrected", "jackknife", "percentile", "bca"]
     resamples: int
     seed: int
     error_ratio: float
@@ -50,16 +51,19 @@ class Outcome:
 @click.option("--columns", metavar="MAP.toml", type=_FILE, help="TRIAL.csv is wide: which column holds which reading.")
 @click.option(
     "--intervals",
-    type=click.Choice(["jackknife", "percentile", "bca"]),
-    default="jackknife",
+    type=click.Choice(["corrected", "jackknife", "percentile", "bca"]),
+    default="corrected",
     show_default=True,
-    help="Over patients: leave-one-out with Student's t, or two bootstraps.",
+    help="Over patients: leave-one-out with Student's t, corrected for rare misses and few influential patients; the "
+    "same uncorrected; or two bootstraps.",
 )
-@click.option("--resamples", type=click.IntRange(200), default=2000, show_default=True, help="Of the bootstraps.")
+@click.option(
+    "--resamples", type=click.IntRange(200, 100_000), default=2000, show_default=True, help="Of the bootstraps."
+)
 @click.option("--seed", type=click.IntRange(0), default=1999, show_default=True, help="Of everything random.")
 @click.option(
     "--error-ratio",
-    type=click.FloatRange(0, min_open=True),
+    type=FiniteRange(1e-6, 1e6),
     default=1.0,
     show_default=True,
     help="Variance of the ex-vivo error over the modality's, for the Deming lines.",
@@ -106,31 +110,36 @@ def command(
         if target:
             _refuse_inputs(target, *(one for one in (trial, excision, columns, protocol) if one))
             refuse_existing(target, force=force)
-    chosen = _settings(settings, protocol)
-    outcome = _analyse(load_trial(trial, excision, columns), chosen, protocol)
+    title, chosen = _settings(settings, protocol)
+    outcome = _analyse(load_trial(trial, excision, columns), chosen, protocol, title=title)
     if output or as_json:
         check_document(outcome.document, "validate.schema.json", path=output or Path("the report"))
     if output:
         write_text(output, dump_json(outcome.document), force=force)
     if html:
         _write_html(html, outcome, force=force)
+    if as_json:
+        for doubt in outcome.report.doubts:
+            click.echo(f"doubtful: {doubt}", err=True)
     click.echo(dump_json(outcome.document) if as_json else _text(outcome, methods=methods), nl=False)
 
 
-def _settings(given: dict[str, Any], protocol: Path | None) -> Settings:
-    """The settings of the protocol, where there is one; an option that contradicts it is refused."""
+def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, Settings]:
+    """Title and settings of the protocol, where there is one; an option that contradicts it is refused."""
     from tactile_bayes.files.protocol import read_protocol
 
     if protocol is None:
-        return Settings(**given)
+        return None, Settings(**given)
     context = click.get_current_context()
-    fixed = read_protocol(protocol)
+    read = read_protocol(protocol)
+    # TOML and its schema take 1000.0 for a whole number
+    fixed = {name: type(given[name])(value) for name, value in read.analysis.items()}
     for name, value in fixed.items():
         typed = context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
         if typed and given[name] != value:
             option = f"--{name.replace('_', '-')} {given[name]}"
             raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
-    return Settings(**(given | fixed))
+    return read.title, Settings(**(given | fixed))
 
 
 def _intervals(settings: Settings) -> Intervals:
@@ -140,7 +149,7 @@ def _intervals(settings: Settings) -> Intervals:
     return Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
 
 
-def _analyse(inputs: TrialInputs, settings: Settings, protocol: Path | None) -> Outcome:
+def _analyse(inputs: TrialInputs, settings: Settings, protocol: Path | None, *, title: str | None) -> Outcome:
     from tactile_bayes.presets import RESEARCH_USE
     from tactile_bayes.trial.check_intervals import check_all
     from tactile_bayes.trial.document import as_document, checks_document
@@ -155,7 +164,7 @@ def _analyse(inputs: TrialInputs, settings: Settings, protocol: Path | None) -> 
         ex_vivo_sd_mm=inputs.ex_vivo_sd_mm,
         seed=settings.seed,
     )
-    document = {"schema": SCHEMA, **as_document(report)}
+    document = {"schema": SCHEMA, **({} if title is None else {"title": title}), **as_document(report)}
     checks: dict[str, IntervalCheck] = {}
     if settings.check_intervals:
         checks = check_all(report.sizes, confidence=confidence, trials=settings.check_intervals, seed=settings.seed)
@@ -168,10 +177,10 @@ def _analyse(inputs: TrialInputs, settings: Settings, protocol: Path | None) -> 
 
 
 def _next_mass(inputs: TrialInputs, settings: Settings) -> NextMass:
-    """The Bayesian model; the sampler is handed in, for the trial knows none."""
+    """The Bayesian model; the sampler is handed in, because the trial's package imports none."""
     import numpy as np
 
-    from tactile_bayes.posterior.ensemble import ensemble
+    from tactile_bayes.commands.trial_sampler import draw
     from tactile_bayes.presets import INTERVAL
     from tactile_bayes.trial.next_mass import next_mass
 
@@ -179,7 +188,7 @@ def _next_mass(inputs: TrialInputs, settings: Settings) -> NextMass:
         inputs.readings,
         inputs.ex_vivo_mm,
         inputs.ex_vivo_sd_mm,
-        sample=ensemble,
+        sample=draw,
         rng=np.random.default_rng(settings.seed),
         probability=INTERVAL,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +11,16 @@ from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
 
 
-def read_protocol(path: Path) -> dict[str, Any]:
-    """The settings under ``[analysis]``; other tables are for people and count only through the file's hash.
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """The settings that a protocol fixes, and its title where it has one."""
+
+    analysis: dict[str, Any]
+    title: str | None = None
+
+
+def read_protocol(path: Path) -> Protocol:
+    """The title and the settings under ``[analysis]``; the rest is for people and counts only through the file's hash.
 
     Raises
     ------
@@ -20,4 +30,7 @@ def read_protocol(path: Path) -> dict[str, Any]:
     document = load_toml(path, way_out="give the analysis as TOML")
     check_document(document, "protocol.schema.json", path=path)
     analysis: dict[str, Any] = document.get("analysis", {})
-    return analysis
+    for name, value in analysis.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise BadDataError(f"analysis.{name} is {value}", way_out="give a finite number", path=str(path))
+    return Protocol(analysis, document.get("title"))

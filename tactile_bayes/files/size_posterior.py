@@ -28,8 +28,13 @@ class StatedSize:
     probability: float | None = None
 
 
-def read_stated_size(path: Path) -> StatedSize:
+def read_stated_size(path: Path, number: int | None = None) -> StatedSize:
     """The largest size that an estimate states.
+
+    Parameters
+    ----------
+    number
+        Which estimate of a list, from 1; a list of one needs none.
 
     Raises
     ------
@@ -39,7 +44,9 @@ def read_stated_size(path: Path) -> StatedSize:
     with open_input(path) as file:
         head = file.read(8)
     if head.lstrip().startswith((b"{", b"[")):
-        return _from_json(path)
+        return _from_json(path, number)
+    if number is not None:
+        raise BadDataError("is no list of estimates", way_out=f"leave out #{number}", path=str(path))
     if head.startswith(b"\x89HDF"):
         return _from_netcdf(path)
     way_out = "give what `estimate` wrote with --json or -o"
@@ -54,7 +61,7 @@ def fill_from_posteriors(
     Parameters
     ----------
     folder
-        Relative paths start here: the folder of the table.
+        Relative paths start here: the folder of the table. ``batch.json#3`` is the third of a list.
     fault
         Makes the error for a cell, as `Table.error` does.
 
@@ -67,14 +74,22 @@ def fill_from_posteriors(
     for row, name in enumerate(filled.get("posterior", [])):
         if not name:
             continue
-        path = folder / name
+        path, number = _split_number(folder, name)
         _check_blank(filled, row, fault=fault)
-        stated = read_stated_size(path)
+        stated = read_stated_size(path, number)
         _check_status(filled["status"][row], stated, row, fault=fault)
         for column in ("size_mm", "low_mm", "high_mm", "probability"):
             filled[column][row] = getattr(stated, column)
         paths.append(path)
-    return filled, paths
+    return filled, list(dict.fromkeys(paths))
+
+
+def _split_number(folder: Path, name: str) -> tuple[Path, int | None]:
+    """The file, and which estimate of its list where the cell ends in #NUMBER."""
+    stem, mark, number = name.rpartition("#")
+    if mark and number.isascii() and number.isdigit() and len(number) < 10 and not (folder / name).exists():
+        return folder / stem, int(number)
+    return folder / name, None
 
 
 def _check_blank(columns: Mapping[str, list[Any]], row: int, *, fault: Callable[..., BadDataError]) -> None:
@@ -92,6 +107,9 @@ def _check_status(status: str | None, stated: StatedSize, row: int, *, fault: Ca
     if status == "detected" and stated.size_mm is None:
         way_out = "give status not_detected, or not_done"
         raise fault(row, "posterior", "names an estimate without a size while status is detected", way_out=way_out)
+    if status is None and stated.size_mm is None:
+        what = "is blank beside a posterior that names an estimate without a size"
+        raise fault(row, "status", what, way_out="give status not_detected (the mass was looked for), or not_done")
     if status != "detected" and stated.size_mm is not None:
         way_out = "give status detected, or leave posterior blank"
         raise fault(
@@ -99,19 +117,29 @@ def _check_status(status: str | None, stated: StatedSize, row: int, *, fault: Ca
         )
 
 
-def _from_json(path: Path) -> StatedSize:
+def _from_json(path: Path, number: int | None) -> StatedSize:
     document: Any = load_json(path, way_out="give `estimate --json`")
     if isinstance(document, list):
-        if len(document) != 1:
-            what = f"holds {len(document)} estimates"
-            raise BadDataError(what, way_out="write each map's estimate to a file of its own", path=str(path))
-        document = document[0]
+        document = document[_index(path, len(document), number)]
+    elif number is not None:
+        raise BadDataError("holds one estimate, no list", way_out=f"leave out #{number}", path=str(path))
     pooled = isinstance(document, dict) and str(document.get("schema", "")).startswith("tactile-bayes/pooled/")
     check_document(document, "pooled.schema.json" if pooled else "estimate.schema.json", path=path)
     size = document["max_size_mm"]
     if size is None:
         return StatedSize()
     return StatedSize(size["median"], size["low"], size["high"], size["probability"])
+
+
+def _index(path: Path, length: int, number: int | None) -> int:
+    """Where in a list of estimates the wanted one stands."""
+    if number is None and length == 1:
+        return 0
+    if number is None or not 1 <= number <= length:
+        wanted = "" if number is None else f" and none with the number {number}"
+        way_out = f"name one as {path.name}#1 to {path.name}#{length}, in the order of the maps"
+        raise BadDataError(f"holds {length} estimates{wanted}", way_out=way_out, path=str(path))
+    return number - 1
 
 
 def _from_netcdf(path: Path) -> StatedSize:

@@ -29,6 +29,14 @@ _NOT_FINITE = {"nan", "inf", "infinity"}
 _TO_MM = {"cm": "10", "m": "1000", "in": "25.4", "inch": "25.4", "um": "0.001"}
 _BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _AS_UTF8 = "save it as CSV UTF-8"
+_EXPORT = "export the sheet as CSV UTF-8, comma-separated"
+# First bytes of files that are no UTF-8 text, what they are, and the way out.
+_NOT_TEXT = (
+    (_BYTE_ORDER_MARKS, "is UTF-16 text", _AS_UTF8),
+    ((b"PK\x03\x04",), "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
+    ((b"\xd0\xcf\x11\xe0",), "is an old Office file (xls), not CSV", _EXPORT),
+    ((b"\x1f\x8b",), "is compressed with gzip", "decompress it first"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,8 +155,9 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
 
 def _decode(path: Path) -> str:
     data = read_bytes(path, most=TABLE_BYTES)
-    if data.startswith(_BYTE_ORDER_MARKS):
-        raise BadDataError("is UTF-16 text", way_out=_AS_UTF8, path=str(path))
+    for marks, what, way_out in _NOT_TEXT:
+        if data.startswith(marks):
+            raise BadDataError(what, way_out=way_out, path=str(path))
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -248,9 +257,21 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
     if text.lstrip("+-").lower() in _NOT_FINITE or _NUMBER.fullmatch(text):
         raise _CellError(f"{_shown(text)} is not a finite number", _blank_advice(field))
     if _DECIMAL_COMMA.fullmatch(text):
-        raise _CellError(f"{_shown(text)} has a decimal comma", f"write {text.replace(',', '.')}")
+        raise _CellError(*_comma_fault(text))
     unit = " in mm" if field["name"].endswith("_mm") else ""
     raise _CellError(f"{_shown(text)} is not a number", f"write digits only{unit}; {_blank_advice(field)}")
+
+
+def _comma_fault(text: str) -> tuple[str, str]:
+    """What a comma in a number may mean: three digits after it may be thousands, any other count is a decimal."""
+    whole, _, rest = text.partition(",")
+    decimal = f"{whole}.{rest}"
+    if len(rest) != 3 or whole.lstrip("+-").startswith("0"):
+        return f"{_shown(text)} has a decimal comma", f"write {decimal}"
+    return (
+        f"{_shown(text)} has a comma that may separate thousands or decimals",
+        f"write {whole}{rest} or {decimal}, whichever is meant",
+    )
 
 
 def _parse_integer(text: str, field: Mapping[str, Any]) -> int:

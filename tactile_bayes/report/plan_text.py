@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 
 def plan_text(document: Mapping[str, Any]) -> str:
     """The whole plan; the research-use line comes last."""
-    errors = ", ".join(f"{name.replace('_', ' ')} {value:.3g}" for name, value in document["errors"].items())
     lines = [
-        f"Assumed errors of ln size: {errors}",
+        f"Assumed errors of ln size: {_errors(document, document['errors'])}",
+        *_origins(document),
         "",
         "patients  maps  power                tactile MAPE %  other MAPE %  tactile interval  ratio interval",
         *(_design_line(one) for one in document["designs"]),
@@ -21,6 +21,18 @@ def plan_text(document: Mapping[str, Any]) -> str:
         str(document["research_use"]),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _errors(document: Mapping[str, Any], names: Iterable[str]) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {document['errors'][name]:.3g}" for name in names)
+
+
+def _origins(document: Mapping[str, Any]) -> Iterator[str]:
+    """Beside a pilot, which of the errors are its own and which the options gave."""
+    sources: Mapping[str, str] = document["errors_from"]
+    given = [name for name, source in sources.items() if source == "option"]
+    if "pilot" in sources.values() and given:
+        yield f"Given by options: {_errors(document, given)}; the others are the pilot's."
 
 
 def _design_line(one: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.trial_figures import calibration_figure, differences_figure, sizes_figure
 from tactile_bayes.report.trial_methods_text import shown
+from tactile_bayes.report.trial_text import ratio_line
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
@@ -69,6 +70,7 @@ def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>{title}</title><style>{_STYLE}</style></head><body>",
         f"<h1>{title}</h1>",
+        *([f"<p>Protocol: {html.escape(document['title'])}</p>"] if "title" in document else []),
         *_opening(report),
         *_errors(report),
         *_agreement(report),
@@ -89,6 +91,8 @@ def _opening(report: TrialReport) -> Iterator[str]:
         f"<p>{report.masses} masses of {report.patients} patients, {report.readings} readings. "
         f"In brackets: {100 * report.confidence:g} % intervals over patients.</p>"
     )
+    for doubt in report.doubts:
+        yield f'<p class="mark">Doubtful: {html.escape(doubt)}</p>'
     if report.synthetic_readings:
         share = "All" if report.synthetic_readings == report.readings else str(report.synthetic_readings)
         yield f'<p class="mark">{share} readings are synthetic: made by a generator, not measured.</p>'
@@ -102,11 +106,11 @@ def _errors(report: TrialReport) -> Iterator[str]:
         '<p class="note">A mass not found counts as size 0, an error of 100 %, except in columns that say "found". '
         "r2 centred is 1 - SSE0/SST of the line through zero, below 0 where it fails.</p>"
     )
-    for name, ratios in report.ratios.items():
-        yield (
-            f"<p>{html.escape(name)}: percent error {shown(ratios['ratio'], '.2f')} times the tactile one's "
-            f"({shown(ratios['ratio_detected'], '.2f')} over masses found).</p>"
-        )
+    for name, ratio in report.ratios.items():
+        yield f"<p>{html.escape(ratio_line(name, ratio))}.</p>"
+    for one in report.modalities.values():
+        for caution in one.cautions:
+            yield f'<p class="note">{html.escape(f"{one.name}: {caution}")}.</p>'
     yield _picture(sizes_figure(report), "Size against ex-vivo size for each modality, with identity and fitted line")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from tactile_bayes.trial.figures import Figure
@@ -21,6 +22,9 @@ def method_lines(report: TrialReport) -> Iterator[str]:
     yield "Detected masses as measurements (size on ex vivo; differences are size - ex vivo):"
     for one in report.modalities.values():
         yield from _modality_lines(one)
+    growing = growing_line(report)
+    if growing:
+        yield growing
     for pair in report.paired:
         yield _pair_line(pair)
     if report.paired:
@@ -47,12 +51,29 @@ def _modality_lines(report: ModalityReport) -> Iterator[str]:
 
 
 def _limits_lines(report: ModalityReport) -> Iterator[str]:
-    for key, unit in (("mm", "mm"), ("log_ratio", "in ln ratio")):
-        one = report.methods.limits.get(key)
+    figures = report.methods.figures
+    for unit, words in (("log_ratio", "of size / ex vivo"), ("mm", "in mm")):
+        one = report.methods.limits.get(unit)
         if one is None:
             continue
-        ends = (f"{one.low:.3g}{_ends(one.low_interval)}", f"{one.high:.3g}{_ends(one.high_interval)}")
-        yield f"{report.name}: limits of agreement {unit}: bias {one.bias:.3g}, {ends[0]} to {ends[1]}"
+        low, high = figures[f"limit_low_{unit}"], figures[f"limit_high_{unit}"]
+        bias, spec = one.bias, ".3g"
+        if unit == "log_ratio":
+            low, high, bias, spec = low.mapped(math.exp), high.mapped(math.exp), math.exp(bias), ".2f"
+        yield (
+            f"{report.name}: limits of agreement {words}: bias {bias:{spec}}, {shown(low, spec)} to {shown(high, spec)}"
+        )
+
+
+def growing_line(report: TrialReport) -> str | None:
+    """Which modalities' limits in mm not to use, and why; None where errors do not grow with size."""
+    names = [one.name for one in report.modalities.values() if one.methods.errors_grow]
+    if not names:
+        return None
+    return (
+        f"Errors grow with size ({', '.join(names)}): limits in mm are too wide for small masses, too narrow for large "
+        "ones; use the ratio's."
+    )
 
 
 def _replicate_lines(report: ModalityReport) -> Iterator[str]:

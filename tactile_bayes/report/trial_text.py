@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.trial_methods_text import method_lines
+from tactile_bayes.report.trial_methods_text import method_lines, shown
 from tactile_bayes.trial.check_intervals import IntervalCheck
+from tactile_bayes.trial.comparison import ModalityRatio
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
@@ -24,6 +25,7 @@ def trial_text(
     lines = [
         f"Sizes against excision: {_plural(report.masses, 'mass')} of {_plural(report.patients, 'patient')}, "
         f"{_plural(report.readings, 'reading')}{_synthetic(report)}",
+        *(f"Doubtful: {doubt}" for doubt in report.doubts),
         "",
         *_aligned([_HEADINGS, *(_row(one) for one in report.modalities.values())]),
         "",
@@ -49,13 +51,13 @@ def _row(report: ModalityReport) -> tuple[str, ...]:
     return (
         report.name,
         _found(report),
-        _shown(figures["mape_percent"], ".1f"),
-        _shown(figures["mape_detected_percent"], ".1f"),
-        _shown(figures["mae_mm"], ".3g"),
-        _shown(figures["bias_percent"], "+.1f"),
-        _shown(figures["slope_through_origin"], ".2f"),
-        _shown(figures["r2_centred"], ".2f"),
-        _shown(figures["r2_centred_detected"], ".2f"),
+        shown(figures["mape_percent"], ".1f"),
+        shown(figures["mape_detected_percent"], ".1f"),
+        shown(figures["mae_mm"], ".3g"),
+        shown(figures["bias_percent"], "+.1f"),
+        shown(figures["slope_through_origin"], ".2f"),
+        shown(figures["r2_centred"], ".2f"),
+        shown(figures["r2_centred_detected"], ".2f"),
     )
 
 
@@ -63,14 +65,21 @@ def _notes(report: TrialReport) -> Iterator[str]:
     percent = f"{100 * report.confidence:g} %"
     for one in report.modalities.values():
         yield from _modality_notes(one, percent=percent)
-    for name, ratios in report.ratios.items():
-        ratio, found = _shown(ratios["ratio"], ".2f"), _shown(ratios["ratio_detected"], ".2f")
-        yield f"{name}: MAPE {ratio} times the tactile one's; over masses found, {found} times"
+    for name, quotient in report.ratios.items():
+        yield ratio_line(name, quotient)
     if report.masses_without_any_reading:
         yield f"{_plural(report.masses_without_any_reading, 'excised mass')} without any reading, left out"
     yield f"In brackets: {percent} intervals. MAPE: mean absolute error in percent of the ex-vivo size."
     yield "A mass not found counts as size 0 (100 % error), except in columns that say 'found'."
     yield "slope: line through 0 of sizes on ex-vivo sizes. r2: centred, 1 - SSE0/SST, below 0 where it fails."
+
+
+def ratio_line(name: str, one: ModalityRatio) -> str:
+    """The ratio of errors with the masses that it is over."""
+    if one.masses == 0:
+        return f"{name}: no MAPE ratio: no mass was looked for by both this modality and the tactile one"
+    line = f"{name}: MAPE {shown(one.ratio, '.2f')} times the tactile one's on {_plural(one.masses, 'common mass')}"
+    return f"{line}; {shown(one.ratio_detected, '.2f')} times on the {one.masses_detected} that both found"
 
 
 def _modality_notes(report: ModalityReport, *, percent: str) -> Iterator[str]:
@@ -79,9 +88,11 @@ def _modality_notes(report: ModalityReport, *, percent: str) -> Iterator[str]:
         left_out = f"{report.masses_not_done} not done, {report.masses_without_reading} without a row"
         yield f"{name}: masses left out: {left_out}"
     if figures["within_mass_sd_mm"].value is not None:
-        sd, cv = _shown(figures["within_mass_sd_mm"], ".2g"), _shown(figures["within_mass_cv_percent"], ".1f")
-        rms = _shown(figures["within_mass_cv_rms_percent"], ".1f")
+        sd, cv = shown(figures["within_mass_sd_mm"], ".2g"), shown(figures["within_mass_cv_percent"], ".1f")
+        rms = shown(figures["within_mass_cv_rms_percent"], ".1f")
         yield f"{name}: within one mass, mean SD {sd} mm, {cv} % (root mean square {rms} %)"
+    for caution in report.cautions:
+        yield f"{name}: {caution}"
     for one in report.coverage:
         low, high = one.interval
         yield (
@@ -108,15 +119,6 @@ def _found(report: ModalityReport) -> str:
         return share
     low, high = report.detected_interval
     return f"{share} [{100 * low:.0f}, {100 * high:.0f} %]"
-
-
-def _shown(figure: Figure, spec: str) -> str:
-    if figure.value is None:
-        return "-"
-    if figure.interval is None:
-        return f"{figure.value:{spec}}"
-    low, high = figure.interval
-    return f"{figure.value:{spec}} [{low:{spec}}, {high:{spec}}]"
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from tactile_bayes.trial.figures import Figure, figure
 from tactile_bayes.trial.jackknife import UndefinedError
+from tactile_bayes.trial.misses import alike, by_size, figure_with_misses
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
@@ -15,15 +18,23 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     masses only, weighted and median percent errors, and `bias_percent` (detected only: 0 has no logarithm)."""
     found = sizes.only_detected()
     bias = figure(geometric_ratio, found, scale="log", confidence=confidence)
+    on_log = partial(figure_with_misses, scale="log", confidence=confidence)
     return {
-        "mape_percent": figure(mape_percent, sizes, scale="log", confidence=confidence),
+        "mape_percent": mape_figure(sizes, confidence=confidence),
         "mape_detected_percent": figure(mape_percent, found, scale="log", confidence=confidence),
-        "mae_mm": figure(mae_mm, sizes, scale="log", confidence=confidence),
+        "mae_mm": on_log(mae_mm, sizes, weight=alike, missed=lambda one: float(one.ex_vivo_mm.mean())),
         "mae_detected_mm": figure(mae_mm, found, scale="log", confidence=confidence),
-        "weighted_mape_percent": figure(weighted_mape_percent, sizes, scale="log", confidence=confidence),
+        "weighted_mape_percent": on_log(weighted_mape_percent, sizes, weight=by_size, missed=lambda _: 100.0),
         "median_error_percent": figure(median_percent, sizes),
         "bias_percent": bias.mapped(lambda ratio: 100 * (ratio - 1)),
     }
+
+
+def mape_figure(sizes: ModalitySizes, *, confidence: float) -> Figure:
+    """Percent error with its interval, a mass not found counting 100 %."""
+    return figure_with_misses(
+        mape_percent, sizes, scale="log", confidence=confidence, weight=alike, missed=lambda _: 100.0
+    )
 
 
 def _percent_errors(sizes: ModalitySizes) -> FloatArray:

@@ -18,6 +18,9 @@ from tactile_bayes.trial.readings import FloatArray
 from tactile_bayes.trial.tolerance import content_factor, percentile_factor
 
 Ends = tuple[float, float]
+# Times that errors proportional to size must be likelier than constant ones, and masses needed to judge it.
+LIKELIER = 3.0
+LEAST_MASSES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +168,28 @@ def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.9
     if line.slope_se == 0:
         return Trend(line.slope, both[1], 1.0 if line.slope == 0 else 0.0)
     return Trend(line.slope, both[1], 2 * float(stdtr(line.n - 2, -abs(line.slope) / line.slope_se)))
+
+
+def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
+    r"""Whether ln y - ln x is likelier to be normal with one SD than y - x is, by a factor of `LIKELIER`.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays, above 0
+        Ex-vivo sizes and sizes; False for fewer than `LEAST_MASSES`.
+
+    Notes
+    -----
+    Likelihoods of y, profiled over mean and SD as in Box & Cox (1964), J. R. Stat. Soc. B 26, 211: the logarithm's
+    carries the Jacobian :math:`\prod 1/y`.
+    """
+    n = len(x)
+    if n < LEAST_MASSES:
+        return False
+    with np.errstate(all="ignore"):
+        logs, off = np.var(np.log(y) - np.log(x)), np.var(y - x)
+        gain = 0.5 * n * (np.log(off) - np.log(logs)) - float(np.sum(np.log(y)))
+    return bool(np.isfinite(gain) and gain > np.log(LIKELIER))
 
 
 @dataclass(frozen=True, slots=True)

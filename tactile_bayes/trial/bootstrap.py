@@ -10,8 +10,8 @@ import numpy as np
 from tactile_bayes.trial.jackknife import UndefinedError
 from tactile_bayes.trial.readings import FloatArray
 
-Method = Literal["jackknife", "percentile", "bca"]
-METHODS: tuple[Method, ...] = ("jackknife", "percentile", "bca")
+Method = Literal["corrected", "jackknife", "percentile", "bca"]
+METHODS: tuple[Method, ...] = ("corrected", "jackknife", "percentile", "bca")
 RESAMPLES = 2000
 SEED = 1999
 # Of the redrawn trials, at least this share must have the figure at all.
@@ -26,7 +26,8 @@ class Intervals(float):
     confidence
         Probability, two-sided.
     method, resamples, seed
-        ``percentile`` and ``bca`` draw the patients `resamples` times from this seed.
+        ``corrected`` is the jackknife with the corrections of record 0077; ``percentile`` and ``bca`` draw the
+        patients `resamples` times from this seed.
     """
 
     method: Method
@@ -40,6 +41,11 @@ class Intervals(float):
         made = super().__new__(cls, confidence)
         made.method, made.resamples, made.seed = method, resamples, seed
         return made
+
+
+def method_of(confidence: float) -> Method:
+    """How intervals of this probability are made."""
+    return confidence.method if isinstance(confidence, Intervals) else "jackknife"
 
 
 @lru_cache(maxsize=8)

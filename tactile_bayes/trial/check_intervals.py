@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tactile_bayes.trial.accuracy import mape_percent
-from tactile_bayes.trial.figures import figure
+from tactile_bayes.trial.accuracy import mape_figure
 from tactile_bayes.trial.jackknife import MIN_PATIENTS
 from tactile_bayes.trial.proportion import clopper_pearson
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
@@ -157,6 +156,6 @@ def _ends(
     ends = []
     for _ in range(trials):
         one = simulate(sizes.patient, sizes.ex_vivo_mm, model, rng=rng)
-        found = figure(mape_percent, one, scale="log", confidence=confidence).interval
+        found = mape_figure(one, confidence=confidence).interval
         ends.append(found or (math.nan, math.nan))
     return ends

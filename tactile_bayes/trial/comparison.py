@@ -17,22 +17,49 @@ from tactile_bayes.trial.sums import ratio
 REFERENCE = "tactile"
 
 
-def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dict[str, dict[str, Figure]]:
-    """Percent error of each other modality over the tactile one's; empty without a tactile one.
+@dataclass(frozen=True, slots=True)
+class ModalityRatio:
+    """Percent error of one modality over the tactile one's on common masses.
 
-    `ratio` counts masses not found as 100 % error; `ratio_detected` takes each modality over the masses it found.
+    Attributes
+    ----------
+    ratio
+        On the `masses` that both looked for, a mass not found counting 100 %.
+    ratio_detected
+        On the `masses_detected` that both found.
     """
+
+    masses: int
+    ratio: Figure
+    masses_detected: int
+    ratio_detected: Figure
+
+
+def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dict[str, ModalityRatio]:
+    """Every other modality against the tactile one; empty without a tactile one."""
     reference = sizes.get(REFERENCE)
     if reference is None:
         return {}
     return {
-        name: {
-            "ratio": mape_ratio(one, reference, confidence=confidence),
-            "ratio_detected": mape_ratio(one.only_detected(), reference.only_detected(), confidence=confidence),
-        }
-        for name, one in sizes.items()
-        if name != REFERENCE
+        name: _modality_ratio(one, reference, confidence=confidence) for name, one in sizes.items() if name != REFERENCE
     }
+
+
+def _modality_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> ModalityRatio:
+    looked_for = on_common_masses(sizes, reference)
+    found = on_common_masses(sizes.only_detected(), reference.only_detected())
+    return ModalityRatio(
+        masses=len(looked_for[0].size_mm),
+        ratio=mape_ratio(*looked_for, confidence=confidence),
+        masses_detected=len(found[0].size_mm),
+        ratio_detected=mape_ratio(*found, confidence=confidence),
+    )
+
+
+def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:
+    """Both modalities on the masses that both have, in the same order."""
+    _, of_one, of_other = np.intersect1d(one.mass, other.mass, return_indices=True)
+    return one.take(of_one), other.take(of_other)
 
 
 def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> Figure:

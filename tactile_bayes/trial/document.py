@@ -8,6 +8,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from tactile_bayes.trial.check_intervals import IntervalCheck
+from tactile_bayes.trial.comparison import ModalityRatio
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.method_comparison import MethodComparison
 from tactile_bayes.trial.paired import PairedComparison
@@ -51,8 +52,9 @@ def as_document(report: TrialReport) -> dict[str, Any]:
             "synthetic_readings": report.synthetic_readings,
         },
         "modalities": {name: _modality_document(one) for name, one in report.modalities.items()},
-        "mape_ratio_to_tactile": {name: _figures_document(one) for name, one in report.ratios.items()},
+        "mape_ratio_to_tactile": {name: _ratio_document(one) for name, one in report.ratios.items()},
         "paired_comparisons": [_paired_document(one) for one in report.paired],
+        "doubts": list(report.doubts),
         "conventions": CONVENTIONS,
     }
 
@@ -104,6 +106,7 @@ def _modality_document(report: ModalityReport) -> dict[str, Any]:
         "method_comparison": _methods_document(report.methods),
         "replicates": {**_figures_document(report.replicates), "variance_components": _plain(report.components)},
         "calibration": _plain(report.calibration),
+        "cautions": list(report.cautions),
     }
 
 
@@ -116,7 +119,13 @@ def _methods_document(methods: MethodComparison) -> dict[str, Any]:
         "limits": {name: _plain(one) for name, one in methods.limits.items()},
         "trends": {name: _plain(one) for name, one in methods.trends.items()},
         "concordance_parts": _plain(methods.concordance),
+        "errors_grow_with_size": methods.errors_grow,
     }
+
+
+def _ratio_document(one: ModalityRatio) -> dict[str, Any]:
+    figures = {"ratio": one.ratio, "ratio_detected": one.ratio_detected}
+    return {"masses": one.masses, "masses_detected": one.masses_detected, **_figures_document(figures)}
 
 
 def _paired_document(one: PairedComparison) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,8 +12,14 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.trial.bootstrap import Intervals, bca_interval, draw_patients, percentile_interval
-from tactile_bayes.trial.jackknife import Scale, UndefinedError, interval_from_values, need_patients
+from tactile_bayes.trial.bootstrap import Intervals, bca_interval, draw_patients, method_of, percentile_interval
+from tactile_bayes.trial.jackknife import (
+    Scale,
+    UndefinedError,
+    effective_number,
+    interval_from_values,
+    need_patients,
+)
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic
 
@@ -20,6 +27,7 @@ from tactile_bayes.trial.sums import SumStatistic
 LARGEST = 1e150
 
 Statistic = Callable[[ModalitySizes], float]
+Leverage = Callable[[ModalitySizes], FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +51,25 @@ class Figure:
     has_interval: bool = False
 
     def mapped(self, function: Callable[[float], float]) -> Figure:
-        """The figure in other units, by an increasing function."""
+        """The figure in other units, by an increasing function; ends beyond double precision leave no interval."""
         ends = self.interval
-        return replace(
-            self,
-            value=None if self.value is None else function(self.value),
-            interval=None if ends is None else (function(ends[0]), function(ends[1])),
-        )
+        one = replace(self, value=None if self.value is None else function(self.value))
+        if ends is None:
+            return one
+        with contextlib.suppress(OverflowError):
+            low, high = function(ends[0]), function(ends[1])
+            if abs(low) < LARGEST and abs(high) < LARGEST:
+                return replace(one, interval=(low, high))
+        return replace(one, interval=None, interval_reason="the interval is wider than double precision holds")
 
 
 def figure(
-    statistic: Statistic, sizes: ModalitySizes, *, scale: Scale | None = None, confidence: float | None = None
+    statistic: Statistic,
+    sizes: ModalitySizes,
+    *,
+    scale: Scale | None = None,
+    confidence: float | None = None,
+    leverage: Leverage | None = None,
 ) -> Figure:
     """The statistic of these masses, with an interval over patients when `scale` and `confidence` are given.
 
@@ -65,10 +81,16 @@ def figure(
         ``log`` for a figure above 0, ``linear`` for one of either sign.
     confidence
         Probability of the interval, two-sided; or `Intervals`, to choose how it is made.
+    leverage
+        (n,) weight of each mass in the variance of the figure. The corrected jackknife takes the effective number of
+        patients by these weights as its degrees of freedom (Bell & McCaffrey 2002, Survey Methodology 28, 169).
     """
     if scale is None or confidence is None:
         return _plain(partial(finite, statistic, sizes))
-    return resampled(Sample(statistic, sizes), scale=scale, confidence=confidence)
+    freedom = None
+    if leverage is not None and method_of(confidence) == "corrected" and len(sizes.size_mm):
+        freedom = effective_number(leverage(sizes), sizes.patient)
+    return resampled(Sample(statistic, sizes), scale=scale, confidence=confidence, freedom=freedom)
 
 
 class Resampled(Protocol):
@@ -129,23 +151,25 @@ class Sample:
             return math.nan
 
 
-def resampled(sample: Resampled, *, scale: Scale, confidence: float) -> Figure:
-    """A figure with its interval over patients."""
+def resampled(sample: Resampled, *, scale: Scale, confidence: float, freedom: float | None = None) -> Figure:
+    """A figure with its interval over patients; `freedom` as in `interval_from_values`."""
     plain = _plain(sample.value)
     if plain.value is None:
         return replace(plain, has_interval=True, interval_reason=plain.reason)
     try:
         need_patients(len(sample.patients))
-        interval = _interval(sample, plain.value, scale=scale, confidence=confidence)
+        interval = _interval(sample, plain.value, scale=scale, confidence=confidence, freedom=freedom)
     except UndefinedError as undefined:
         return replace(plain, has_interval=True, interval_reason=str(undefined))
     return replace(plain, has_interval=True, interval=interval)
 
 
-def _interval(sample: Resampled, value: float, *, scale: Scale, confidence: float) -> tuple[float, float]:
+def _interval(
+    sample: Resampled, value: float, *, scale: Scale, confidence: float, freedom: float | None
+) -> tuple[float, float]:
     chosen = confidence if isinstance(confidence, Intervals) else Intervals(confidence)
-    if chosen.method == "jackknife":
-        return interval_from_values(value, sample.left_out(), scale=scale, confidence=float(chosen))
+    if chosen.method in ("corrected", "jackknife"):
+        return interval_from_values(value, sample.left_out(), scale=scale, confidence=float(chosen), freedom=freedom)
     draws = draw_patients(len(sample.patients), resamples=chosen.resamples, seed=chosen.seed)
     drawn = sample.redrawn(draws)
     if chosen.method == "percentile":

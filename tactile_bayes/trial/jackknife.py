@@ -9,11 +9,13 @@ from typing import Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-Scale = Literal["log", "linear", "fisher"]
+Scale = Literal["log", "linear", "fisher", "slope"]
 Values = TypeVar("Values", float, npt.NDArray[np.float64])
 
 # Below this the spread of so few leave-one-out values says little; a Student t with 6 degrees of freedom would hide it.
 MIN_PATIENTS = 8
+# An interval on the logarithm whose upper end is more than this many times the lower one says nothing.
+WIDEST = 1000.0
 
 
 class UndefinedError(Exception):
@@ -33,7 +35,8 @@ def jackknife_interval(
         One function a patient, giving the statistic without that patient.
     scale
         ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear`` on the figure,
-        ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1).
+        ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1), ``slope`` as ``log`` where the
+        figure is above 0 with every patient left out, else as ``linear``.
     confidence
         Probability of the interval.
 
@@ -59,27 +62,70 @@ def need_patients(groups: int) -> None:
 
 
 def interval_from_values(
-    value: float, values: Sequence[float] | npt.NDArray[np.float64], *, scale: Scale, confidence: float
+    value: float,
+    values: Sequence[float] | npt.NDArray[np.float64],
+    *,
+    scale: Scale,
+    confidence: float,
+    freedom: float | None = None,
 ) -> tuple[float, float]:
-    """The interval of `jackknife_interval` from the leave-one-out values themselves."""
+    """The interval of `jackknife_interval` from the leave-one-out values themselves.
+
+    Parameters
+    ----------
+    freedom
+        Degrees of freedom of Student's t where they are fewer than G - 1.
+    """
     from scipy.special import stdtrit
 
     groups = len(values)
     need_patients(groups)
-    everything = on_scale(value, scale)
-    others = on_scale(np.asarray(values, dtype=np.float64), scale)
+    left_out = np.asarray(values, dtype=np.float64)
+    if scale == "slope":
+        scale = "log" if value > 0 and np.all(left_out > 0) else "linear"
+    everything, others = on_scale(value, scale), on_scale(left_out, scale)
     variance = (groups - 1) / groups * float(np.sum((others - others.mean()) ** 2))
     if variance <= (1e-12 * max(1.0, abs(everything))) ** 2:
         raise UndefinedError("the figure is the same whichever patient is left out, so its error cannot be estimated")
-    reach = float(stdtrit(groups - 1, 0.5 + 0.5 * confidence)) * math.sqrt(variance)
+    degrees = groups - 1 if freedom is None else min(max(freedom, 1.0), groups - 1)
+    reach = float(stdtrit(degrees, 0.5 + 0.5 * confidence)) * math.sqrt(variance)
     low, high = everything - reach, everything + reach
     if scale == "linear":
         return low, high
     if scale == "fisher":
         return math.tanh(low), math.tanh(high)
-    if high > math.log(1e300):
-        raise UndefinedError("the interval is wider than double precision holds")
+    if high - low > math.log(WIDEST):
+        raise UndefinedError(f"it would span more than a factor of {WIDEST:g}: the figure rests on one or two patients")
     return math.exp(low), math.exp(high)
+
+
+def effective_number(weights: npt.NDArray[np.float64], patient: npt.NDArray[np.int64]) -> float:
+    r"""How many equal patients carry as much as these, :math:`(\sum_g W_g)^2 / \sum_g W_g^2` (Satterthwaite 1946).
+
+    Parameters
+    ----------
+    weights : (n,) array
+        Of each mass, not below 0; 0 is returned where all are 0.
+    patient : (n,) array
+        Patient of each mass.
+    """
+    _, group = np.unique(patient, return_inverse=True)
+    by_patient = np.bincount(group, weights=weights / max(float(weights.max(initial=0.0)), 1e-300))
+    squares = float(np.sum(by_patient**2))
+    return float(by_patient.sum()) ** 2 / squares if squares > 0 else 0.0
+
+
+def kurtosis_freedom(values: npt.NDArray[np.float64]) -> float:
+    r"""Degrees of freedom of a jackknife variance from the fourth moment of its leave-one-out values.
+
+    With normal contributions of unequal variance the expected squares and fourth powers give Satterthwaite's
+    :math:`(\sum\sigma_g^2)^2 / \sum\sigma_g^4 = 3 (\sum d_g^2)^2 / \sum d_g^4`.
+    """
+    off = np.abs(values - values.mean())
+    if not off.any():
+        return 1.0
+    squares = (off / off.max()) ** 2
+    return 3 * float(squares.sum()) ** 2 / float(np.sum(squares**2))
 
 
 def on_scale(values: Values, scale: Scale) -> Values:

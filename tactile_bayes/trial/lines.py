@@ -18,7 +18,7 @@ from tactile_bayes.trial.readings import FloatArray
 MAX_ITERATIONS = 30
 THRESHOLD = 1e-6
 # Differences below this share of the numbers themselves are rounding.
-_EQUAL = 1e-12
+EQUAL = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
     mean_x, mean_y, u, q, p = _moments(x, y, np.ones_like(x))
     slope = deming_slope(u, q, p, error_ratio)
     intercept = mean_y - slope * mean_x
-    if len(x) < 3 or p == 0:
+    if len(x) < 3 or slope == 0:
         return Line(intercept, slope, len(x))
     r2 = min(1.0, p * p / (u * q))
     slope_se = abs(slope) * math.sqrt((1 - r2) / r2 / (len(x) - 2))
@@ -153,7 +153,15 @@ def jackknife_errors(
 
 
 def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
-    """Deming's slope from the sums of squares of x and y and of their products, by whichever form does not cancel."""
+    """Deming's slope from the sums of squares of x and y and of their products, by whichever form does not cancel.
+
+    Raises
+    ------
+    UndefinedError
+        Where the products are 0 up to rounding and y varies at least as much as x, so that the line is vertical.
+    """
+    if abs(p) <= EQUAL * math.sqrt(u * q):
+        p = 0.0
     d = error_ratio * q - u
     root = math.hypot(d, 2 * math.sqrt(error_ratio) * p)
     if d < 0:
@@ -190,7 +198,7 @@ def _moments(x: FloatArray, y: FloatArray, w: FloatArray) -> tuple[float, float,
 
 def _without_rounding(differences: FloatArray, values: FloatArray) -> FloatArray:
     """The differences, or zeros where all of them are rounding."""
-    if np.ptp(values) <= _EQUAL * np.abs(values).max():
+    if np.ptp(values) <= EQUAL * np.abs(values).max():
         return np.zeros_like(differences)
     return differences
 

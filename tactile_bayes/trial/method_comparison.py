@@ -9,12 +9,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from tactile_bayes.trial import bland_altman
+from tactile_bayes.trial import bland_altman, patient_limits
 from tactile_bayes.trial.bland_altman import Limits, Trend
+from tactile_bayes.trial.bootstrap import method_of
 from tactile_bayes.trial.concordance import Concordance, concordance
 from tactile_bayes.trial.figures import Figure, Statistic, figure
 from tactile_bayes.trial.jackknife import Scale, UndefinedError
-from tactile_bayes.trial.lines import Line, deming, jackknife_errors, least_squares, weighted_deming
+from tactile_bayes.trial.lines import EQUAL, Line, deming, jackknife_errors, least_squares, weighted_deming
 from tactile_bayes.trial.passing_bablok import PassingBablok, passing_bablok
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic, columns, ratio
@@ -44,6 +45,8 @@ class MethodComparison:
         ``mm`` for differences, ``log_ratio`` for logarithms of ratios; of single readings, replicates allowed for.
     trends
         Slope of the differences on the ex-vivo size (``on_ex_vivo``) and on the mean of both (``on_mean``).
+    errors_grow
+        Errors are likelier proportional to size than constant, so that limits in mm suit no one size.
     """
 
     n: int
@@ -53,6 +56,7 @@ class MethodComparison:
     limits: Mapping[str, Limits] = field(default_factory=dict)
     trends: Mapping[str, Trend] = field(default_factory=dict)
     concordance: Concordance | None = None
+    errors_grow: bool = False
 
 
 def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0) -> MethodComparison:
@@ -71,18 +75,28 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
         limits=_limits(found, confidence=float(confidence)),
         trends=_trends(x, y, confidence=float(confidence)),
         concordance=_or_none(lambda: concordance(x, y, confidence=float(confidence))),
+        errors_grow=bland_altman.errors_are_proportional(x, y),
     )
 
 
 def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float, robust: _Fit) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
-    for name, statistic, scale in _statistics(error_ratio, robust):
+    slope: Scale = "slope" if method_of(confidence) == "corrected" else "linear"
+    for name, statistic, scale in _statistics(error_ratio, robust, slope):
         wanted = scale if isinstance(statistic, SumStatistic) or len(found.size_mm) <= MOST_REFITTED else None
-        figures[name] = figure(_guarded(statistic), found, scale=wanted, confidence=confidence)
-    return figures
+        figures[name] = figure(
+            _guarded(statistic), found, scale=wanted, confidence=confidence, leverage=_squared_distance
+        )
+    return figures | patient_limits.figures(found, confidence=confidence)
 
 
-def _statistics(error_ratio: float, robust: _Fit) -> list[tuple[str, Statistic, Scale]]:
+def _squared_distance(sizes: ModalitySizes) -> FloatArray:
+    """(n,) what each ex-vivo size adds to their variance: how much the mass bears on a slope."""
+    share = sizes.ex_vivo_mm / sizes.ex_vivo_mm.max()
+    return np.asarray((share - share.mean()) ** 2)
+
+
+def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[str, Statistic, Scale]]:
     """Every figure with its name and the scale of its interval."""
     demings = partial(_deming_slope, error_ratio=error_ratio)
     fits = (
@@ -91,11 +105,11 @@ def _statistics(error_ratio: float, robust: _Fit) -> list[tuple[str, Statistic, 
     )
     return [
         ("ols_intercept_mm", SumStatistic(_terms, _intercept_with(_ols_slope), _NO_LINE), "linear"),
-        ("ols_slope", SumStatistic(_terms, _ols_slope, _NO_LINE), "linear"),
+        ("ols_slope", SumStatistic(_terms, _ols_slope, _NO_LINE), slope),
         ("deming_intercept_mm", SumStatistic(_terms, _intercept_with(demings), _NO_LINE), "linear"),
-        ("deming_slope", SumStatistic(_terms, demings, _NO_LINE), "linear"),
+        ("deming_slope", SumStatistic(_terms, demings, _NO_LINE), slope),
         *((f"{name}_intercept_mm", fit.part("intercept"), "linear") for name, fit in fits),
-        *((f"{name}_slope", fit.part("slope"), "linear") for name, fit in fits),
+        *((f"{name}_slope", fit.part("slope"), slope) for name, fit in fits),
         ("concordance", SumStatistic(_terms, _concordance, "concordance needs sizes that vary"), "fisher"),
         ("difference_mean_mm", SumStatistic(_terms, _bias), "linear"),
         ("difference_sd_mm", SumStatistic(_terms, _sd, "one mass has no spread"), "log"),
@@ -132,6 +146,7 @@ def _ols_slope(sums: FloatArray) -> FloatArray:
 
 def _deming_slope(sums: FloatArray, *, error_ratio: float) -> FloatArray:
     u, q, p = _squares(sums)
+    p = np.where(np.abs(p) <= EQUAL * np.sqrt(u * q), 0.0, p)
     d = error_ratio * q - u
     root = np.hypot(d, 2 * np.sqrt(error_ratio) * p)
     return np.where(d < 0, ratio(2 * p, root - d), ratio(d + root, 2 * error_ratio * p))

@@ -9,6 +9,13 @@ For mass i of patient g with true log size :math:`\xi_i`, centred at the mean of
 with bias :math:`\beta`, slope :math:`\gamma` on the logarithm, patient effects :math:`u_g \sim N(0, \rho^2)`, mass
 effects :math:`b_i \sim N(0, \tau^2)` and replicate noise :math:`w_{ij} \sim N(0, \omega^2)`. The effects are
 integrated out exactly: all that is left is normal, patient by patient. Masses not found enter through their share.
+
+The expected error depends on the root mean square r of bias, slope error and total SD,
+
+.. math:: r^2 = \beta^2 + (\gamma - 1)^2 s_\xi^2 + \rho^2 + \tau^2 + \omega^2,
+
+so the prior is put on it and on how it splits, not on the parts: separate priors favour a larger sum than any of them
+says (record 0078). It is uniform in ln r, as far as the caliper's own error lets r be seen.
 """
 
 from __future__ import annotations
@@ -23,11 +30,14 @@ import numpy as np
 from tactile_bayes.trial.jackknife import MIN_PATIENTS
 from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, gather, mass_numbers
 
-# Half-normal prior SDs of the patient, mass and replicate SDs on the logarithm; normal ones of bias and slope - 1.
-PRIOR_SD = 0.5
+# Largest total SD of ln size; normal prior SDs of bias and slope - 1.
+MOST_TOTAL_SD = 5.0
 PRIOR_BIAS, PRIOR_SLOPE = 0.5, 0.5
 # Caliper error as a share of the size, where the table gives none: +-5 % in Wellman & Howe (1999), figure 10.
 CALIPER = 0.05
+# Both parameters of the beta prior of the share of masses missed. With 1/3 the posterior's median is near the share
+# observed, also when that is 0 (Kerman 2011, Electron. J. Statist. 5, 1450).
+PRIOR_MISS = 1 / 3
 
 
 class Draws(Protocol):
@@ -59,9 +69,9 @@ class Posterior:
     Attributes
     ----------
     summaries
-        Median, low and high end of each figure, by name.
-    mape_percent
-        (n,) draws of the expected percent error of the next mass, misses included.
+        Median, low and high end of each figure, by name. `mape_detected_percent` is the error of a mass that is found.
+    mape_percent, mape_detected_percent
+        (n,) draws of the expected percent error of the next mass, misses included, and of one that is found.
     """
 
     name: str
@@ -69,6 +79,7 @@ class Posterior:
     patients: int
     summaries: Mapping[str, tuple[float, float, float]]
     mape_percent: FloatArray
+    mape_detected_percent: FloatArray
     diagnostics: Mapping[str, float]
 
 
@@ -106,10 +117,12 @@ class NextMass:
         """Text for people."""
         lines = ["Bayesian errors-in-variables model, beside the table above and not instead of it:"]
         for name, one in self.posteriors.items():
-            error, bias, slope = (one.summaries[key] for key in ("mape_percent", "bias_percent", "log_slope"))
+            error, found, bias, slope = (
+                one.summaries[key] for key in ("mape_percent", "mape_detected_percent", "bias_percent", "log_slope")
+            )
             lines.append(
-                f"{name}: next mass: expected error {_shown(error, '.1f')} %, bias {_shown(bias, '+.1f')} %, "
-                f"slope of ln size {_shown(slope, '.2f')}"
+                f"{name}: next mass: expected error {_shown(error, '.1f')} %, if it is found {_shown(found, '.1f')} %; "
+                f"bias {_shown(bias, '+.1f')} %, slope of ln size {_shown(slope, '.2f')}"
             )
         lines += [f"probability that {pair}: {p:.3f}" for pair, p in self.probability_less_error.items()]
         return [*lines, *(f"{name}: no model: {reason}" for name, reason in self.left_out.items())]
@@ -129,7 +142,7 @@ def next_mass(
     Parameters
     ----------
     sample
-        Draws from a log density; `posterior.ensemble.ensemble` in the program.
+        Draws from a log density; importance sampling or MCMC in the program.
     probability
         Of the equal-tailed intervals.
 
@@ -180,19 +193,21 @@ def _fit(
     centre, covariance = model.start()
     drawn = sample(model.log_density, centre, covariance, rng=rng)
     theta = np.asarray(drawn.theta).reshape(-1, len(centre))
-    misses = rng.beta(len(sizes.size_mm) - len(found.size_mm) + 0.5, len(found.size_mm) + 0.5, len(theta))
-    if len(found.size_mm) == len(sizes.size_mm):
-        misses = np.zeros(len(theta))
-    error = expected_error_percent(model, theta, misses)
-    sds = np.exp(theta[:, 2:])
+    missed = len(sizes.size_mm) - len(found.size_mm)
+    misses = rng.beta(missed + PRIOR_MISS, len(found.size_mm) + PRIOR_MISS, len(theta))
+    of_found = expected_error_percent(model, theta, np.zeros(len(theta)))
+    error = (1 - misses) * of_found + 100 * misses
+    sds = np.sqrt(np.array(variances(theta)))
     tails = [0.5, 0.5 - probability / 2, 0.5 + probability / 2]
     figures = {
         "mape_percent": error,
+        "mape_detected_percent": of_found,
         "bias_percent": 100 * np.expm1(theta[:, 0]),
         "log_slope": theta[:, 1],
-        "patient_sd": sds[:, 0],
-        "mass_sd": sds[:, 1],
-        "replicate_sd": sds[:, 2],
+        "total_sd": np.exp(theta[:, 2]),
+        "patient_sd": sds[0],
+        "mass_sd": sds[1],
+        "replicate_sd": sds[2],
         "miss_share": misses,
     }
     quantiles = {name: np.quantile(values, tails) for name, values in figures.items()}
@@ -202,6 +217,7 @@ def _fit(
         patients=len(found.patients),
         summaries={name: (float(q[0]), float(q[1]), float(q[2])) for name, q in quantiles.items()},
         mape_percent=error,
+        mape_detected_percent=of_found,
         diagnostics=dict(drawn.diagnostics),
     )
 
@@ -223,6 +239,7 @@ class LogModel:
         self.spread = max(float(self.log_e.std(ddof=1)), 1e-3)
         self._x = self.log_e - self.centre
         self._caliper2 = caliper**2
+        self.caliper = math.sqrt(float(np.mean(self._caliper2)))
         logs = [np.log(group) for group in found.replicates_mm]
         self._number = np.array([len(group) for group in logs], dtype=np.float64)
         self._y = np.array([group.mean() for group in logs]) - self.centre
@@ -235,19 +252,18 @@ class LogModel:
         """A guess of the mode and of the covariance about it."""
         off = self._y - self._x
         residual = max(float(off.std()), 0.02)
-        within = math.sqrt(self._within / self._freedom) if self._freedom else 0.1
-        centre = np.array([off.mean(), 1.0, math.log(0.5 * residual), math.log(residual), math.log(max(within, 0.01))])
+        within2 = max(self._within / self._freedom, 1e-4) if self._freedom else residual**2
+        total2 = residual**2 + within2 * (1 - float(np.mean(1 / self._number)))
+        share = min(max(within2 / total2, 0.05), 0.95) if self._freedom else 0.5
+        centre = np.array([off.mean(), 1.0, 0.5 * math.log(total2), math.log(share / (1 - share)), 0.0])
         n = len(off)
-        spreads = np.array([residual / math.sqrt(n), residual / self.spread / math.sqrt(n), 0.7, 0.4, 0.2])
-        if not self._freedom:
-            spreads[4] = 0.7
-        return centre, np.diag(spreads**2)
+        spreads = [residual / math.sqrt(n), residual / self.spread / math.sqrt(n), 0.8 / math.sqrt(n)]
+        return centre, np.diag(np.array([*spreads, 0.5 if self._freedom else 1.5, 1.5]) ** 2)
 
     def log_density(self, theta: FloatArray) -> FloatArray:
-        """(m,) unnormalised log posterior of (m, 5) rows: bias, slope and three log SDs."""
-        bias, slope, *logs = theta.T
-        with np.errstate(over="ignore"):
-            rho2, tau2, omega2 = (np.exp(2 * np.clip(one, -20, 5)) for one in logs)
+        """(m,) unnormalised log posterior of (m, 5) rows, see `variances`."""
+        bias, slope = theta.T[:2]
+        rho2, tau2, omega2 = variances(theta)
         # the true size given the ex-vivo one: normal about a shrunken value
         prior2 = max(self.spread**2 - float(np.mean(self._caliper2)), 0.25 * self.spread**2)
         keep = prior2 / (prior2 + self._caliper2)
@@ -257,7 +273,7 @@ class LogModel:
         log_like = -0.5 * np.sum((self._y - mean) * off + np.log(variance), axis=1)
         log_like += self._patients_part(rho2, off, 1 / variance)
         log_like -= 0.5 * (self._within / omega2 + self._freedom * np.log(omega2))
-        return np.asarray(log_like + _log_prior(bias, slope, logs, (rho2, tau2, omega2)))
+        return np.asarray(log_like + log_prior(theta, spread=self.spread, caliper=self.caliper))
 
     def _patients_part(self, rho2: FloatArray, off: FloatArray, precision: FloatArray) -> FloatArray:
         """What a shared patient effect adds to independent masses (Woodbury, patient by patient)."""
@@ -269,15 +285,50 @@ class LogModel:
         return part
 
 
-def _log_prior(
-    bias: FloatArray, slope: FloatArray, logs: Sequence[FloatArray], variances: Sequence[FloatArray]
-) -> FloatArray:
-    """Normal priors of bias and slope, half-normal ones of the SDs with the Jacobian of their logarithms."""
-    prior = -0.5 * ((bias / PRIOR_BIAS) ** 2 + ((slope - 1) / PRIOR_SLOPE) ** 2)
-    for log_sd, variance in zip(logs, variances, strict=True):
-        prior = prior - 0.5 * variance / PRIOR_SD**2 + log_sd
-        prior = np.where((log_sd < -12) | (log_sd > 4), -np.inf, prior)
-    return np.asarray(prior)
+def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Variances of ln size between patients, between masses of a patient and between readings of a mass.
+
+    Parameters
+    ----------
+    theta : (m, 5) array
+        Bias, slope, logarithm of the total SD, logit of the share of the total variance that single readings have,
+        logit of the patients' share of the rest.
+    """
+    from scipy.special import expit
+
+    total2 = np.exp(2 * np.clip(theta[:, 2], -14, 5))
+    # at least 1e-12 of the variance is the readings' own, so that no logarithm of 0 is taken
+    of_readings, of_patients = np.clip(expit(theta[:, 3]), 1e-12, 1.0), expit(theta[:, 4])
+    rest = total2 * expit(-theta[:, 3])
+    return rest * of_patients, rest * (1 - of_patients), total2 * of_readings
+
+
+def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray:
+    r"""(m,) unnormalised log prior; the Jacobians of the logarithm and the logits are in it.
+
+    Parameters
+    ----------
+    theta : (m, 5) array
+        See `variances`.
+    spread, caliper
+        SD of ln ex-vivo size over the masses, and root mean square of the calipers' relative SDs.
+
+    Notes
+    -----
+    :math:`(r^2 + c^2)^{-3/2}` in bias, slope error and total SD, which is uniform in ln r for r well above the
+    caliper's c: given the SD, bias and slope error are bivariate Cauchy with the SD as scale (Zellner & Siow 1980), and
+    the SD has Jeffreys' prior. Both shares of the variance are uniform. Normal priors keep bias and slope finite.
+    """
+    from scipy.special import log_expit
+
+    bias, slope, log_total, *logits = theta.T
+    off = slope - 1
+    square = bias**2 + (off * spread) ** 2 + np.exp(2 * np.clip(log_total, -14, 5)) + caliper**2
+    prior = log_total - 1.5 * np.log(square) - 0.5 * ((bias / PRIOR_BIAS) ** 2 + (off / PRIOR_SLOPE) ** 2)
+    for one in logits:
+        prior = prior + log_expit(one) + log_expit(-one)
+    outside = (log_total < -12) | (log_total > math.log(MOST_TOTAL_SD))
+    return np.asarray(np.where(outside, -np.inf, prior))
 
 
 def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArray) -> FloatArray:
@@ -286,7 +337,7 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
     On the logarithm the error is normal; its size-dependent mean is averaged over normal sizes like the trial's.
     """
     at, weight = np.polynomial.hermite_e.hermegauss(15)
-    sd = np.sqrt(np.sum(np.exp(2 * theta[:, 2:]), axis=1))[:, None]
+    sd = np.exp(theta[:, 2])[:, None]
     mean = theta[:, :1] + (theta[:, 1:2] - 1) * model.spread * at[None, :]
     folded = np.exp(mean + sd**2 / 2) * _erf((mean / sd + sd) / math.sqrt(2)) - _erf(mean / sd / math.sqrt(2))
     error: FloatArray = 100 * ((1 - misses) * (folded @ weight / weight.sum()) + misses)

@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.trial.accuracy import some
 from tactile_bayes.trial.figures import Figure, figure
 from tactile_bayes.trial.jackknife import UndefinedError
+from tactile_bayes.trial.misses import by_square, figure_with_misses
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
@@ -22,7 +23,9 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     """Slope and r squared with masses not found at size 0 (the paper's convention), then over detected masses only."""
     result: dict[str, Figure] = {}
     for suffix, subset in (("", sizes), ("_detected", sizes.only_detected())):
-        result[f"slope_through_origin{suffix}"] = figure(slope, subset, scale="linear", confidence=confidence)
+        result[f"slope_through_origin{suffix}"] = figure_with_misses(
+            slope, subset, scale="linear", confidence=confidence, weight=by_square, missed=lambda _: 0.0
+        )
         result[f"r2_centred{suffix}"] = figure(r2_centred, subset)
         result[f"r2_uncentred{suffix}"] = figure(r2_uncentred, subset)
         result[f"r2_pearson{suffix}"] = figure(r2_pearson, subset)

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from tactile_bayes.trial.accuracy import mape_percent
-from tactile_bayes.trial.comparison import Pair
+from tactile_bayes.trial.comparison import Pair, on_common_masses
 from tactile_bayes.trial.figures import Figure, figure, resampled
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import ratio
@@ -122,12 +122,6 @@ def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, see
         ratio=quotient,
         p_value=sign_flip(sums, seed=seed) if len(patients) and np.all(np.isfinite(sums)) else None,
     )
-
-
-def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:
-    """Both modalities on the masses that both looked for, in the same order."""
-    _, of_one, of_other = np.intersect1d(one.mass, other.mass, return_indices=True)
-    return one.take(of_one), other.take(of_other)
 
 
 def _difference(one: FloatArray, other: FloatArray) -> FloatArray:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.trial.accuracy import mape_percent
-from tactile_bayes.trial.check_intervals import ErrorModel
+from tactile_bayes.trial.accuracy import mape_figure, mape_percent
+from tactile_bayes.trial.bootstrap import Intervals
 from tactile_bayes.trial.comparison import mape_ratio
 from tactile_bayes.trial.figures import figure
 from tactile_bayes.trial.paired import sign_flip
@@ -151,7 +151,7 @@ def _trial(case: PlanCase, number: int) -> _Found:
     tactile_sizes, other_sizes = _sizes("tactile", ex_vivo, maps), _sizes("other", ex_vivo, other)
     off = np.abs(maps / ex_vivo - 1) - np.abs(other / ex_vivo - 1)
     p = sign_flip(off, seed=number, flips=FLIPS)
-    error = figure(mape_percent, tactile_sizes, scale="log", confidence=case.confidence)
+    error = mape_figure(tactile_sizes, confidence=Intervals(case.confidence, method="corrected"))
     ratio = mape_ratio(other_sizes, tactile_sizes, confidence=case.confidence)
     return _Found(
         won=p is not None and p < LEVEL and float(off.sum()) < 0,
@@ -180,24 +180,36 @@ def _plain(result: PlanResult | Mapping[str, Any]) -> Mapping[str, Any]:
     return result.as_dict() if isinstance(result, PlanResult) else result
 
 
-def assumptions_from(tactile: ModalitySizes, other: ModalitySizes) -> dict[str, float] | None:
-    """Errors like those of a pilot trial: bias, SDs between and within masses, share missed."""
+def assumptions_from(
+    tactile: ModalitySizes, other: ModalitySizes, *, map_sd: float | None = None
+) -> dict[str, float] | None:
+    """Errors like those of a pilot trial: bias, SDs between and within masses, share missed.
+
+    Parameters
+    ----------
+    map_sd
+        SD of ln size of single maps; estimated from the pilot's replicates when not given.
+
+    Returns
+    -------
+    None when a modality found fewer than 3 masses; without ``map_sd`` and ``mass_sd`` when the pilot has no replicates
+    and none is given, for then the two cannot be told apart.
+    """
     from tactile_bayes.trial.check_intervals import observed_errors
-    from tactile_bayes.trial.figures import Figure
     from tactile_bayes.trial.replicates import log_sd_within
 
-    models: list[ErrorModel | None] = [observed_errors(tactile), observed_errors(other)]
-    if models[0] is None or models[1] is None:
+    mine, theirs = observed_errors(tactile), observed_errors(other)
+    if mine is None or theirs is None:
         return None
-    within: Figure = figure(log_sd_within, tactile.only_replicated())
-    map_sd = within.value or 0.0
-    replicates = [len(group) for group in tactile.replicates_mm if len(group)]
-    shared = models[0].mass_sd ** 2 - map_sd**2 / float(np.mean(replicates))
-    return {
-        "tactile_bias": models[0].bias,
-        "mass_sd": math.sqrt(max(shared, 0.0)),
-        "map_sd": map_sd,
-        "other_bias": models[1].bias,
-        "other_sd": models[1].mass_sd,
-        "other_miss": models[1].miss,
+    found = {
+        "tactile_bias": mine.bias,
+        "other_bias": theirs.bias,
+        "other_sd": theirs.mass_sd,
+        "other_miss": theirs.miss,
     }
+    single = figure(log_sd_within, tactile.only_replicated()).value if map_sd is None else map_sd
+    if single is None:
+        return found
+    replicates = [len(group) for group in tactile.replicates_mm if len(group)]
+    shared = mine.mass_sd**2 - single**2 / float(np.mean(replicates))
+    return found | {"mass_sd": math.sqrt(max(shared, 0.0)), "map_sd": single}

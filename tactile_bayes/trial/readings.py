@@ -162,8 +162,8 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     Raises
     ------
     BadDataError
-        A size without detection or detection without a size; an interval that is incomplete, upside down or
-        stated for a mass that was not found.
+        A size without detection or detection without a size; an interval that is incomplete, upside down, does not
+        contain the reading's own size, or is stated for a mass that was not found.
     """
     names = ("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability")
     readings = []
@@ -171,7 +171,7 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     for row, cells in enumerate(zip(*(columns[name] for name in names), *more, strict=True)):
         patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, *others = cells
         status = _status(row, status, size_mm, fault=fault)
-        interval = _interval(row, status, (low_mm, high_mm, probability), fault=fault)
+        interval = _interval(row, status, size_mm, (low_mm, high_mm, probability), fault=fault)
         sd_mm, reader, synthetic = others
         key = (patient, mass)
         readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(synthetic), sd_mm, reader))
@@ -194,7 +194,12 @@ def _status(row: int, status: str | None, size_mm: float | None, *, fault: CellF
 
 
 def _interval(
-    row: int, status: str, cells: tuple[float | None, float | None, float | None], *, fault: CellFault
+    row: int,
+    status: str,
+    size_mm: float | None,
+    cells: tuple[float | None, float | None, float | None],
+    *,
+    fault: CellFault,
 ) -> Interval | None:
     low_mm, high_mm, probability = cells
     if low_mm is None and high_mm is None and probability is None:
@@ -211,6 +216,9 @@ def _interval(
         raise fault(row, "low_mm", f"is {low_mm:g} while status is {status}", way_out=way_out)
     if low_mm > high_mm:
         raise fault(row, "low_mm", f"is {low_mm:g}, above high_mm {high_mm:g}", way_out="exchange or correct them")
+    if size_mm is not None and not low_mm <= size_mm <= high_mm:
+        what = f"is {size_mm:g}, outside its own interval {low_mm:g} to {high_mm:g}"
+        raise fault(row, "size_mm", what, way_out="correct the size, low_mm or high_mm; all three are in mm")
     return Interval(low_mm, high_mm, probability)
 
 

@@ -6,14 +6,18 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from tactile_bayes.trial import accuracy, origin_line, replicates, spread
 from tactile_bayes.trial.bootstrap import SEED
 from tactile_bayes.trial.calibration import Calibration, Prediction, calibration, log_normal, predictions
-from tactile_bayes.trial.comparison import mape_ratios
+from tactile_bayes.trial.cautions import cautions
+from tactile_bayes.trial.comparison import ModalityRatio, mape_ratios
 from tactile_bayes.trial.coverage import Coverage, coverage
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
 from tactile_bayes.trial.paired import PairedComparison, paired_comparisons
+from tactile_bayes.trial.plausibility import unit_doubts
 from tactile_bayes.trial.proportion import clopper_pearson
 from tactile_bayes.trial.readings import MassKey, ModalitySizes, Reading, gather, mass_numbers, patient_numbers
 from tactile_bayes.trial.replicates import reader_components
@@ -42,17 +46,19 @@ class ModalityReport:
     components: Components | None = None
     calibration: Calibration | None = None
     prediction: Prediction | None = None
+    cautions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class TrialReport:
     """All modalities, their percent errors over the tactile one's, every pair of them, and what was counted.
 
-    `sizes` are those that the figures were made from; `ex_vivo_sd_mm` is by the number of the mass.
+    `sizes` are those that the figures were made from; `ex_vivo_sd_mm` is by the number of the mass. `doubts` says what
+    looks like another unit than mm.
     """
 
     modalities: Mapping[str, ModalityReport]
-    ratios: Mapping[str, Mapping[str, Figure]]
+    ratios: Mapping[str, ModalityRatio]
     patients: int
     masses: int
     masses_without_any_reading: int
@@ -62,6 +68,7 @@ class TrialReport:
     paired: tuple[PairedComparison, ...] = ()
     sizes: Mapping[str, ModalitySizes] = field(default_factory=dict)
     ex_vivo_sd_mm: Mapping[int, float | None] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
 
 def summarise(
@@ -108,6 +115,7 @@ def summarise(
         confidence=float(confidence),
         paired=tuple(paired_comparisons(sizes, confidence=confidence, seed=seed)),
         sizes=sizes,
+        doubts=tuple(unit_doubts(sizes, np.array(list(ex_vivo_mm.values()), dtype=np.float64))),
         ex_vivo_sd_mm={number: (ex_vivo_sd_mm or {}).get(key) for key, number in mass_numbers(ex_vivo_mm).items()},
     )
 
@@ -181,4 +189,5 @@ def modality_report(
         components=None if beside is None else beside.components(sizes.name),
         calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
         prediction=prediction,
+        cautions=cautions(sizes, confidence=confidence),
     )

@@ -1,0 +1,133 @@
+"""How often intervals of lines, concordance and limits of agreement hold: ``python -m benchmarks.agreement_coverage``.
+
+Prints the tables of docs/coverage.md: trials of 25 masses with log-normal errors, ex-vivo sizes drawn anew each time.
+The truth is the same figure of a hundred thousand masses.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from tactile_bayes.trial import accuracy, origin_line, patient_limits
+from tactile_bayes.trial.bland_altman import limits
+from tactile_bayes.trial.bootstrap import Intervals, Method
+from tactile_bayes.trial.check_intervals import ErrorModel, simulate
+from tactile_bayes.trial.concordance import concordance
+from tactile_bayes.trial.figures import Figure
+from tactile_bayes.trial.lines import deming, least_squares, weighted_deming
+from tactile_bayes.trial.method_comparison import compare_methods
+from tactile_bayes.trial.readings import ModalitySizes
+
+Ends = tuple[float, float]
+ONE_EACH = np.minimum(np.arange(25), 23)
+TWO_EACH = np.concatenate([np.repeat(np.arange(11), 2), [11, 12, 13]])
+# Error SD of ln size and its bias, as of tactile maps and of ultrasound.
+ERRORS = {"SD 0.20": (0.02, 0.20), "SD 0.40": (-0.08, 0.40)}
+DESIGNS = {
+    "24 patients, one with two masses": (ONE_EACH, 0.0, 0.0),
+    "the same, one in 25 missed": (ONE_EACH, 0.0, 0.04),
+    "14 patients, 11 with two masses": (TWO_EACH, 0.7, 0.0),
+}
+WANTED = (
+    "mape_percent",
+    "slope_through_origin",
+    "ols_slope",
+    "deming_slope",
+    "weighted_deming_slope",
+    "concordance",
+    "limit_low_mm",
+    "limit_high_mm",
+    "limit_low_log_ratio",
+    "limit_high_log_ratio",
+)
+
+
+def main() -> None:
+    """Print a table for each design."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=1999)
+    options = parser.parse_args()
+    for design in DESIGNS:
+        print(f"\n| {design} |" + "".join(f" {name}: corrected | jackknife | customary |" for name in ERRORS))
+        print("|---|" + "---|---|---|" * len(ERRORS))
+        columns = [_held(design, error, options) for error in ERRORS]
+        for name in WANTED:
+            print(f"| {name} | " + " | ".join(cell for column in columns for cell in column[name]) + " |", flush=True)
+
+
+def _held(design: str, error: str, options: argparse.Namespace) -> dict[str, list[str]]:
+    """Share of trials whose interval holds the truth, by figure: corrected, jackknife, customary."""
+    rng = np.random.default_rng([options.seed, list(DESIGNS).index(design)])
+    truth = _truth(_trial(design, error, rng, copies=4000))
+    hits: dict[tuple[str, int], list[bool]] = {}
+    for _ in range(options.trials):
+        sizes = _trial(design, error, rng)
+        for column, intervals in enumerate(_three(sizes)):
+            for name, ends in intervals.items():
+                hits.setdefault((name, column), []).append(ends[0] <= truth[name] <= ends[1])
+    return {name: [_share(hits.get((name, column))) for column in range(3)] for name in WANTED}
+
+
+def _share(hits: list[bool] | None) -> str:
+    return "-" if hits is None else f"{np.mean(hits):.3f}"
+
+
+def _trial(design: str, error: str, rng: np.random.Generator, *, copies: int = 1) -> ModalitySizes:
+    """One trial, or many of them as one with patients of their own."""
+    patient, shared, miss = DESIGNS[design]
+    bias, sd = ERRORS[error]
+    many = (np.arange(copies)[:, None] * (patient.max() + 1) + patient).ravel()
+    model = ErrorModel(bias, sd * (1 - shared**2) ** 0.5, patient_sd=sd * shared, miss=miss)
+    made = simulate(many, 16 * np.exp(rng.normal(0, 0.38, len(many))), model, rng=rng)
+    return replace(made, replicates_mm=tuple(size[size > 0] for size in made.size_mm[:, None]))
+
+
+def _truth(sizes: ModalitySizes) -> dict[str, float]:
+    found = sizes.only_detected()
+    x, y = found.ex_vivo_mm, found.size_mm
+    limit = patient_limits.figures(found, confidence=0.95)
+    return {
+        "mape_percent": accuracy.mape_percent(sizes),
+        "slope_through_origin": origin_line.slope(sizes),
+        "ols_slope": least_squares(x, y).slope,
+        "deming_slope": deming(x, y).slope,
+        "weighted_deming_slope": weighted_deming(x, y).slope,
+        "concordance": concordance(x, y).coefficient,
+        **{name: one.value for name, one in limit.items() if one.value is not None},
+    }
+
+
+def _figures(sizes: ModalitySizes, confidence: float) -> dict[str, Figure]:
+    found = accuracy.figures(sizes, confidence=confidence) | origin_line.figures(sizes, confidence=confidence)
+    return found | dict(compare_methods(sizes, confidence=confidence).figures)
+
+
+def _three(sizes: ModalitySizes) -> Iterator[Mapping[str, Ends]]:
+    methods: tuple[Method, ...] = ("corrected", "jackknife")
+    for method in methods:
+        found = _figures(sizes, Intervals(0.95, method=method))
+        yield {name: ends for name in WANTED if (ends := found[name].interval) is not None}
+    yield _customary(sizes)
+
+
+def _customary(sizes: ModalitySizes) -> dict[str, Ends]:
+    """What other programs print: analytic intervals of lines, Fisher's z, exact limits of agreement."""
+    one = compare_methods(sizes, confidence=0.95)
+    ends = {name: both for name, both in one.analytic.items() if both is not None and name in WANTED}
+    found = sizes.only_detected()
+    plain = {"mm": found.size_mm - found.ex_vivo_mm, "log_ratio": np.log(found.size_mm / found.ex_vivo_mm)}
+    for unit, off in plain.items():
+        both = limits(off)
+        assert both.low_interval is not None
+        assert both.high_interval is not None
+        ends |= {f"limit_low_{unit}": both.low_interval, f"limit_high_{unit}": both.high_interval}
+    return ends
+
+
+if __name__ == "__main__":
+    main()

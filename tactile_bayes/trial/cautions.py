@@ -1,0 +1,20 @@
+"""What a reader must know of a modality's intervals before trusting them, said where the data meet the condition."""
+
+from __future__ import annotations
+
+from tactile_bayes.trial.bootstrap import method_of
+from tactile_bayes.trial.readings import ModalitySizes
+
+# Up to so many misses, each moves the mean error by more than an uncorrected interval allows for.
+FEW_MISSES = 3
+
+
+def cautions(sizes: ModalitySizes, *, confidence: float) -> tuple[str, ...]:
+    """Sentences about this modality's intervals; measured shares are in docs/coverage.md."""
+    missed = len(sizes.size_mm) - int(sizes.detected.sum())
+    if not 0 < missed <= FEW_MISSES or method_of(confidence) == "corrected":
+        return ()
+    return (
+        f"only {missed} of {len(sizes.size_mm)} masses missed: intervals of MAPE hold less often than they say; "
+        "--intervals corrected allows for it",
+    )
