@@ -110,8 +110,8 @@ def test_the_papers_errors_and_the_ratio_as_measured() -> None:
     assert errors == pytest.approx({"tactile": 17, "cbe": 47, "ultrasound": 34})
     assert report.modalities["ultrasound"].figures["mape_detected_percent"].value == pytest.approx(31.25)
     ultrasound = report.ratios["ultrasound"]
-    assert ultrasound["ratio"].value == pytest.approx(2.0)  # "more than twice" is exactly twice
-    assert ultrasound["ratio_detected"].value == pytest.approx(1.84, abs=0.005)
+    assert ultrasound.ratio.value == pytest.approx(2.0)  # "more than twice" is exactly twice
+    assert ultrasound.ratio_detected.value == pytest.approx(1.84, abs=0.005)
     assert (report.patients, report.masses) == (24, 25)
     assert report.modalities["cbe"].detected == 24
 
@@ -188,7 +188,7 @@ def test_a_modality_never_done_has_counts_and_reasons() -> None:
 
 def test_ratio_to_an_error_of_zero_is_undefined() -> None:
     perfect, off = single([5, 10], [5, 10]), single([5, 10], [6, 12], name="cbe")
-    ratio = mape_ratios({"tactile": perfect, "cbe": off}, confidence=0.95)["cbe"]["ratio"]
+    ratio = mape_ratios({"tactile": perfect, "cbe": off}, confidence=0.95)["cbe"].ratio
     assert ratio.value is None
     assert ratio.reason == "the error of tactile is 0"
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
 
