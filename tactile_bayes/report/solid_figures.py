@@ -192,8 +192,8 @@ def _draw_stiffness(axes: Axes, rows: Sequence[StudyRow], axis: str, line: str, 
     if not hardest:
         return
     label = f"d {rows[0].d_mm:g} mm" if axis == "x" else None
-    ratio = [row.stiffness_ratio for row in rows]
-    axes.plot(ratio, sigma / hardest[0], line, marker=_MARKS[i % 6], color=_COLOURS[i % 6], label=label)
+    points = sorted(zip((row.stiffness_ratio for row in rows), sigma / hardest[0], strict=True))
+    axes.plot(*zip(*points, strict=True), line, marker=_MARKS[i % 6], color=_COLOURS[i % 6], label=label)
 
 
 def _draw_sections(axes: Axes, made: TactileMap, reach_mm: float, words: str) -> None:

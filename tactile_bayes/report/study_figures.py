@@ -134,7 +134,7 @@ def figure_7(
         level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
         hardest = {row.d_mm: row.sigma_x_mm for row in level if row.stiffness_ratio == HARD_RATIO}
         for i, diameter in enumerate(hardest):
-            points = [(r.stiffness_ratio, r.sigma_x_mm / hardest[diameter]) for r in level if r.d_mm == diameter]
+            points = sorted((r.stiffness_ratio, r.sigma_x_mm / hardest[diameter]) for r in level if r.d_mm == diameter)
             right.plot(
                 *zip(*points, strict=True), marker=_MARKS[i % 6], color=_COLOURS[i % 6], label=f"d {diameter:g} mm"
             )

@@ -123,7 +123,7 @@ def draw_tradeoff(found: Tradeoff, path: Path, *, tolerance_sd: float, force: bo
             axes.plot(seconds, [one.error_sd for one in shown], f"{mark}-", color=_COLOURS[method], label=method)
             for one, x in zip(shown, seconds, strict=True):
                 axes.annotate(one.setting, (x, one.error_sd), xytext=(6, 3), textcoords="offset points", fontsize=7)
-        axes.axhline(tolerance_sd, color="0.6", lw=0.8)
+        axes.axhline(tolerance_sd, color="0.6", lw=0.8, label=f"tolerance, {tolerance_sd:g} SD")
         axes.axhline(found.reference_error_sd, color="0.6", lw=0.8, ls=":", label="the reference's own error")
         axes.set_xscale("log")
         axes.set_yscale("log")
