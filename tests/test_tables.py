@@ -124,8 +124,8 @@ def test_each_fault_is_one_line_that_says_where_and_what_to_do(tmp_path: Path, f
 
 
 def test_missing_file_and_folder_are_bad_data(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.csv", tmp_path):
-        with pytest.raises(BadDataError, match="cannot be read"):
+    for path, words in ((tmp_path / "none.csv", "cannot be read"), (tmp_path, "is a directory; give a regular file")):
+        with pytest.raises(BadDataError, match=words):
             read_table(path, TRIAL)
 
 
