@@ -74,6 +74,27 @@ def test_a_reader_hands_over_what_it_reads_in_order_with_rising_times(line):
     os.close(ours)
 
 
+def test_a_reader_says_when_it_reads_and_nothing_of_that_is_data(line):
+    ours, stream = line
+    assert not stream.ready
+    stream.wait_until_ready()
+    assert stream.ready
+    os.write(ours, b"first")
+    assert read_all(stream, 5) == b"first"
+    os.close(ours)
+
+
+def test_a_reader_that_does_not_come_is_not_waited_for_without_end():
+    device, far = os.pipe()
+    process = subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE)
+    stream = Stream(process, device)
+    stream.wait_until_ready(0.05)
+    assert not stream.ready
+    process.stdin.close()
+    stream.close()
+    os.close(far)
+
+
 def test_a_reader_tells_when_the_device_has_gone(line):
     ours, stream = line
     os.write(ours, b"last words")

@@ -244,9 +244,12 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
     stack.callback(head_stream.close)
     line = Line("head", port, head_stream, parser, start, stop)
     if tracker_port is None:
+        head_stream.wait_until_ready()
         return hello, (line, None)
     tracker_stream = read_in_process(tracker_port)
     stack.callback(tracker_stream.close)
+    for stream in (head_stream, tracker_stream):
+        stream.wait_until_ready()
     return hello, (line, Line("tracker", tracker_port, tracker_stream, driver.parser(), driver.start, driver.stop))
 
 

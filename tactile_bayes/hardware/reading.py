@@ -2,7 +2,8 @@
 
 Run as a file, with no package around it, so that it starts in 20 ms and holds nothing that could pause it:
 ``python reading.py DEVICE_FD PIPE_FD``. Each record on the pipe is ``host time u64 in ns (monotonic), bytes lost so far
-u32, length u16, bytes``; a length of 0 says that the device has gone, and the process ends.
+u32, length u16, bytes``; a length of 0 says that the device has gone, and the process ends. The first record has the
+length `READY` and no bytes: from then on nothing waits in the device's own small buffer.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import time
 RECORD = struct.Struct("<QIH")
 # A record of at most PIPE_BUF bytes goes into the pipe whole or not at all, so a full pipe loses whole records.
 MAX_DATA = select.PIPE_BUF - RECORD.size
+READY = 0xFFFF
 _LOOK_UP_S = 1.0
 
 
@@ -27,6 +29,8 @@ def read_device(device: int, pipe: int) -> None:
     parent, lost = os.getppid(), 0
     os.set_blocking(device, False)
     os.set_blocking(pipe, False)
+    with contextlib.suppress(BrokenPipeError):
+        os.write(pipe, RECORD.pack(time.monotonic_ns(), 0, READY))
     while True:
         ready, _, _ = select.select([device], [], [], _LOOK_UP_S)
         if not ready:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import select
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -16,6 +18,8 @@ from tactile_bayes.hardware.ports import Port
 
 # Room for six seconds of a head at 200 Hz while the writer waits for the disk.
 PIPE_BYTES: Final = 1 << 20
+# A reader starts in 20 ms; on a busy computer it may take seconds.
+READY_S: Final = 15.0
 
 
 class Piece(NamedTuple):
@@ -37,6 +41,8 @@ class Stream:
         Where its records come out; not blocking.
     overrun_bytes
         Bytes that the reader had to drop because the pipe was full.
+    ready
+        The reader has begun to read.
     ended
         The device has gone, or the reader has.
     """
@@ -44,6 +50,7 @@ class Stream:
     process: subprocess.Popen[bytes]
     pipe: int
     overrun_bytes: int = 0
+    ready: bool = False
     ended: bool = False
     cpu_s: float = 0.0
     _rest: bytes = field(default=b"", repr=False)
@@ -51,6 +58,17 @@ class Stream:
     def fileno(self) -> int:
         """For `select`."""
         return self.pipe
+
+    def wait_until_ready(self, timeout_s: float = READY_S) -> None:
+        """Return when the reader reads: before that, what a device sends piles up in a buffer of 4 KiB.
+
+        A reader that takes longer is waited for no more; what it loses is counted. What comes meanwhile is not asked
+        for: devices are told to send afterwards.
+        """
+        end = time.monotonic() + timeout_s
+        while not (self.ready or self.ended) and (left := end - time.monotonic()) > 0:
+            if select.select([self], [], [], left)[0]:
+                self.read()
 
     def read(self) -> list[Piece]:
         """What has come since; sets `ended` after the last of it."""
@@ -65,6 +83,9 @@ class Stream:
         size = reading.RECORD.size
         while len(buffer) - place >= size:
             host_ns, lost, length = reading.RECORD.unpack_from(buffer, place)
+            if length == reading.READY:
+                self.ready, place = True, place + size
+                continue
             if len(buffer) - place - size < length:
                 break
             self.overrun_bytes = lost
