@@ -12,7 +12,7 @@ import click
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, TactileBayesError
-from tactile_bayes.printing import ReaderGoneError, protect_streams
+from tactile_bayes.printing import ReaderGoneError, protect_streams, release_streams
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -92,6 +92,13 @@ def main() -> None:
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()
+    status = _run()
+    release_streams()
+    sys.exit(status)
+
+
+def _run() -> int:
+    """Run the command that the words name; return its exit code."""
     try:
         status = cli.main(prog_name="tactile-bayes", standalone_mode=False)
         if sys.stdout is not None:
@@ -99,19 +106,19 @@ def main() -> None:
     except click.Abort as error:
         told = str(error.__cause__ or "")  # a batch says how far it came
         click.echo(f"interrupted: {told}" if told else "interrupted", err=True)
-        sys.exit(EXIT_INTERRUPTED)
+        return EXIT_INTERRUPTED
     except click.ClickException as error:
         error.show()
-        sys.exit(error.exit_code)
+        return error.exit_code
     except TactileBayesError as error:
         click.echo(f"error: {error}", err=True)
-        sys.exit(error.exit_code)
+        return error.exit_code
     except ReaderGoneError:
-        sys.exit(EXIT_READER_GONE)
+        return EXIT_READER_GONE
     except (OSError, MemoryError) as error:
         click.echo(f"error: {_system_fault(error)}", err=True)
-        sys.exit(EXIT_FAULT)
-    sys.exit(status if isinstance(status, int) else 0)
+        return EXIT_FAULT
+    return status if isinstance(status, int) else 0
 
 
 def _system_fault(error: OSError | MemoryError) -> str:

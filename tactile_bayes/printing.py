@@ -7,6 +7,7 @@ import io
 import os
 import re
 import sys
+from collections.abc import Callable
 from typing import Any, TextIO
 
 from tactile_bayes.errors import UsageError
@@ -42,16 +43,14 @@ class PrintableStream:
     def __init__(self, stream: TextIO, *, required: bool) -> None:
         self._stream = stream
         self._required = required
+        self._failure: Exception | None = None  # told again at the next call: whoever printed may have let it go
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
         """Write the text, made printable."""
-        try:
-            self._stream.write(printable(text))
-        except OSError as error:
-            self._failed(error)
+        self._try(self._stream.write, printable(text))
         return len(text)
 
     def flush(self) -> None:
@@ -64,18 +63,22 @@ class PrintableStream:
         ReaderGoneError
             When its reader has gone.
         """
-        try:
-            self._stream.flush()
-        except OSError as error:
-            self._failed(error)
+        self._try(self._stream.flush)
 
-    def _failed(self, error: OSError) -> None:
-        _abandon(self._stream)
-        if not self._required:
-            return
-        if error.errno == errno.EPIPE:
-            raise ReaderGoneError
-        raise UsageError(f"the standard output cannot be written ({error.strerror}); make room, or send it elsewhere")
+    def _try(self, action: Callable[..., object], *arguments: object) -> None:
+        try:
+            action(*arguments)
+        except OSError as error:
+            _abandon(self._stream)
+            self._failure = _failure(error) if self._required else None
+        if self._failure is not None:
+            raise self._failure
+
+
+def _failure(error: OSError) -> Exception:
+    if error.errno == errno.EPIPE:
+        return ReaderGoneError()
+    return UsageError(f"the standard output cannot be written ({error.strerror}); make room, or send it elsewhere")
 
 
 def _abandon(stream: TextIO) -> None:
@@ -93,6 +96,11 @@ def protect_streams() -> None:
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")
             setattr(sys, name, PrintableStream(stream, required=required))
+
+
+def release_streams() -> None:
+    """Put the streams back as they were, for Python's own end."""
+    sys.stdout, sys.stderr = raw_stream(sys.stdout), raw_stream(sys.stderr)
 
 
 def raw_stream(stream: Any) -> TextIO:
