@@ -1,8 +1,9 @@
 """Feed damaged files to every reader: ``python -m benchmarks.fuzz_readers [FORMAT...] [--inputs N] [--keep DIR]``.
 
 Each format's valid files are damaged N times (`fuzz_mutations`) and read in a process of its own that may take 1 GB
-more memory than it has at the start and 10 s a file. A reader accepts the file or refuses it with one of the program's
-own errors; anything else is a fault: another exception, memory, time, or the end of the process. DIR gets the faults.
+more memory than it has at the start and 10 s of CPU a file. A reader accepts the file or refuses it with one of the
+program's own errors; anything else is a fault: another exception, memory, time, or the end of the process. DIR gets the
+faults.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ def _input(name: str, seeds: Sequence[bytes], number: int) -> bytes:
 def work(name: str, folder: Path, *, first: int, inputs: int, keep: Path) -> None:
     """Read the inputs one after the other in this process and print the outcome of each."""
     warnings.simplefilter("error")
-    signal.signal(signal.SIGALRM, _stop)
+    signal.signal(signal.SIGPROF, _stop)
     form, seeds = FORMATS[name], _seeds(folder)
     path = folder / f"input{form.suffix}"
     _read(form, path, seeds[0])  # whatever is imported on the way is not the input's memory
@@ -139,7 +140,7 @@ def _read(form: Format, path: Path, data: bytes) -> tuple[str, str]:
     path.write_bytes(data)
     outcome = "accepted"
     for reader in form.readers:
-        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         try:
             reader(path)
         except TactileBayesError as error:
@@ -153,7 +154,7 @@ def _read(form: Format, path: Path, data: bytes) -> tuple[str, str]:
         except Exception:
             return "traceback", traceback.format_exc()
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
     return outcome, ""
 
 

@@ -7,6 +7,7 @@ empty scale, which netCDF hides. Record 0080 says why neither netCDF4 nor h5netc
 from __future__ import annotations
 
 import contextlib
+import io
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -15,8 +16,9 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.hdf5_heaps import check_heaps
 from tactile_bayes.files.kinds import not_a
-from tactile_bayes.files.reading import check_limit, decoding, open_input, unpacked_limit
+from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, open_input, unpacked_limit
 from tactile_bayes.records import dataclass
 
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable.{:10d}"
@@ -248,8 +250,11 @@ def open_netcdf(path: Path, *, way_out: str) -> Iterator[Group]:
         with open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
             if stream.read(len(_MAGIC)) != _MAGIC:
                 raise not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
-            size = stream.seek(0, 2)
-            with h5py.File(stream, "r") as file:
-                yield Group(file, most_bytes=unpacked_limit(size), way_out=way_out)
+            check_limit(stream.seek(0, io.SEEK_END), NETCDF_BYTES, what="it has {} bytes")
+            stream.seek(0)
+            data = stream.read()
+            check_heaps(data, way_out=way_out)
+            with h5py.File(io.BytesIO(data), "r") as file:
+                yield Group(file, most_bytes=unpacked_limit(len(data)), way_out=way_out)
     except BadDataError as error:
         raise error.at(path) from None
