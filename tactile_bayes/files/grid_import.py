@@ -212,6 +212,7 @@ def _image(path: Path) -> FloatArray:
         decoding("cannot be decoded", way_out="save it again as TIFF, PGM or PNG"),
         warnings.catch_warnings(action="ignore"),  # damage is told by the errors
     ):
+        Image.MAX_IMAGE_PIXELS = None  # the limit below is the one that can be raised
         try:
             image = Image.open(file, formats=("TIFF", "PPM", "PNG"))
         except UnidentifiedImageError:
