@@ -140,4 +140,3 @@ def test_a_replay_in_a_terminal_starts_at_once(tmp_path, child_environment):
     os.close(far)
     assert done.returncode == 0, done.stderr
     assert re.search(r"again.mcap: scan, ended by the head stopped\n40 frames", done.stdout)
-    assert "caution" not in done.stdout

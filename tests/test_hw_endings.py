@@ -136,13 +136,19 @@ def test_a_closed_terminal_ends_the_recording_in_order(tmp_path, child_environme
 def test_an_estimator_does_not_outlive_its_recording(tmp_path, child_environment, how):
     (tmp_path / "warm.py").write_text(WARM_ESTIMATOR)
     process = subprocess.Popen(
-        [sys.executable, "warm.py", how], cwd=tmp_path, env=child_environment, stdout=subprocess.PIPE, text=True
+        [sys.executable, "warm.py", how],
+        cwd=tmp_path,
+        env=child_environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     children = [int(word) for word in process.stdout.readline().split()]
     assert len(children) == 1
     if how == "kill":
         process.kill()
-    process.communicate(timeout=30)
+    _, err = process.communicate(timeout=30)
+    assert err == "" or how == "kill"
     wait_until(lambda: not any(is_running(pid) for pid in children))
 
 

@@ -341,5 +341,3 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
 
 if __name__ == "__main__":
     run(int(sys.argv[1]), json.load(sys.stdin))
-    sys.stderr.flush()
-    os._exit(0)  # threads that still talk to browsers would be waited for
