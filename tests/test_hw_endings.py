@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import socket
@@ -14,11 +15,14 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from emulated_devices import head_and_tracker, short_scan
+from emulated_devices import head_and_tracker, serving, short_scan
 
-from tactile_bayes.errors import DeviceError
+from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan_report, write_scan
+from tactile_bayes.files.scan_recording import create_exclusive
+from tactile_bayes.hardware.emulated import EmulatedTracker
+from tactile_bayes.hardware.emulator import PtyLink
 from tactile_bayes.hardware.live import LiveState
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.serve import LiveServer
@@ -199,3 +203,32 @@ def test_pages_that_do_not_read_are_cut_off():
     wait_until(lambda: not [one for one in server._server.handler_threads if one.is_alive()])
     for line in lines:
         line.close()
+
+
+def test_a_file_that_is_being_recorded_is_left_alone(tmp_path, run_cli):
+    path = tmp_path / "a.mcap"
+    write_scan(path, short_scan(0.1), provenance=Provenance("test", {}))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-50])  # a recording that has not ended
+    with path.open("rb") as recording:
+        fcntl.flock(recording, fcntl.LOCK_EX)
+        with pytest.raises(UsageError, match="is being recorded"):
+            create_exclusive(path, force=True)
+        done = run_cli("repair", "a.mcap", cwd=tmp_path)
+        assert done.returncode == 2
+        assert "a.mcap is being recorded; wait for its end" in done.stderr
+    assert path.read_bytes() == whole[:-50]
+    with create_exclusive(path, force=True) as stream, pytest.raises(UsageError, match="is being recorded"):
+        create_exclusive(path, force=True)
+    assert stream.closed
+    assert path.read_bytes() == b""
+
+
+def test_a_tracker_on_the_heads_port_is_told(tmp_path, run_cli):
+    write_scan(tmp_path / "scan.mcap", short_scan(0.1), provenance=Provenance("test", {}))
+    tracker = EmulatedTracker(short_scan(0.1).poses, protocol="open")
+    with serving(tracker, PtyLink()) as emulator:
+        url = emulator._link.url
+        done = run_cli("record", "-o", "a.mcap", "--head", url, "--like", "scan.mcap", cwd=tmp_path)
+    assert done.returncode == 4
+    assert done.stderr == f"error: head {url}: 'emulated tracker' is there, without taxels; give a head's port\n"

@@ -25,9 +25,12 @@ def command(*, scan: Path, output: Path | None, force: bool) -> None:
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+    from tactile_bayes.files.scan_recording import refuse_recording
 
     if output is not None:
         refuse_existing(output, force=force)
+    if output is None:
+        refuse_recording(scan)
     file = read_scan_report(scan)
     if file.complete and output is None:
         click.echo(f"{scan}: is whole, nothing to repair")

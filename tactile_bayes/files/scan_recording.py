@@ -7,6 +7,7 @@ device time of the frame or pose it belongs to; and, when the recording ended in
 
 from __future__ import annotations
 
+import fcntl
 import os
 import threading
 from collections.abc import Mapping
@@ -31,17 +32,45 @@ SYNC_S: Final = 0.5
 def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
     """Open a new file for its owner only; not a temporary one, because it must be there after a kill.
 
+    It is locked until it is closed: another recording, or `repair`, leaves it alone.
+
     Raises
     ------
     UsageError
-        When `path` exists and `force` is false, or cannot be made.
+        When `path` exists and `force` is false, cannot be made, or is being recorded.
     """
     refuse_existing(path, force=force)
-    flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if force else os.O_EXCL)
+    flags = os.O_WRONLY | os.O_CREAT | (0 if force else os.O_EXCL)
     try:
-        return os.fdopen(os.open(path, flags, 0o600), "wb")
+        stream = os.fdopen(os.open(path, flags, 0o600), "wb")
     except OSError as error:
         raise UsageError(f"{path} cannot be written ({error.strerror}); choose another place") from None
+    try:
+        _lock(stream, path)
+    except UsageError:
+        stream.close()
+        raise
+    stream.truncate(0)
+    return stream
+
+
+def refuse_recording(path: Path) -> None:
+    """Raise `UsageError` when a file is being recorded at this moment."""
+    try:
+        stream = path.open("rb")
+    except OSError:
+        return  # whoever reads it says what is wrong with it
+    with stream:
+        _lock(stream, path)
+
+
+def _lock(stream: IO[bytes], path: Path) -> None:
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"{path} is being recorded; wait for its end, or choose another name") from None
+    except OSError:
+        return  # some network file systems have no locks
 
 
 class _Syncer:
