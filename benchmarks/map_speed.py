@@ -31,7 +31,7 @@ from tactile_bayes.mapping.cells import CellSums
 from tactile_bayes.mapping.engine import Engine, NumpyEngine, compiled_engine, fast_is_installed
 from tactile_bayes.mapping.frames import chunks
 from tactile_bayes.mapping.poses import FramePoses
-from tactile_bayes.mapping.project import Projection, Projector
+from tactile_bayes.mapping.project import ProjectedTaxels, Projection, Projector
 from tactile_bayes.mapping.readout import Readout
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
@@ -79,9 +79,9 @@ class Frames:
             counts.reshape(frames, -1),
             self.calibration.gain_kpa_per_count.ravel(),
             self.calibration.offset_kpa.ravel(),
-            projection.turn,
+            np.ascontiguousarray(projection.turn),
             projection.shift - np.array([first[1], first[0]]),
-            projection.taxels_mm,
+            projection.taxels.place_mm,
             shape,
         )
 
@@ -106,7 +106,8 @@ def same_work(source: Frames, job: Job, engine: Engine) -> CellSums:
     """What the peers do, our way: levels, projection and scatter, with the frames' numbers prepared beforehand."""
     good = np.ones(source.head.shape, dtype=bool)
     readout, sums = Readout.of(source.calibration, good), CellSums(1.0)
-    projection = Projection(job.taxels, job.turn, job.shift, 1.0)
+    matrix = np.concatenate([job.turn, job.shift[:, :, None]], axis=2)
+    projection = Projection(ProjectedTaxels(job.taxels), matrix, 1.0)
     for part in chunks(len(job.counts), engine.chunk_frames(readout.size)):
         counts = job.counts[part]
         level, _ = engine.levels(readout, counts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,8 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
 from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.head_profile import LEAST_FRAMES, ProfileReader, profile_figures
+from tactile_bayes.mapping.frame_marks import NO_LIMIT, frame_marks, marks_limit
+from tactile_bayes.mapping.head_profile import LEAST_FRAMES, MOST_FRAMES, ProfileReader, profile_figures
 from tactile_bayes.mapping.poses import poses_at
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
@@ -27,6 +29,7 @@ from tactile_bayes.posterior.fat_depth import head_profile
 from tactile_bayes.posterior.fit import FitOptions
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.scan import Scan
 
 TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
 """By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""
@@ -111,38 +114,82 @@ def test_lumps_are_left_out_also_where_most_frames_feel_one() -> None:
         if i % 4:
             frame[5:9, 6:10] += 1.0
         rows.append(ProfileReader.of(good).read(frame[good][None], np.array([1.0])))
-    found = profile_figures(rows)
+    found = profile_figures(np.concatenate(rows))
     assert found["head_profile_frames"] == pytest.approx(100, abs=5)
     assert found["head_profile_y2"] == pytest.approx(0.1, abs=0.002)
     assert abs(np.concatenate(rows).mean(axis=0)[1] - 0.1) > 0.01
-    assert profile_figures(rows[::-1]) == found
-    assert profile_figures(rows[: LEAST_FRAMES - 1]) == {}
+    assert profile_figures(np.concatenate(rows[::-1])) == found
+    assert profile_figures(np.concatenate(rows[: LEAST_FRAMES - 1])) == {}
 
 
 def test_an_array_of_few_rows_has_no_profile() -> None:
-    reader = ProfileReader.of(np.ones((4, 26), dtype=bool))
-    assert reader.read(np.ones((3, 104)), np.ones(3)).shape == (0, 4)
+    rows = ProfileReader.of(np.ones((4, 26), dtype=bool)).read(np.ones((99, 104)), np.ones(99))
+    assert profile_figures(rows) == {}
 
 
-def test_frames_without_pressure_or_with_a_reading_that_carries_none_are_left_out() -> None:
-    good, valid = np.ones((16, 26), dtype=bool), np.ones((2, 416), dtype=bool)
-    valid[1, 7] = False
-    reader = ProfileReader.of(good)
-    assert len(reader.read(np.ones((2, 416)), np.ones(2), valid)) == 1
-    assert np.isfinite(reader.read(np.ones((2, 416)), np.array([0.0, 9.0]))).all()
+def spread_scan(frames: int) -> Scan:
+    """A scan without a lump, each frame with a level of its own."""
+    rng = np.random.default_rng(2)
+    centres = np.tile(scans.even_centres(), (frames // len(scans.even_centres()) + 1, 1))[:frames]
+    levels = rng.uniform(6.0, 12.0, frames)
+    plain = scans.make_scan(centres, field=lambda u, v: 1.0 + 1e-4 * (u * u + v), levels_kpa=levels)
+    rough = plain.frames.counts + rng.integers(0, 200, plain.frames.counts.shape).astype(np.uint16)
+    return scans.with_counts(plain, rough)
 
 
-def test_a_live_map_has_the_profile_of_the_whole_scan() -> None:
-    scan = scans.make_scan(np.tile(scans.even_centres(), (12, 1)), field=lambda u, v: 1.0 + 1e-4 * (u * u + v))
-    whole = build_map(scan)
-    live = MapAccumulator(MapGrid(whole.plane_from_base), Instrument(scan.head, scan.element_calibration))
+def grown(scan: Scan, like: TactileMap, portions: Iterable[np.ndarray]) -> MapAccumulator:
+    """A map that was given the frames in portions, a snapshot after each."""
+    found = MapAccumulator(MapGrid(like.plane_from_base), Instrument(scan.head, scan.element_calibration))
     poses = poses_at(scan.poses, scan.frames.time_s)
-    for i in range(len(scan.frames)):
-        live.add(scan.frames.counts[i : i + 1], poses.part(slice(i, i + 1)))
-    found = live.snapshot().quality
-    assert found["head_profile_frames"] == whole.quality["head_profile_frames"] >= LEAST_FRAMES
-    for name in HEAD_PROFILE:
-        assert found[name] == pytest.approx(whole.quality[name], abs=1e-12)
+    for portion in portions:
+        found.add(scan.frames.counts[portion], poses.part(portion))
+        found.snapshot()
+    return found
+
+
+def profile_of(quality: Mapping[str, float]) -> dict[str, float]:
+    return {name: value for name, value in quality.items() if name.startswith("head_profile")}
+
+
+def test_frames_with_a_reading_that_carries_no_pressure_are_left_out() -> None:
+    scan = spread_scan(200)
+    counts = scan.frames.counts.copy()
+    counts[::2, 3, 4] = 65535
+    half = scans.with_counts(scan, counts)
+    whole = build_map(scan)
+    by_hand = ProfileReader.of(np.ones((8, 8), dtype=bool)).read(
+        scan.pressure_kpa()[1::2].reshape(100, -1), scan.pressure_kpa()[1::2].mean(axis=(1, 2))
+    )
+    live = grown(half, whole, [np.arange(200)]).snapshot().quality
+    assert profile_of(live) == pytest.approx(profile_figures(by_hand), abs=1e-9)
+
+
+@pytest.mark.parametrize("frames", [240, MOST_FRAMES + 700])
+def test_a_live_map_has_the_profile_of_the_whole_scan(frames: int) -> None:
+    """To the bit, in any portions and any order, with all frames read and with a choice of them."""
+    scan = spread_scan(frames)
+    whole = build_map(scan)
+    expected = profile_of(whole.quality)
+    assert MOST_FRAMES >= expected["head_profile_frames"] >= LEAST_FRAMES
+    order = np.random.default_rng(3).permutation(frames)
+    for portions in ([np.arange(frames)], np.array_split(order, frames // 40)):
+        assert profile_of(grown(scan, whole, portions).snapshot().quality) == expected
+    one_by_one, *others = (grown(scan, whole, part) for part in (order[:90, None], [order[90:150]], [order[150:]]))
+    for other in others:
+        one_by_one.merge(other)
+    assert profile_of(one_by_one.snapshot().quality) == expected
+
+
+def test_the_marked_frames_are_a_random_choice() -> None:
+    """Shares of the levels' range and of the order are those of a simple random sample; equal levels go together."""
+    level = np.sort(np.random.default_rng(1).uniform(6.0, 12.0, 20_000))
+    marks = frame_marks(level)
+    chosen = np.flatnonzero(marks < marks_limit(marks, 2000))
+    assert len(chosen) == 2000
+    shares = np.bincount(chosen * 10 // len(level), minlength=10)
+    assert ((shares - 200) ** 2 / 180).sum() < 27.9  # chi-square of 9 degrees of freedom, 0.1 %
+    assert marks_limit(np.array([5, 7, 7, 9], dtype=np.uint64), 2) == 7
+    assert marks_limit(marks[:2000], 2000) == NO_LIMIT
 
 
 def test_a_map_without_lump_free_frames_has_no_profile() -> None:

@@ -13,7 +13,7 @@ from tactile_bayes.mapping.cells import CellSums
 from tactile_bayes.mapping.elements import TaxelFault
 from tactile_bayes.mapping.engine import Engine, NumpyEngine
 from tactile_bayes.mapping.frames import BoolArray, chunks, gate
-from tactile_bayes.mapping.head_profile import ProfileReader, profile_figures
+from tactile_bayes.mapping.head_profile import GrowingProfile
 from tactile_bayes.mapping.plane import HeadMoments, MomentSums, head_moments
 from tactile_bayes.mapping.poses import FramePoses
 from tactile_bayes.mapping.project import Projection, Projector
@@ -119,8 +119,8 @@ class MapAccumulator:
     instrument
         Head, calibration, gate and way to normalise.
     keep_frames
-        Keep counts and poses (0.9 kB a frame of 416 taxels), which `rebuild` needs. Without, memory grows
-        by 32 B a frame.
+        Keep counts and poses (0.9 kB a frame of 416 taxels), which `rebuild` needs. Without, memory grows with the
+        number of cells only.
     engine
         Which inner loops to use.
 
@@ -142,7 +142,7 @@ class MapAccumulator:
         self._moments, self._merged = MomentSums(instrument.head), HeadMoments.none()
         self._tally = dict.fromkeys(_TALLIES, 0)
         self._saturated = 0
-        self._profile_reader, self._profiles = ProfileReader.of(instrument.good), list[FloatArray]()
+        self._profile = GrowingProfile(instrument.good, instrument.readout)
         self._kept: list[tuple[CountArray, FramePoses]] | None = [] if keep_frames else None
 
     @property
@@ -201,8 +201,7 @@ class MapAccumulator:
         if number:
             taxels, array = len(instrument.readout.taxels), instrument.readout.size
             self._saturated += int(np.rint((taxels - share * array).sum()))
-            pressure, valid = instrument.readout.pressure_kpa(readings)
-            self._profiles.append(self._profile_reader.read(pressure, level, valid))
+            self._profile.add(readings, level, share)
             divisor = level if instrument.normalise == "mean" else np.ones(number)
             engine.add(self._sums, instrument.readout, readings, projection=projection, level=divisor)
         return used
@@ -234,7 +233,7 @@ class MapAccumulator:
         self._sums.merge(other._sums)
         self._merged = self._merged + other._all_moments()
         self._saturated += other._saturated
-        self._profiles += other._profiles
+        self._profile.merge(other._profile)
         for name in _TALLIES:
             self._tally[name] += other._tally[name]
         self._kept = None if self._kept is None or other._kept is None else self._kept + other._kept
@@ -291,6 +290,6 @@ class MapAccumulator:
             plane_from_base=self.grid.plane_from_base,
             background=None if instrument.normalise == "none" else 1.0,
             frame_count=self._tally["frames_used"],
-            quality=self.figures | profile_figures(self._profiles),
+            quality=self.figures | self._profile.figures(),
             masked_taxels=tuple(str(fault) for fault in instrument.faults),
         )

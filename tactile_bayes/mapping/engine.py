@@ -110,6 +110,7 @@ class LoopEngine:
         if not counts.size:
             return
         first, shape = projection.block()
+        place = projection.moved(-np.array(first[::-1], dtype=np.float64))
         cells = np.zeros((shape[0] * shape[1] + 1, 2), dtype=np.int64)
         clipped, negative = self._scatter(
             counts,
@@ -117,9 +118,8 @@ class LoopEngine:
             1.0 / VALUE_STEP / level,
             LIMIT_STEPS,
             readout.plain_count if _bounded(readout, level) else -1,
-            projection.taxels_mm,
-            projection.turn,
-            projection.shift - np.array([first[1], first[0]]),
+            place.taxels.place_mm,
+            place.matrix,
             np.int32(shape[1]),
             cells,
         )

@@ -11,14 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
+from numpy.typing import NDArray
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.frames import BoolArray, SelectedFrames
+from tactile_bayes.mapping.frame_marks import NO_LIMIT, frame_marks, marks_limit
+from tactile_bayes.mapping.frames import BoolArray, SelectedFrames, chunks
 from tactile_bayes.mapping.readout import Readout
 from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.scan import CountArray
 
-# Frames that are looked at, spread evenly over the scan.
+# Frames that are read, chosen by their marks; those of a scan of 10 s at 200 Hz are read all.
 MOST_FRAMES = 2048
+# Chosen frames that wait to be read: many at once cost less each, and most are overtaken by others before.
+_MOST_WAITING = 4096
+_CHUNK = 128
+# The figures are means of whole multiples of this.
+_STEP = 2.0**-32
 # A frame is called lump-free when what is left of it beside a smooth profile is within this factor of the smoothest
 # tenth's, and there must be this many of them.
 SMOOTH_FACTOR = 1.1
@@ -32,36 +40,129 @@ _COLUMNS = len(HEAD_PROFILE) + 1
 
 def head_profile_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     """The map's figures `HEAD_PROFILE`, and ``head_profile_frames``; none where too few frames are free of a lump."""
-    return profile_figures([_of_scan(part) for part in selections])
+    frames = [
+        np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels)) for part in selections
+    ]
+    marks = [frame_marks(part.level_kpa[chosen]) for part, chosen in zip(selections, frames, strict=True)]
+    limit = marks_limit(np.concatenate(marks), MOST_FRAMES)
+    read = [_read(part, each[mark < limit]) for part, each, mark in zip(selections, frames, marks, strict=True)]
+    return profile_figures(np.concatenate(read))
 
 
-def profile_figures(profiles: Sequence[FloatArray]) -> dict[str, float]:
-    """The figures from what `ProfileReader` read, in any portions and any order: the mean over the lump-free frames.
+def _whole(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> BoolArray:
+    """Which frames can be read: all good taxels valid, and a mean above 0."""
+    whole: BoolArray = (valid_share == np.count_nonzero(good) / good.size) & (level_kpa > 0)
+    return whole
 
-    A lump, or the edge of a rib, is no smooth profile: what is left of a frame tells it, also where most frames feel
-    one.
+
+def profile_figures(rows: FloatArray) -> dict[str, float]:
+    """The figures from the (f, 4) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
+
+    A lump, or the edge of a rib, is no smooth profile: the residual of a frame shows it, also where most frames feel
+    one. Rows of NaN are left out.
     """
-    rows = np.concatenate(profiles) if profiles else np.zeros((0, _COLUMNS))
     if len(rows) < LEAST_FRAMES:
         return {}
-    smooth = rows[rows[:, -1] <= SMOOTH_FACTOR * float(np.quantile(rows[:, -1], 0.1)), :-1]
+    smooth = rows[rows[:, -1] <= SMOOTH_FACTOR * _tenth(rows[:, -1]), :-1]
     if len(smooth) < LEAST_FRAMES:
         return {}
-    mean = np.sort(smooth, axis=0).mean(axis=0)  # sorted, so that the order of the frames leaves no trace
+    # Sums of whole steps have no rounding, so the order of the frames leaves no trace.
+    mean = np.rint(smooth / _STEP).sum(axis=0) * (_STEP / len(smooth))
     return {
         **{name: float(value) for name, value in zip(HEAD_PROFILE, mean, strict=True)},
         "head_profile_frames": float(len(smooth)),
     }
 
 
-def _of_scan(part: SelectedFrames) -> FloatArray:
-    frames = np.flatnonzero(part.used)
+def _tenth(values: FloatArray) -> float:
+    """The quantile 0.1 of two values or more, between neighbours linear."""
+    below, share = divmod(0.1 * (len(values) - 1), 1.0)
+    low, high = np.partition(values, (int(below), int(below) + 1))[int(below) : int(below) + 2]
+    return float(low + share * (high - low))
+
+
+def _read(part: SelectedFrames, frames: NDArray[np.intp]) -> FloatArray:
     if not len(frames):
         return np.zeros((0, _COLUMNS))
-    frames = frames[:: max(1, len(frames) // MOST_FRAMES)]
     readout = Readout.of(part.scan.element_calibration, part.good_taxels)
-    pressure, valid = readout.pressure_kpa(readout.counts(part.scan.frames.counts[frames]))
-    return ProfileReader.of(part.good_taxels).read(pressure, part.level_kpa[frames], valid)
+    counts = readout.counts(part.scan.frames.counts[frames])
+    return _rows(ProfileReader.of(part.good_taxels), readout, counts, part.level_kpa[frames])
+
+
+def _rows(reader: ProfileReader, readout: Readout, counts: CountArray, level_kpa: FloatArray) -> FloatArray:
+    """(f, 4) rows of (f, k) counts, in portions that stay in the processor's cache."""
+    rows = np.empty((len(counts), _COLUMNS))
+    for part in chunks(len(counts), _CHUNK):
+        rows[part] = reader.read(readout.pressure_kpa(counts[part])[0], level_kpa[part])
+    return rows
+
+
+class GrowingProfile:
+    """The profiles of at most `MOST_FRAMES` frames of a scan that grows, the same in any portions and any order.
+
+    Parameters
+    ----------
+    good : (rows, columns) bool array
+        Taxels that are used.
+    readout
+        How their counts become pressures.
+    """
+
+    def __init__(self, good: BoolArray, readout: Readout) -> None:
+        self._good, self._readout, self._reader = good, readout, ProfileReader.of(good)
+        self._limit = NO_LIMIT
+        self._marks, self._rows = np.zeros(0, dtype=np.uint64), np.zeros((0, _COLUMNS))
+        self._waiting: list[tuple[NDArray[np.uint64], CountArray, FloatArray]] = []
+        self._number_waiting = 0
+
+    def add(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
+        """Add frames.
+
+        Parameters
+        ----------
+        counts : (f, k) uint16 array
+            Of the used taxels.
+        level_kpa, valid_share : (f,) arrays
+            The frames' means, and the share of all taxels that is valid.
+        """
+        marks = frame_marks(level_kpa)
+        chosen = (marks < self._limit) & _whole(level_kpa, valid_share, self._good)
+        number = int(np.count_nonzero(chosen))
+        if not number:
+            return
+        self._waiting.append((marks[chosen], counts[chosen], level_kpa[chosen]))
+        self._number_waiting += number
+        if self._number_waiting > _MOST_WAITING:
+            self._read_waiting()
+
+    def merge(self, other: GrowingProfile) -> None:
+        """Add the frames that another one was given."""
+        self._read_waiting()
+        other._read_waiting()
+        self._limit = min(self._limit, other._limit)
+        self._keep(np.concatenate([self._marks, other._marks]), np.concatenate([self._rows, other._rows]))
+
+    def figures(self) -> dict[str, float]:
+        """See `profile_figures`."""
+        self._read_waiting()
+        return profile_figures(self._rows)
+
+    def _read_waiting(self) -> None:
+        """Read the waiting frames that are still among the chosen ones."""
+        if not self._waiting:
+            return
+        marks, counts, level = (np.concatenate(part) for part in zip(*self._waiting, strict=True))
+        self._waiting, self._number_waiting = [], 0
+        limit = min(self._limit, marks_limit(np.concatenate([self._marks, marks]), MOST_FRAMES))
+        last = marks < limit
+        rows = _rows(self._reader, self._readout, counts[last], level[last])
+        self._keep(np.concatenate([self._marks, marks[last]]), np.concatenate([self._rows, rows]))
+
+    def _keep(self, marks: NDArray[np.uint64], rows: FloatArray) -> None:
+        """Keep the rows of the chosen frames."""
+        self._limit = min(self._limit, marks_limit(marks, MOST_FRAMES))
+        kept = marks < self._limit
+        self._marks, self._rows = marks[kept], rows[kept]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +171,7 @@ class ProfileReader:
 
     Parameters
     ----------
-    solve : (taxels, 9) array
+    solve : (9, taxels) array
         Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares; no taxel where too
         few rows or columns have one to tell the polynomials apart.
     gram : (9, 9) array
@@ -87,36 +188,34 @@ class ProfileReader:
         terms = np.stack([np.outer(across[:, i], along[:, j])[good] for i, j in _ORDERS], axis=1)
         if min(np.count_nonzero(good.any(axis=1)), np.count_nonzero(good.any(axis=0))) <= _HIGHEST:
             terms = terms[:0]
-        return cls(np.ascontiguousarray(np.linalg.pinv(terms).T), terms.T @ terms)
+        return cls(np.ascontiguousarray(np.linalg.pinv(terms)), terms.T @ terms)
 
-    def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray, valid: BoolArray | None = None) -> FloatArray:
-        """Coefficients and what they leave of frames.
+    def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
+        """Coefficients and residuals of frames, each frame's to the same bits whatever is read with it.
 
         Parameters
         ----------
         pressure_kpa : (f, taxels) array
-            Of the good taxels.
+            Of the good taxels, all valid.
         level_kpa : (f,) array
-            The frames' means.
-        valid : (f, taxels) array
-            Which readings carry a pressure; None where all do. Frames with one that does not are left out.
+            The frames' means, above 0.
 
         Returns
         -------
-        (n, 4) array
-            `HEAD_PROFILE`, and the root mean square of what the nine terms leave.
+        (f, 4) array
+            `HEAD_PROFILE`, and the root mean square of the residual of the nine terms. NaN where the array has too few
+            rows or columns.
         """
-        if not len(self.solve):
-            return np.zeros((0, _COLUMNS))
-        whole = level_kpa > 0
-        if valid is not None:
-            whole &= valid.all(axis=1)
-        pressure_kpa, level_kpa = pressure_kpa[whole], level_kpa[whole]
-        found = pressure_kpa @ self.solve
-        # what is left by Pythagoras: the residual itself would cost as much as the map
-        square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,ij,fj->f", found, self.gram, found)
-        left = np.sqrt(np.maximum(square, 0.0) / len(self.solve))
-        return np.column_stack([found[:, : len(HEAD_PROFILE)], left]) / level_kpa[:, None]
+        if not self.solve.size:
+            return np.full((len(pressure_kpa), _COLUMNS), np.nan)
+        # One matrix times vector per frame: a product of all frames would be rounded by how many there are.
+        found = np.matmul(self.solve, pressure_kpa[:, :, None])[:, :, 0]
+        # The residual's square by Pythagoras: the residual itself would cost as much as the map.
+        fitted = np.matmul(self.gram, found[:, :, None])[:, :, 0]
+        square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,fi->f", found, fitted)
+        left = np.sqrt(np.maximum(square, 0.0) / self.solve.shape[1])
+        rows: FloatArray = np.column_stack([found[:, : len(HEAD_PROFILE)], left]) / level_kpa[:, None]
+        return rows
 
 
 def _legendre(taxels: int) -> FloatArray:

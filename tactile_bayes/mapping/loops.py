@@ -50,8 +50,7 @@ def scatter_loop(
     limit: _Any,
     plain: _Any,
     taxels: _Any,
-    turn: _Any,
-    shift: _Any,
+    matrix: _Any,
     columns: _Any,
     cells: _Any,
 ) -> tuple[int, int]:
@@ -67,7 +66,7 @@ def scatter_loop(
         Largest value in steps.
     plain
         Frames without a count above it are known to be valid, not negative and within the limit.
-    taxels, turn, shift
+    taxels, matrix
         See `tactile_bayes.mapping.project.Projection`; the shift is counted from the block's first cell.
     columns : int32
         Columns of the block.
@@ -79,9 +78,11 @@ def scatter_loop(
     nowhere, clipped, negative = np.uint32(cells.shape[0] - 1), 0, 0
     for f in range(counts.shape[0]):
         row = counts[f]
+        across, along = matrix[f, 0], matrix[f, 1]
         for k in range(counts.shape[1]):
-            u = turn[f, 0, 0] * taxels[0, k] + turn[f, 0, 1] * taxels[1, k] + turn[f, 0, 2] * taxels[2, k] + shift[f, 0]
-            v = turn[f, 1, 0] * taxels[0, k] + turn[f, 1, 1] * taxels[1, k] + turn[f, 1, 2] * taxels[2, k] + shift[f, 1]
+            x, y, z = taxels[0, k], taxels[1, k], taxels[2, k]
+            u = across[0] * x + across[1] * y + across[2] * z + across[3]
+            v = along[0] * x + along[1] * y + along[2] * z + along[3]
             index[k] = np.uint32(np.int32(v) * columns + np.int32(u))
         highest = row[0]
         for k in range(counts.shape[1]):

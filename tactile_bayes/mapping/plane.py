@@ -23,6 +23,7 @@ _CHUNK = 1024
 _FAR_STEPS = 2**26
 _FRAMES_AT_ONCE = 2**10
 _FARTHEST_STEPS = 2.0**52
+_STEPS = np.array([_POSITION_STEP, _AXIS_STEP, _AXIS_STEP, _SPREAD_STEP, _SPREAD_STEP, _SPREAD_STEP])[:, None]
 # Mean directions shorter than this (of 1) are no direction: the head was turned by over 90 degrees (SD).
 _LEAST_RESULTANT = 0.3
 
@@ -108,17 +109,17 @@ class MomentSums:
     def __init__(self, head: HeadGeometry) -> None:
         tracker_from_head = inverse(head.scanhead_from_tracker)
         taxels = apply(tracker_from_head, head.surface_mm.reshape(-1, 3))
-        self._middle = taxels.mean(axis=0)
-        self._covariance = (taxels - self._middle).T @ (taxels - self._middle) / len(taxels)
-        self._axes = np.ascontiguousarray(tracker_from_head[:3, [0, 2]].T)
+        middle = taxels.mean(axis=0)
+        covariance = (taxels - middle).T @ (taxels - middle) / len(taxels)
+        self._vectors = np.column_stack([middle, tracker_from_head[:3, [0, 2]], covariance])[:, :, None]
         self._whole = HeadMoments.none()
-        self._begin(np.zeros(3, dtype=np.int64))
+        self._begin(np.zeros((3, 1), dtype=np.int64))
 
     def _begin(self, reference: NDArray[np.int64]) -> None:
-        """Count positions from `reference` on."""
+        """Count positions from the (3, 1) `reference` on."""
         self._reference, self._count = reference, 0
-        self._first, self._product = np.zeros(3, dtype=np.int64), np.zeros((3, 3), dtype=np.int64)
-        self._spread, self._directions = np.zeros((3, 3), dtype=np.int64), np.zeros((2, 3), dtype=np.int64)
+        # Sums of the position, of the two axes and of the spread, a column each.
+        self._sums, self._product = np.zeros((3, 6), dtype=np.int64), np.zeros((3, 3), dtype=np.int64)
 
     def add(self, poses: FramePoses) -> None:
         """Add the frames of which the pose is known."""
@@ -129,37 +130,46 @@ class MomentSums:
             self._add(rotation[start : start + _CHUNK], position[start : start + _CHUNK])
 
     def _add(self, rotation: FloatArray, position: FloatArray) -> None:
-        centres = np.rint((position + _times(rotation, self._middle)) * (1.0 / _POSITION_STEP))
-        if max(float(centres.max()), -float(centres.min())) > _FARTHEST_STEPS:
+        # Term by term and not by matrix products: the bits of a frame do not hang on how many others there are.
+        # Frames along the last axis, along which numpy is fast.
+        r, vectors = np.ascontiguousarray(rotation.transpose(1, 2, 0)), self._vectors
+        turned = r[:, 0, None] * vectors[0]
+        turned += r[:, 1, None] * vectors[1]
+        turned += r[:, 2, None] * vectors[2]
+        values = turned.copy()
+        values[:, 0] += position.T
+        values[:, 3:] = turned[:, 3, None] * r[:, 0]
+        values[:, 3:] += turned[:, 4, None] * r[:, 1]
+        values[:, 3:] += turned[:, 5, None] * r[:, 2]
+        values *= 1.0 / _STEPS
+        np.rint(values, out=values)
+        farthest = float(np.abs(values[:, 0]).max())
+        if farthest > _FARTHEST_STEPS:
             raise BadDataError(
-                f"the head was {float(np.abs(centres).max()) * _POSITION_STEP:.3g} mm from the tracker's base",
+                f"the head was {farthest * _POSITION_STEP:.3g} mm from the tracker's base",
                 way_out="check the unit of the positions (mm)",
             )
-        steps = centres.astype(np.int64)
+        self._add_steps(values.astype(np.int64), rotation, position)
+
+    def _add_steps(self, steps: NDArray[np.int64], rotation: FloatArray, position: FloatArray) -> None:
+        """Add (3, 6, n) whole steps of as many poses."""
+        number = steps.shape[2]
         if not self._count:
-            self._begin(steps[0])
-        offset = steps - self._reference
-        if self._count + len(steps) > _FRAMES_AT_ONCE or int(np.abs(offset).max()) >= _FAR_STEPS:
+            self._begin(steps[:, 0, :1].copy())
+        if self._count + number > _FRAMES_AT_ONCE or self._far(steps):
             self._whole = self.moments()
-            self._begin(steps[0])
-            offset = steps - self._reference
-        if int(np.abs(offset).max()) >= _FAR_STEPS:
-            self._add_apart(rotation, position)
-            return
-        # Term by term and not by matrix products: the bits of a frame do not hang on how many others there are.
-        covariance, r = self._covariance, rotation
-        turned = r[:, :, 0, None] * covariance[0] + r[:, :, 1, None] * covariance[1] + r[:, :, 2, None] * covariance[2]
-        spread = turned[:, :, 0, None] * r[:, None, :, 0]
-        spread += turned[:, :, 1, None] * r[:, None, :, 1]
-        spread += turned[:, :, 2, None] * r[:, None, :, 2]
-        axes = r[:, None, :, 0] * self._axes[:, 0, None]
-        axes += r[:, None, :, 1] * self._axes[:, 1, None]
-        axes += r[:, None, :, 2] * self._axes[:, 2, None]
-        self._count += len(steps)
-        self._first += offset.sum(axis=0)
-        self._product += offset.T @ offset
-        self._spread += np.rint(spread * (1.0 / _SPREAD_STEP)).astype(np.int64).sum(axis=0)
-        self._directions += np.rint(axes * (1.0 / _AXIS_STEP)).astype(np.int64).sum(axis=0)
+            self._begin(steps[:, 0, :1].copy())
+            if self._far(steps):
+                self._add_apart(rotation, position)
+                return
+        steps[:, 0] -= self._reference
+        self._count += number
+        self._sums += steps.sum(axis=2)
+        self._product += steps[:, 0] @ steps[:, 0].T
+
+    def _far(self, steps: NDArray[np.int64]) -> bool:
+        """Whether a position lies so far from the reference that squares could overflow."""
+        return bool(np.abs(steps[:, 0] - self._reference).max() >= _FAR_STEPS)
 
     def _add_apart(self, rotation: FloatArray, position: FloatArray) -> None:
         """One by one: these lie too far apart to be counted from one place."""
@@ -168,14 +178,14 @@ class MomentSums:
 
     def moments(self) -> HeadMoments:
         """All so far, from the tracker's base."""
-        n, place, first, product = self._count, self._reference.tolist(), self._first.tolist(), self._product.tolist()
+        n, place, product = self._count, self._reference[:, 0].tolist(), self._product.tolist()
+        first, axes, spread = self._sums[:, 0].tolist(), self._sums[:, 1:3].T.tolist(), self._sums[:, 3:].tolist()
         position = [first[i] + n * place[i] for i in range(3)]
         outer = [
             [product[i][j] + first[i] * place[j] + place[i] * first[j] + n * place[i] * place[j] for j in range(3)]
             for i in range(3)
         ]
-        parts = (position, outer, self._spread.tolist(), self._directions.tolist())
-        now = HeadMoments(n, *(np.array(part, dtype=object) for part in parts))
+        now = HeadMoments(n, *(np.array(part, dtype=object) for part in (position, outer, spread, axes)))
         return self._whole + now if self._whole.count else now
 
 
@@ -184,12 +194,6 @@ def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
     sums = MomentSums(head)
     sums.add(poses)
     return sums.moments()
-
-
-def _times(rotation: FloatArray, vector: FloatArray) -> FloatArray:
-    """(n, 3) products of (n, 3, 3) rotations and one vector, term by term: any number of them has the same bits."""
-    product: FloatArray = rotation[:, :, 0] * vector[0] + rotation[:, :, 1] * vector[1] + rotation[:, :, 2] * vector[2]
-    return product
 
 
 def _whole(values: FloatArray) -> WholeArray:

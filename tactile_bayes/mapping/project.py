@@ -20,7 +20,32 @@ IntArray = NDArray[np.int64]
 _TURN_STEP = 2.0**-22
 _TAXEL_STEP_MM = 2.0**-15
 _SHIFT_STEP = 2.0**-30
+_MATRIX_STEPS = np.array([_TURN_STEP, _TURN_STEP, _TURN_STEP, _SHIFT_STEP])[:, None]
 _MOST_CELLS = 2**15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProjectedTaxels:
+    """The taxels of a head that are projected.
+
+    Parameters
+    ----------
+    place_mm : (3, k) array
+        Their centres in the tracker's axes, about their middle.
+    place_and_one : (4, k) array
+        The same over a row of ones, with which a shift is one more term of a product.
+    reach_mm : (4,) array
+        How far they reach from their middle along each axis, and 0.
+    """
+
+    place_mm: FloatArray
+    place_and_one: FloatArray = field(init=False)
+    reach_mm: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        ones = np.ones(self.place_mm.shape[1])
+        object.__setattr__(self, "place_and_one", np.vstack([self.place_mm, ones]))
+        object.__setattr__(self, "reach_mm", np.append(np.abs(self.place_mm).max(axis=1, initial=0.0), 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,34 +57,41 @@ class Projection:
 
     Parameters
     ----------
-    taxels_mm : (3, k) array
-        Taxel centres in the tracker's axes, about their middle.
-    turn : (n, 2, 3) array
-        First two rows of the rotation from the tracker to the plane, in cells a mm.
-    shift : (n, 2) array
-        Where the taxels' middle lies on the lattice, in cells; half a cell is added, so that cell k is centred on k.
+    taxels
+        What is projected.
+    matrix : (n, 2, 4) array
+        First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them where the taxels'
+        middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k.
     cell_mm
         Side of a cell.
-    extent_mm : (3,) array
-        How far the taxels reach from their middle along each axis; found from them when it is not given.
     """
 
-    taxels_mm: FloatArray
-    turn: FloatArray
-    shift: FloatArray
+    taxels: ProjectedTaxels
+    matrix: FloatArray
     cell_mm: float
-    extent_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    def __post_init__(self) -> None:
-        if not self.extent_mm.any():
-            object.__setattr__(self, "extent_mm", np.abs(self.taxels_mm).max(axis=1, initial=0.0))
 
     def __len__(self) -> int:
-        return len(self.turn)
+        return len(self.matrix)
+
+    @property
+    def turn(self) -> FloatArray:
+        """(n, 2, 3) rotations, in cells a mm."""
+        return self.matrix[:, :, :3]
+
+    @property
+    def shift(self) -> FloatArray:
+        """(n, 2) shifts, in cells."""
+        return self.matrix[:, :, 3]
 
     def part(self, frames: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Projection:
         """Some of the frames."""
-        return Projection(self.taxels_mm, self.turn[frames], self.shift[frames], self.cell_mm, self.extent_mm)
+        return Projection(self.taxels, self.matrix[frames], self.cell_mm)
+
+    def moved(self, cells: FloatArray) -> Projection:
+        """Each frame moved by (n, 2) cells, or all by (2,); whole multiples of the shifts' step."""
+        matrix = self.matrix.copy()
+        matrix[:, :, 3] += cells
+        return Projection(self.taxels, matrix, self.cell_mm)
 
     def block(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """First row and column, and shape, of a block of the lattice that holds every reading.
@@ -69,7 +101,8 @@ class Projection:
         BadDataError
             When the block would be so wide that cells could not be told exactly.
         """
-        reach = np.abs(self.turn) @ self.extent_mm
+        # Of two dimensions, for which numpy has a fast product.
+        reach = (np.abs(self.matrix).reshape(-1, 4) @ self.taxels.reach_mm).reshape(-1, 2)
         left, top = np.floor((self.shift - reach).min(axis=0)).tolist()
         right, bottom = np.floor((self.shift + reach).max(axis=0)).tolist()
         columns, rows = right - left + 1, bottom - top + 1
@@ -79,14 +112,16 @@ class Projection:
 
     def flat(self, first: tuple[int, int], shape: tuple[int, int]) -> IntArray:
         """(n, k) indices of the readings' cells in a block given by its first row and column and its shape."""
-        row = self._coordinate(1, first[0]).astype(np.int64)  # not negative inside the block: cutting off is floor
-        row *= shape[1]
-        row += self._coordinate(0, first[1]).astype(np.int64)
-        return row
+        # Not negative inside the block: cutting off is floor. Blocks have at most 2^30 cells, so 32 bits hold an index.
+        row = self._coordinate(1, first[0]).astype(np.int32)
+        row *= np.int32(shape[1])
+        row += self._coordinate(0, first[1]).astype(np.int32)
+        return row.astype(np.int64)
 
     def _coordinate(self, axis: int, first: int) -> FloatArray:
-        position: FloatArray = self.turn[:, axis] @ self.taxels_mm
-        position += (self.shift[:, axis] - first)[:, None]
+        rows = self.matrix[:, axis].copy()
+        rows[:, 3] -= first
+        position: FloatArray = rows @ self.taxels.place_and_one
         return position
 
 
@@ -108,31 +143,27 @@ class Projector:
         tracker_from_head = inverse(head.scanhead_from_tracker)
         self._middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
         centres = apply(tracker_from_head, head.surface_mm[taxels]) - self._middle
-        self._taxels = np.ascontiguousarray(_rounded(centres, _TAXEL_STEP_MM).T)
-        self._extent = np.abs(self._taxels).max(axis=1, initial=0.0)
+        steps = np.rint(centres * (1.0 / _TAXEL_STEP_MM)).T
+        self._taxels = ProjectedTaxels(np.ascontiguousarray(steps * _TAXEL_STEP_MM))
 
     def at(self, poses: FramePoses) -> Projection:
         """Projection of the frames at `poses` onto the cells of the plane."""
         # Term by term and not by matrix products: the bits of a frame do not hang on how many others there are.
-        rows, rotation, middle = self._rows, poses.rotation[:, None], self._middle
-        turn = rows[:, 0, None] * rotation[:, :, 0]
-        turn += rows[:, 1, None] * rotation[:, :, 1]
-        turn += rows[:, 2, None] * rotation[:, :, 2]
-        offset = (poses.position_mm - self._origin_mm)[:, :, None]  # first of all: bases may lie far away
-        shift = rows[:, 0] * offset[:, 0] + rows[:, 1] * offset[:, 1] + rows[:, 2] * offset[:, 2]
-        shift += turn[:, :, 0] * middle[0] + turn[:, :, 1] * middle[1] + turn[:, :, 2] * middle[2]
-        return Projection(
-            self._taxels,
-            _rounded(turn / self._cell_mm, _TURN_STEP),
-            _rounded(shift / self._cell_mm + 0.5, _SHIFT_STEP),
-            self._cell_mm,
-            self._extent,
-        )
-
-
-def _rounded(values: FloatArray, step: float) -> FloatArray:
-    whole: FloatArray = np.rint(values * (1.0 / step)) * step
-    return whole
+        # Frames along the last axis, along which numpy is fast.
+        rows, middle = self._rows[:, :, None, None], self._middle
+        pose = np.empty((3, 4, len(poses.rotation)))
+        pose[:, :3] = poses.rotation.transpose(1, 2, 0)
+        pose[:, 3] = (poses.position_mm - self._origin_mm).T  # first of all: bases may lie far away
+        matrix = rows[:, 0] * pose[0]
+        matrix += rows[:, 1] * pose[1]
+        matrix += rows[:, 2] * pose[2]
+        matrix[:, 3] += matrix[:, 0] * middle[0] + matrix[:, 1] * middle[1] + matrix[:, 2] * middle[2]
+        matrix /= self._cell_mm
+        matrix[:, 3] += 0.5
+        matrix *= 1.0 / _MATRIX_STEPS
+        np.rint(matrix, out=matrix)
+        matrix *= _MATRIX_STEPS
+        return Projection(self._taxels, np.ascontiguousarray(matrix.transpose(2, 0, 1)), self._cell_mm)
 
 
 def yaw_deg(head: HeadGeometry, rotation: FloatArray, *, plane_from_base: FloatArray) -> FloatArray:

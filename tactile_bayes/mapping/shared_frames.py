@@ -160,7 +160,7 @@ def _correlations(
 
 def _distances(source: Source) -> FloatArray:
     """(k, k) distances between the taxels that are read, mm."""
-    place = source.projection.taxels_mm
+    place = source.projection.taxels.place_mm
     square = sum((axis[:, None] - axis[None, :]) ** 2 for axis in place)
     distance: FloatArray = np.sqrt(square)
     return distance

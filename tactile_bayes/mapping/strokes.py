@@ -162,7 +162,7 @@ def _stroke_map(
 
 def _shifted(projection: Projection, by_mm: FloatArray) -> Projection:
     whole = np.rint(by_mm / projection.cell_mm * 2.0**30) / 2.0**30  # on the grid that keeps cells exact
-    return Projection(projection.taxels_mm, projection.turn, projection.shift + whole, projection.cell_mm)
+    return projection.moved(whole)
 
 
 def _moved(source: Source, strokes: list[StrokeShift]) -> Source:

@@ -1,0 +1,47 @@
+"""A random choice of frames, the same live, at once, in shards and in any order: by a hash of each frame's level.
+
+A statistic that needs no more than some thousand frames is taken from those with the smallest marks. The choice depends
+on the set of frames alone, and shards agree on it without knowing each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.geometry import FloatArray
+
+NO_LIMIT = np.uint64(2**64 - 1)
+
+
+def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
+    """A frame's mark: its level's bits, mixed until they look random.
+
+    Parameters
+    ----------
+    level_kpa : (f,) array
+        Exact means, the same to the bit whatever computes them (see `tactile_bayes.mapping.readout`).
+
+    Returns
+    -------
+    (f,) uint64 array; equal levels have equal marks.
+
+    Notes
+    -----
+    The mixing function of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number generators).
+    """
+    mark = np.ascontiguousarray(level_kpa).view(np.uint64)
+    mark = (mark ^ (mark >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mark = (mark ^ (mark >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return mark ^ (mark >> np.uint64(31))
+
+
+def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
+    """The limit under which at most `most` marks lie: the next one's, so that equal marks are chosen together or not.
+
+    The limit of a set can be found from the marks under the limits of its parts and those limits, of which the least
+    counts.
+    """
+    if len(marks) <= most:
+        return NO_LIMIT
+    return np.uint64(np.partition(marks, most)[most])
