@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.last import Comparison
 from benchmarks.map_peers import BINCOUNT_FRAMES, BOOST, BOOST_FRAMES, Job, bincount
 from tactile_bayes.forward.scene import Head, Scene, Strokes
 from tactile_bayes.forward.simulate import head_positions
@@ -188,37 +189,52 @@ def live_steps(seconds: float, engine: Engine, *, every: int) -> dict[str, Float
     return {"wall": 1e6 * steps[:, 0], "work": 1e6 * steps[:, 1]}
 
 
-def _live_report(seconds: float, name: str, engine: Engine, *, every: int) -> dict[str, Any]:
+def _bincount_us(frames: int = 1400) -> float:
+    """Microseconds a frame of the peer: what a live step is compared with."""
+    job = Frames().job(frames)
+    least = cpu_s({str(size): lambda n=size: bincount(job, frames=n) for size in BINCOUNT_FRAMES}, runs=9)
+    return 1e6 * min(least.values()) / frames
+
+
+def _live_report(seconds: float, name: str, engine: Engine, *, every: int, last: Comparison) -> dict[str, Any]:
     rows: dict[str, Any] = {}
+    peer_us = _bincount_us()
     for busy in (0, 2):
-        beside = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+        others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
         try:
             steps = live_steps(seconds, engine, every=every)
         finally:
-            for process in beside:
+            for process in others:
                 process.kill()
                 process.wait()
         for kind, values in steps.items():
             p50, p99 = np.percentile(values, [50, 99])
             rows[f"{name}, {busy} busy processes beside it, {kind}"] = {"p50_us": round(p50), "p99_us": round(p99)}
-            print(f"{name}, {busy} busy beside it, {kind:<5} p50 {p50:6.0f} us   p99 {p99:6.0f} us", flush=True)
+            beside = f"{name}, {busy} busy beside it, {kind:<5}"
+            text = ""
+            if kind == "work" and not busy:
+                ratio = float(p50) / peer_us
+                text = f"   p50 {ratio:.1f} x a frame of bincount {last.add(f'live p50, {name}, over bincount', ratio)}"
+            print(f"{beside} p50 {p50:6.0f} us   p99 {p99:6.0f} us{text}", flush=True)
     return rows
 
 
-def _compare(minutes: Sequence[float], *, runs: int) -> dict[str, Any]:
+def _compare(minutes: Sequence[float], *, runs: int, last: Comparison) -> dict[str, Any]:
     rows = {}
     for length in minutes:
         times = against_peers(int(length * 60 * RATE_HZ), runs=runs if length < 5 else max(2, runs // 3))
         boost = min((value for name, value in times.items() if name.startswith("boost")), default=float("nan"))
         print(f"{length:g} min of {RATE_HZ} Hz frames")
         for name, value in times.items():
-            against = f"{value / times['bincount']:.2f} x bincount, {value / boost:.2f} x boost-histogram"
+            ratio = value / times["bincount"]
+            before = last.add(f"{name}, {length:g} min", ratio)
+            against = f"{ratio:.2f} x bincount {before}, {value / boost:.2f} x boost-histogram".replace(" ,", ",")
             print(f"  {name:<36}{value:8.3f} s CPU   {against}", flush=True)
         rows[f"{length:g} min"] = {name: round(value, 4) for name, value in times.items()}
     return rows
 
 
-def _growth(minutes: Sequence[float], name: str) -> dict[str, Any]:
+def _growth(minutes: Sequence[float], name: str, *, last: Comparison) -> dict[str, Any]:
     """Each length in a process of its own, so that its peak memory is its own."""
     rows = {}
     for length in minutes:
@@ -228,6 +244,10 @@ def _growth(minutes: Sequence[float], name: str) -> dict[str, Any]:
         each_us = 1e6 * cpu / (length * 60 * RATE_HZ)
         print(f"  {name:<6}{length:6g} min{cpu:9.3f} s CPU{each_us:7.2f} us a frame{peak:7.0f} MB", flush=True)
         rows[f"{length:g} min"] = {"cpu_s": round(cpu, 3), "peak_mb": round(peak, 1)}
+    if len(minutes) > 1:
+        longest, shortest = (rows[f"{length:g} min"]["peak_mb"] for length in (max(minutes), min(minutes)))
+        before = last.add(f"{name} peak memory, {max(minutes):g} over {min(minutes):g} min", longest / shortest)
+        print(f"  {name:<6} peak memory of the longest over the shortest {longest / shortest:.2f} {before}", flush=True)
     return rows
 
 
@@ -238,6 +258,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--growth", type=float, nargs="*", default=[1, 10, 30, 120], help="lengths streamed")
     parser.add_argument("--live-s", type=float, default=60.0, help="length of the live run")
     parser.add_argument("--runs", type=int, default=9)
+    parser.add_argument("--keep", action="store_true", help="keep these ratios: later runs are compared with them")
     parser.add_argument("--json", type=Path, metavar="OUT")
     parser.add_argument("--stream", type=float, help=argparse.SUPPRESS)
     parser.add_argument("--engine", choices=("numpy", "fast"), default="numpy", help=argparse.SUPPRESS)
@@ -248,13 +269,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(streamed(options.stream, engine)))
         return 0
     document = {"schema": "tactile-bayes/benchmarks-map/1", "load": os.getloadavg()[0]}
+    last = Comparison("map")
     print(f"load average {document['load']:.2f} on {os.cpu_count()} cores")
-    document["peers"] = _compare(options.minutes, runs=options.runs)
+    document["peers"] = _compare(options.minutes, runs=options.runs, last=last)
     print("cost against length")
     names = ["numpy", *(["fast"] if fast_is_installed() else [])]
-    document["growth"] = {name: _growth(options.growth, name) for name in names}
+    document["growth"] = {name: _growth(options.growth, name, last=last) for name in names}
     print("live step: one frame added, the plane, a snapshot every 8th frame (25 Hz)")
-    document["live"] = _live_report(options.live_s, "numpy", NumpyEngine(), every=8)
+    document["live"] = _live_report(options.live_s, "numpy", NumpyEngine(), every=8, last=last)
+    print(last.report())
+    if options.keep:
+        last.keep()
     if options.json:
         options.json.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return 0

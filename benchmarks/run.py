@@ -1,4 +1,4 @@
-"""Measure the commands against their peers: ``python -m benchmarks.run [--only NAME] [--json OUT]``."""
+"""Measure the commands against their peers, and the ratios against the last kept ones: ``python -m benchmarks.run``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cold_start import CASES, PEERS, Case
+from benchmarks.last import LAST, Comparison
 from benchmarks.measure import CommandFailedError, Cost, measure, run_once
 
 SCHEMA = "tactile-bayes/benchmarks/1"
@@ -21,6 +22,7 @@ SCHEMA = "tactile-bayes/benchmarks/1"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a table, write JSON when asked; 1 when a command failed."""
     options = _parse(arguments)
+    last = Comparison("commands", options.last)
     chosen = [case for case in CASES if not options.only or case.name in options.only]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -29,7 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{'what':<20}{'CPU s':>8}{'MB':>7}  over its peer")
         for peer, cost in peers.items():
             print(f"{peer:<20}{cost.cpu_s:>8.3f}{cost.peak_mb:>7.0f}")
-        rows = [_row(case, peers[case.peer], folder=folder, runs=options.runs) for case in chosen]
+        rows = [_row(case, peers[case.peer], folder=folder, runs=options.runs, last=last) for case in chosen]
+    print(last.report())
+    if options.keep:
+        last.keep()
     if options.json:
         document = {
             "schema": SCHEMA,
@@ -47,6 +52,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     names = [case.name for case in CASES]
     parser.add_argument("--only", action="append", choices=names, help="measure this case; may be repeated")
     parser.add_argument("--runs", type=int, default=5, help="runs a case after one to warm up (5)")
+    parser.add_argument("--keep", action="store_true", help="keep these ratios: later runs are compared with them")
+    parser.add_argument("--last", type=Path, default=LAST, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures as JSON")
     options = parser.parse_args(arguments)
     if options.runs < 1:
@@ -54,7 +61,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def _row(case: Case, peer: Cost, *, folder: Path, runs: int) -> dict[str, Any]:
+def _row(case: Case, peer: Cost, *, folder: Path, runs: int, last: Comparison) -> dict[str, Any]:
     """Measure one case and print its line."""
     row: dict[str, Any] = {"name": case.name, "words": _public(case), "peer": case.peer}
     try:
@@ -64,7 +71,8 @@ def _row(case: Case, peer: Cost, *, folder: Path, runs: int) -> dict[str, Any]:
         print(f"{case.name:<20} {error}")
         return row | {"error": str(error)}
     cpu, memory = cost.cpu_s / peer.cpu_s, cost.peak_mb / peer.peak_mb
-    text = f"{cpu:.2f} x CPU, {memory:.2f} x memory of {case.peer}"
+    before = last.add(f"{case.name}, CPU", cpu), last.add(f"{case.name}, memory", memory)
+    text = f"{cpu:.2f} x CPU {before[0]}, {memory:.2f} x memory {before[1]} of {case.peer}".replace(" ,", ",")
     print(f"{case.name:<20}{cost.cpu_s:>8.3f}{cost.peak_mb:>7.0f}  {text}", flush=True)
     return row | {
         "cpu_s": round(cost.cpu_s, 4),

@@ -6,6 +6,8 @@ Frames: `base` (tracker, paper O), `scanhead` (paper S), `plane` (paper P), `pat
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -137,14 +139,14 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         zero or along the normal.
     """
     variances, axes = np.linalg.eigh(covariance_mm2)
-    spread = np.sqrt(np.maximum(variances, 0.0))[::-1]
-    if not spread[1] > 0.05 * spread[0] or not spread[1] > 1e-9:
+    shortest, middle, longest = (math.sqrt(max(variance, 0.0)) for variance in variances.tolist())
+    if not middle > 0.05 * longest or not middle > 1e-9:
         raise BadDataError(
-            f"the taxel centres lie on a line (spread {spread[0]:.3g} by {spread[1]:.3g} mm)",
+            f"the taxel centres lie on a line (spread {longest:.3g} by {middle:.3g} mm)",
             way_out="scan with strokes side by side",
         )
     normal = axes[:, 0]
-    agreement = float(normal @ head_z) / max(float(np.sqrt(head_z @ head_z)), 1e-300)
+    agreement = float(normal @ head_z) / max(math.sqrt(head_z @ head_z), 1e-300)
     if abs(agreement) < 0.9:
         angle = np.degrees(np.arccos(abs(agreement)))
         raise BadDataError(
@@ -153,16 +155,17 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         )
     normal = normal if agreement > 0 else -normal
     x_axis = head_x - (head_x @ normal) * normal
-    length, of = float(np.sqrt(x_axis @ x_axis)), float(np.sqrt(head_x @ head_x))
+    length, of = math.sqrt(x_axis @ x_axis), math.sqrt(head_x @ head_x)
     if not length > 0.1 * of:
         raise BadDataError(
             f"the head's x axis has no direction on the plane (length {length:.2g} of {of:.2g})",
             way_out="check scanhead_from_tracker, and keep the head's direction while scanning",
         )
-    x, n = x_axis / length, normal
-    y = np.array([n[1] * x[2] - n[2] * x[1], n[2] * x[0] - n[0] * x[2], n[0] * x[1] - n[1] * x[0]])  # n cross x
+    x, n = (x_axis / length).tolist(), normal.tolist()
+    y = [n[1] * x[2] - n[2] * x[1], n[2] * x[0] - n[0] * x[2], n[0] * x[1] - n[1] * x[0]]  # n cross x
     rotation = np.array([x, y, n])
-    return Plane(rigid(rotation, -rotation @ centroid_mm), float(spread[2]), spread)
+    spread_mm = np.array([longest, middle, shortest])
+    return Plane(rigid(rotation, -rotation @ centroid_mm), shortest, spread_mm)
 
 
 def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:

@@ -184,9 +184,14 @@ class MapAccumulator:
     def _add(self, counts: CountArray, poses: FramePoses) -> int:
         """A portion: projected and counted as a whole, read in chunks that suit the engine."""
         readout, projection = self.instrument.readout, self._projector.at(poses)
-        used = np.zeros(len(counts), dtype=bool)
-        for part in chunks(len(counts), self._engine.chunk_frames(readout.size)):
-            used[part] = self._read(readout.counts(counts[part]), poses.known[part], projection.part(part))
+        size = self._engine.chunk_frames(readout.size)
+        if len(counts) <= size:
+            used = self._read(readout.counts(counts), poses.known, projection)
+        else:
+            parts = chunks(len(counts), size)
+            used = np.concatenate(
+                [self._read(readout.counts(counts[p]), poses.known[p], projection.part(p)) for p in parts]
+            )
         self._moments.add(FramePoses(poses.position_mm, poses.rotation, used))
         return int(np.count_nonzero(used))
 
@@ -200,7 +205,7 @@ class MapAccumulator:
             readings, projection, level, share = readings[used], projection.part(used), level[used], share[used]
         if number:
             taxels, array = len(instrument.readout.taxels), instrument.readout.size
-            self._saturated += int(np.rint((taxels - share * array).sum()))
+            self._saturated += round(number * taxels - float(share.sum()) * array)
             self._profile.add(readings, level, share)
             divisor = level if instrument.normalise == "mean" else np.ones(number)
             engine.add(self._sums, instrument.readout, readings, projection=projection, level=divisor)

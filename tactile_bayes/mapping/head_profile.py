@@ -125,8 +125,17 @@ class GrowingProfile:
         level_kpa, valid_share : (f,) arrays
             The frames' means, and the share of all taxels that is valid.
         """
+        if not self._reader.solve.size:
+            return
         marks = frame_marks(level_kpa)
-        chosen = (marks < self._limit) & _whole(level_kpa, valid_share, self._good)
+        if len(marks) >= MOST_FRAMES:  # so many that not all of them need be copied
+            whole = marks[_whole(level_kpa, valid_share, self._good)]
+            others = [waiting for waiting, _, _ in self._waiting]
+            limit = marks_limit(np.concatenate([self._marks, *others, whole]), MOST_FRAMES)
+            self._limit = min(self._limit, limit)
+        chosen = marks < self._limit
+        if chosen.any():
+            chosen &= _whole(level_kpa, valid_share, self._good)
         number = int(np.count_nonzero(chosen))
         if not number:
             return
@@ -139,8 +148,10 @@ class GrowingProfile:
         """Add the frames that another one was given."""
         self._read_waiting()
         other._read_waiting()
-        self._limit = min(self._limit, other._limit)
-        self._keep(np.concatenate([self._marks, other._marks]), np.concatenate([self._rows, other._rows]))
+        limit = marks_limit(np.concatenate([self._marks, other._marks]), MOST_FRAMES)
+        self._limit = min(self._limit, other._limit, limit)
+        chosen = other._marks < self._limit
+        self._keep(other._marks[chosen], other._rows[chosen])
 
     def figures(self) -> dict[str, float]:
         """See `profile_figures`."""
@@ -153,16 +164,15 @@ class GrowingProfile:
             return
         marks, counts, level = (np.concatenate(part) for part in zip(*self._waiting, strict=True))
         self._waiting, self._number_waiting = [], 0
-        limit = min(self._limit, marks_limit(np.concatenate([self._marks, marks]), MOST_FRAMES))
-        last = marks < limit
-        rows = _rows(self._reader, self._readout, counts[last], level[last])
-        self._keep(np.concatenate([self._marks, marks[last]]), np.concatenate([self._rows, rows]))
+        self._limit = min(self._limit, marks_limit(np.concatenate([self._marks, marks]), MOST_FRAMES))
+        chosen = marks < self._limit
+        self._keep(marks[chosen], _rows(self._reader, self._readout, counts[chosen], level[chosen]))
 
     def _keep(self, marks: NDArray[np.uint64], rows: FloatArray) -> None:
-        """Keep the rows of the chosen frames."""
-        self._limit = min(self._limit, marks_limit(marks, MOST_FRAMES))
-        kept = marks < self._limit
-        self._marks, self._rows = marks[kept], rows[kept]
+        """Keep these rows, and those from before that are still under the limit."""
+        kept = self._marks < self._limit
+        self._marks = np.concatenate([self._marks[kept], marks])
+        self._rows = np.concatenate([self._rows[kept], rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import add
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Plane, apply, fit_plane, inverse
@@ -18,17 +19,18 @@ from tactile_bayes.scan import HeadGeometry
 _POSITION_STEP = 2.0**-16
 _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
-_CHUNK = 1024
+_STEPS = np.repeat([_POSITION_STEP, _SPREAD_STEP, _AXIS_STEP], [3, 9, 6])[:, None]
 # Steps from one place up to 2^26 (1 m), and 2^10 frames: squares stay below 2^62. Beyond 2^52 steps floats have gaps.
 _FAR_STEPS = 2**26
 _FRAMES_AT_ONCE = 2**10
 _FARTHEST_STEPS = 2.0**52
-_STEPS = np.array([_POSITION_STEP, _AXIS_STEP, _AXIS_STEP, _SPREAD_STEP, _SPREAD_STEP, _SPREAD_STEP])[:, None]
+# Fewer frames are quicker as plain numbers.
+_FEW_FRAMES = 8
 # Mean directions shorter than this (of 1) are no direction: the head was turned by over 90 degrees (SD).
 _LEAST_RESULTANT = 0.3
 
-# Arrays of Python's integers, which never overflow.
-WholeArray = NDArray[Any]
+# Python's integers, which never overflow.
+Whole = tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,35 +41,35 @@ class HeadMoments:
     ----------
     count
         Frames.
-    position : (3,) whole numbers
+    position : 3 whole numbers
         Sum over frames of the mean taxel centre in `base`.
-    product : (3, 3) whole numbers
+    product : 3 x 3 whole numbers, row by row
         Sum of its outer products.
-    spread : (3, 3) whole numbers
+    spread : 3 x 3 whole numbers, row by row
         Sum of the covariance of the taxels about their mean.
-    axes : (2, 3) whole numbers
+    axes : 2 x 3 whole numbers, row by row
         Sums of the head's x axis and of its normal.
     """
 
     count: int
-    position: WholeArray
-    product: WholeArray
-    spread: WholeArray
-    axes: WholeArray
+    position: Whole
+    product: Whole
+    spread: Whole
+    axes: Whole
 
     def __add__(self, other: HeadMoments) -> HeadMoments:
         return HeadMoments(
             self.count + other.count,
-            self.position + other.position,
-            self.product + other.product,
-            self.spread + other.spread,
-            self.axes + other.axes,
+            _sum(self.position, other.position),
+            _sum(self.product, other.product),
+            _sum(self.spread, other.spread),
+            _sum(self.axes, other.axes),
         )
 
     @classmethod
     def none(cls) -> HeadMoments:
         """The moments of no frame."""
-        return cls(0, _whole(np.zeros(3)), _whole(np.zeros((3, 3))), _whole(np.zeros((3, 3))), _whole(np.zeros((2, 3))))
+        return cls(0, (0,) * 3, (0,) * 9, (0,) * 9, (0,) * 6)
 
     def plane(self) -> Plane:
         """Best-fit plane of the taxel centres.
@@ -78,11 +80,11 @@ class HeadMoments:
             When the head was turned all round, so that its x axis has no mean direction; or see
             `tactile_bayes.geometry.fit_plane`.
         """
-        n, position, product = self.count, self.position.tolist(), self.product.tolist()
+        n, x = self.count, self.position
         # In Python's integers up to the last division: positions far from the base lose nothing.
-        between = [[(n * product[i][j] - position[i] * position[j]) / (n * n) for j in range(3)] for i in range(3)]
-        spread = [[value / n for value in row] for row in self.spread.tolist()]
-        head_x, head_z = np.array([[value / n for value in row] for row in self.axes.tolist()]) * _AXIS_STEP
+        between = [(n * product - x[k // 3] * x[k % 3]) / (n * n) for k, product in enumerate(self.product)]
+        spread = np.array([value / n for value in self.spread])
+        head_x, head_z = np.array([value / n for value in self.axes]).reshape(2, 3) * _AXIS_STEP
         resultant = float(np.sqrt(head_x @ head_x))
         if not resultant > _LEAST_RESULTANT:
             raise BadDataError(
@@ -90,15 +92,15 @@ class HeadMoments:
                 way_out="keep its direction while scanning; map parts with one direction apart",
             )
         return fit_plane(
-            np.array([value / n for value in position]) * _POSITION_STEP,
-            np.array(between) * _POSITION_STEP**2 + np.array(spread) * _SPREAD_STEP,
+            np.array([value / n for value in x]) * _POSITION_STEP,
+            (np.array(between) * _POSITION_STEP**2 + spread * _SPREAD_STEP).reshape(3, 3),
             head_x=head_x,
             head_z=head_z,
         )
 
 
 class MomentSums:
-    """Moments of one head that grow frame by frame, in 64-bit numbers for as long as they cannot overflow.
+    """Moments of one head that grow frame by frame.
 
     Parameters
     ----------
@@ -111,82 +113,88 @@ class MomentSums:
         taxels = apply(tracker_from_head, head.surface_mm.reshape(-1, 3))
         middle = taxels.mean(axis=0)
         covariance = (taxels - middle).T @ (taxels - middle) / len(taxels)
-        self._vectors = np.column_stack([middle, tracker_from_head[:3, [0, 2]], covariance])[:, :, None]
-        self._whole = HeadMoments.none()
-        self._begin(np.zeros((3, 1), dtype=np.int64))
-
-    def _begin(self, reference: NDArray[np.int64]) -> None:
-        """Count positions from the (3, 1) `reference` on."""
-        self._reference, self._count = reference, 0
-        # Sums of the position, of the two axes and of the spread, a column each.
-        self._sums, self._product = np.zeros((3, 6), dtype=np.int64), np.zeros((3, 3), dtype=np.int64)
+        self._middle, self._covariance = middle.tolist(), covariance.tolist()
+        self._axes = tracker_from_head[:3, [0, 2]].T.tolist()
+        self._sums = HeadMoments.none()
 
     def add(self, poses: FramePoses) -> None:
-        """Add the frames of which the pose is known."""
+        """Add the frames of which the pose is known.
+
+        Raises
+        ------
+        BadDataError
+            When the head was so far from the tracker's base that steps would have gaps.
+        """
         rotation, position = poses.rotation, poses.position_mm
         if not poses.known.all():
             rotation, position = rotation[poses.known], position[poses.known]
-        for start in range(0, len(rotation), _CHUNK):
-            self._add(rotation[start : start + _CHUNK], position[start : start + _CHUNK])
-
-    def _add(self, rotation: FloatArray, position: FloatArray) -> None:
-        # Term by term and not by matrix products: the bits of a frame do not hang on how many others there are.
-        # Frames along the last axis, along which numpy is fast.
-        r, vectors = np.ascontiguousarray(rotation.transpose(1, 2, 0)), self._vectors
-        turned = r[:, 0, None] * vectors[0]
-        turned += r[:, 1, None] * vectors[1]
-        turned += r[:, 2, None] * vectors[2]
-        values = turned.copy()
-        values[:, 0] += position.T
-        values[:, 3:] = turned[:, 3, None] * r[:, 0]
-        values[:, 3:] += turned[:, 4, None] * r[:, 1]
-        values[:, 3:] += turned[:, 5, None] * r[:, 2]
-        values *= 1.0 / _STEPS
-        np.rint(values, out=values)
-        farthest = float(np.abs(values[:, 0]).max())
-        if farthest > _FARTHEST_STEPS:
-            raise BadDataError(
-                f"the head was {farthest * _POSITION_STEP:.3g} mm from the tracker's base",
-                way_out="check the unit of the positions (mm)",
-            )
-        self._add_steps(values.astype(np.int64), rotation, position)
-
-    def _add_steps(self, steps: NDArray[np.int64], rotation: FloatArray, position: FloatArray) -> None:
-        """Add (3, 6, n) whole steps of as many poses."""
-        number = steps.shape[2]
-        if not self._count:
-            self._begin(steps[:, 0, :1].copy())
-        if self._count + number > _FRAMES_AT_ONCE or self._far(steps):
-            self._whole = self.moments()
-            self._begin(steps[:, 0, :1].copy())
-            if self._far(steps):
-                self._add_apart(rotation, position)
-                return
-        steps[:, 0] -= self._reference
-        self._count += number
-        self._sums += steps.sum(axis=2)
-        self._product += steps[:, 0] @ steps[:, 0].T
-
-    def _far(self, steps: NDArray[np.int64]) -> bool:
-        """Whether a position lies so far from the reference that squares could overflow."""
-        return bool(np.abs(steps[:, 0] - self._reference).max() >= _FAR_STEPS)
-
-    def _add_apart(self, rotation: FloatArray, position: FloatArray) -> None:
-        """One by one: these lie too far apart to be counted from one place."""
-        for one in range(len(rotation)):
-            self._add(rotation[one : one + 1], position[one : one + 1])
+        for start in range(0, len(rotation), _FRAMES_AT_ONCE):
+            part = slice(start, start + _FRAMES_AT_ONCE)
+            self._sums += self._of(rotation[part], position[part])
 
     def moments(self) -> HeadMoments:
         """All so far, from the tracker's base."""
-        n, place, product = self._count, self._reference[:, 0].tolist(), self._product.tolist()
-        first, axes, spread = self._sums[:, 0].tolist(), self._sums[:, 1:3].T.tolist(), self._sums[:, 3:].tolist()
-        position = [first[i] + n * place[i] for i in range(3)]
-        outer = [
-            [product[i][j] + first[i] * place[j] + place[i] * first[j] + n * place[i] * place[j] for j in range(3)]
+        return self._sums
+
+    def _of(self, rotation: FloatArray, position: FloatArray) -> HeadMoments:
+        if len(rotation) < _FEW_FRAMES:
+            return self._one_by_one(rotation, position)
+        steps = np.array(self._values(rotation.transpose(1, 2, 0).copy(), position.T.copy()))
+        steps *= 1.0 / _STEPS
+        np.rint(steps, out=steps)
+        _refuse_far(float(np.abs(steps[:3]).max()))
+        whole = steps.astype(np.int64)
+        reference = whole[:3, :1].copy()
+        whole[:3] -= reference
+        if np.abs(whole[:3]).max() >= _FAR_STEPS:
+            return self._one_by_one(rotation, position)
+        n, place, sums = len(rotation), reference[:, 0].tolist(), whole.sum(axis=1).tolist()
+        first, product = sums[:3], (whole[:3] @ whole[:3].T).tolist()
+        outer = tuple(
+            product[i][j] + first[i] * place[j] + place[i] * first[j] + n * place[i] * place[j]
             for i in range(3)
-        ]
-        now = HeadMoments(n, *(np.array(part, dtype=object) for part in (position, outer, spread, axes)))
-        return self._whole + now if self._whole.count else now
+            for j in range(3)
+        )
+        return HeadMoments(n, _sum(first, [n * x for x in place]), outer, tuple(sums[3:12]), tuple(sums[12:]))
+
+    def _one_by_one(self, rotation: FloatArray, position: FloatArray) -> HeadMoments:
+        total = HeadMoments.none()
+        for r, p in zip(rotation.tolist(), position.tolist(), strict=True):
+            values = self._values(r, p)
+            _refuse_far(max(abs(value) for value in values[:3]) / _POSITION_STEP)
+            place = tuple(round(value / _POSITION_STEP) for value in values[:3])
+            spread = tuple(round(value / _SPREAD_STEP) for value in values[3:12])
+            axes = tuple(round(value / _AXIS_STEP) for value in values[12:])
+            total += HeadMoments(1, place, tuple(x * y for x in place for y in place), spread, axes)
+        return total
+
+    def _values(self, r: Any, p: Any) -> list[Any]:
+        """Mean taxel centre (3), covariance of the taxels (9) and axes (6) in `base`.
+
+        Parameters
+        ----------
+        r, p
+            3 x 3 rotation and 3 coordinates of one frame as numbers, or of many as arrays. Term by term and not by
+            matrix products: the bits of a frame do not hang on how many others there are.
+        """
+        (m0, m1, m2), (c0, c1, c2) = self._middle, self._covariance
+        centre = [x + (row[0] * m0 + row[1] * m1 + row[2] * m2) for x, row in zip(p, r, strict=True)]
+        turned = [[row[0] * c0[j] + row[1] * c1[j] + row[2] * c2[j] for j in range(3)] for row in r]
+        spread = [t[0] * row[0] + t[1] * row[1] + t[2] * row[2] for t in turned for row in r]
+        axes = [row[0] * x + row[1] * y + row[2] * z for x, y, z in self._axes for row in r]
+        return centre + spread + axes
+
+
+def _refuse_far(steps: float) -> None:
+    if not steps <= _FARTHEST_STEPS:
+        raise BadDataError(
+            f"the head was {steps * _POSITION_STEP:.3g} mm from the tracker's base",
+            way_out="check the unit of the positions (mm)",
+        )
+
+
+def _sum(one: Sequence[int], other: Sequence[int]) -> Whole:
+    return tuple(map(add, one, other))
 
 
 def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
@@ -194,8 +202,3 @@ def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
     sums = MomentSums(head)
     sums.add(poses)
     return sums.moments()
-
-
-def _whole(values: FloatArray) -> WholeArray:
-    whole: WholeArray = np.rint(values).astype(np.int64).astype(object)
-    return whole

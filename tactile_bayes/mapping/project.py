@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,27 +138,29 @@ class Projector:
     def __init__(
         self, head: HeadGeometry, *, plane_from_base: FloatArray, taxels: NDArray[np.bool_], cell_mm: float
     ) -> None:
-        self._rows = np.ascontiguousarray(plane_from_base[:2, :3])
+        self._rows = plane_from_base[:2, :3].tolist()
         self._origin_mm = inverse(plane_from_base)[:3, 3]
         self._cell_mm = cell_mm
         tracker_from_head = inverse(head.scanhead_from_tracker)
-        self._middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
-        centres = apply(tracker_from_head, head.surface_mm[taxels]) - self._middle
+        middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
+        centres = apply(tracker_from_head, head.surface_mm[taxels]) - middle
+        self._middle = middle.tolist()
         steps = np.rint(centres * (1.0 / _TAXEL_STEP_MM)).T
         self._taxels = ProjectedTaxels(np.ascontiguousarray(steps * _TAXEL_STEP_MM))
 
     def at(self, poses: FramePoses) -> Projection:
         """Projection of the frames at `poses` onto the cells of the plane."""
-        # Term by term and not by matrix products: the bits of a frame do not hang on how many others there are.
-        # Frames along the last axis, along which numpy is fast.
-        rows, middle = self._rows[:, :, None, None], self._middle
-        pose = np.empty((3, 4, len(poses.rotation)))
-        pose[:, :3] = poses.rotation.transpose(1, 2, 0)
-        pose[:, 3] = (poses.position_mm - self._origin_mm).T  # first of all: bases may lie far away
-        matrix = rows[:, 0] * pose[0]
-        matrix += rows[:, 1] * pose[1]
-        matrix += rows[:, 2] * pose[2]
-        matrix[:, 3] += matrix[:, 0] * middle[0] + matrix[:, 1] * middle[1] + matrix[:, 2] * middle[2]
+        offset = poses.position_mm - self._origin_mm  # first of all: bases may lie far away
+        # One frame as plain numbers, many as arrays, which each is the quicker for. Term by term and not by matrix
+        # products: the bits of a frame do not hang on how many others there are.
+        r: Any = poses.rotation[0].tolist() if len(offset) == 1 else poses.rotation.transpose(1, 2, 0).copy()
+        x, y, z = offset[0].tolist() if len(offset) == 1 else offset.T.copy()
+        m0, m1, m2 = self._middle
+        columns = []
+        for a, b, c in self._rows:
+            t0, t1, t2 = (a * r[0][j] + b * r[1][j] + c * r[2][j] for j in range(3))
+            columns += [t0, t1, t2, a * x + b * y + c * z + (t0 * m0 + t1 * m1 + t2 * m2)]
+        matrix = np.array(columns).reshape(2, 4, -1)
         matrix /= self._cell_mm
         matrix[:, 3] += 0.5
         matrix *= 1.0 / _MATRIX_STEPS

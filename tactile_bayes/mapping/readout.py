@@ -86,7 +86,7 @@ class Readout:
         """Mean over the valid taxels (n,), NaN without any, and the share of the whole array that is valid (n,)."""
         # Sums of whole steps: any order of adding gives the same bits, so a matrix product may do it.
         if valid is None and len(self.taxels):
-            share = np.broadcast_to(len(self.taxels) / self.size, len(pressure))
+            share = np.full(len(pressure), len(self.taxels) / self.size)
             return pressure @ self._ones / len(self.taxels), share
         valid = np.ones(pressure.shape, dtype=bool) if valid is None else valid
         number = valid.sum(axis=1)
