@@ -61,12 +61,12 @@ class Comparison:
         self._kept = {(one.bench, one.name): one for one in read_figures(self.path)}
 
     def add(self, name: str, ratio: float) -> str:
-        """Take a ratio in and return what the last one was, to print beside it; "" without one."""
+        """Take a ratio in and return what the last one was, to print behind it; "" without one."""
         self.now[name] = ratio
         last = self._kept.get((self.bench, name))
         if last is None:
             return ""
-        return f"(last {last.ratio:.2f}{', WORSE' if self._is_worse(name) else ''})"
+        return f" (last {last.ratio:.2f}{', WORSE' if self._is_worse(name) else ''})"
 
     def worse(self) -> list[str]:
         """Names of the ratios that are worse than the last by more than `MARGIN`."""

@@ -214,7 +214,7 @@ def _live_report(seconds: float, name: str, engine: Engine, *, every: int, last:
             text = ""
             if kind == "work" and not busy:
                 ratio = float(p50) / peer_us
-                text = f"   p50 {ratio:.1f} x a frame of bincount {last.add(f'live p50, {name}, over bincount', ratio)}"
+                text = f"   p50 {ratio:.1f} x a frame of bincount{last.add(f'live p50, {name}, over bincount', ratio)}"
             print(f"{beside} p50 {p50:6.0f} us   p99 {p99:6.0f} us{text}", flush=True)
     return rows
 
@@ -228,7 +228,7 @@ def _compare(minutes: Sequence[float], *, runs: int, last: Comparison) -> dict[s
         for name, value in times.items():
             ratio = value / times["bincount"]
             before = last.add(f"{name}, {length:g} min", ratio)
-            against = f"{ratio:.2f} x bincount {before}, {value / boost:.2f} x boost-histogram".replace(" ,", ",")
+            against = f"{ratio:.2f} x bincount{before}, {value / boost:.2f} x boost-histogram"
             print(f"  {name:<36}{value:8.3f} s CPU   {against}", flush=True)
         rows[f"{length:g} min"] = {name: round(value, 4) for name, value in times.items()}
     return rows
@@ -247,7 +247,7 @@ def _growth(minutes: Sequence[float], name: str, *, last: Comparison) -> dict[st
     if len(minutes) > 1:
         longest, shortest = (rows[f"{length:g} min"]["peak_mb"] for length in (max(minutes), min(minutes)))
         before = last.add(f"{name} peak memory, {max(minutes):g} over {min(minutes):g} min", longest / shortest)
-        print(f"  {name:<6} peak memory of the longest over the shortest {longest / shortest:.2f} {before}", flush=True)
+        print(f"  {name:<6} peak memory of the longest over the shortest {longest / shortest:.2f}{before}", flush=True)
     return rows
 
 

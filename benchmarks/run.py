@@ -72,7 +72,7 @@ def _row(case: Case, peer: Cost, *, folder: Path, runs: int, last: Comparison) -
         return row | {"error": str(error)}
     cpu, memory = cost.cpu_s / peer.cpu_s, cost.peak_mb / peer.peak_mb
     before = last.add(f"{case.name}, CPU", cpu), last.add(f"{case.name}, memory", memory)
-    text = f"{cpu:.2f} x CPU {before[0]}, {memory:.2f} x memory {before[1]} of {case.peer}".replace(" ,", ",")
+    text = f"{cpu:.2f} x CPU{before[0]}, {memory:.2f} x memory{before[1]} of {case.peer}"
     print(f"{case.name:<20}{cost.cpu_s:>8.3f}{cost.peak_mb:>7.0f}  {text}", flush=True)
     return row | {
         "cpu_s": round(cost.cpu_s, 4),

@@ -49,8 +49,8 @@ def test_a_ratio_that_got_worse_is_flagged_and_others_are_not(tmp_path):
     assert "--keep" in first.report()
     first.keep()
     second = Comparison("map", tmp_path / "last.csv")
-    assert second.add("path", 1.01 + MARGIN) == "(last 1.00, WORSE)"
-    assert second.add("memory", 2.0 + 1.9 * MARGIN) == "(last 2.00)"
+    assert second.add("path", 1.01 + MARGIN) == " (last 1.00, WORSE)"
+    assert second.add("memory", 2.0 + 1.9 * MARGIN) == " (last 2.00)"
     assert second.add("new", 9.0) == ""
     assert second.worse() == ["path"]
     assert second.report() == "1 of 2 ratios are more than 20 % above the last kept ones: path"
