@@ -15,7 +15,7 @@ from tactile_bayes.trial.summary import ModalityReport, TrialReport
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_DPI = 110
+_DPI = 160
 _DOTS, _LINE, _SECOND, _GREY = "#1f3b73", "#c8641e", "#2a7f62", "0.45"
 _PANEL_IN = 4.1
 Corner = Literal["upper left", "lower right"]
@@ -39,14 +39,26 @@ def sizes_figure(report: TrialReport) -> bytes:
 
 
 def differences_figure(report: TrialReport) -> bytes:
-    """Bland-Altman: difference to the ex-vivo size against the mean of both, with limits and their intervals."""
+    """Bland-Altman: difference to the ex-vivo size against the mean of both, with limits and their intervals.
+
+    All panels have the same axes, so that modalities can be compared by eye.
+    """
     modalities = list(report.modalities.values())
+    found = [report.sizes[one.name].only_detected() for one in modalities]
 
     def draw(axes: Sequence[Axes]) -> None:
-        for one, panel in zip(modalities, axes, strict=True):
-            _draw_differences(panel, one, report.sizes[one.name].only_detected())
+        for one, sizes, panel in zip(modalities, found, axes, strict=True):
+            _draw_differences(panel, one, sizes)
+        _share_limits(axes)
 
     return _png(draw, len(modalities))
+
+
+def _share_limits(axes: Sequence[Axes]) -> None:
+    """Give all panels the widest range that one of them needs."""
+    across, up = (np.array([get(panel) for panel in axes]) for get in (type(axes[0]).get_xlim, type(axes[0]).get_ylim))
+    for panel in axes:
+        panel.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
 
 
 def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
@@ -113,7 +125,9 @@ def _draw_differences(axes: Axes, report: ModalityReport, found: ModalitySizes) 
     one = report.methods.limits.get("mm")
     if one is not None:
         axes.axhline(one.bias, color=_LINE, linewidth=1.5, label=f"bias {one.bias:.1f}")
-        for value, ends in ((one.low, one.low_interval), (one.high, one.high_interval)):
+        figures = report.methods.figures
+        for value, side in ((one.low, "low"), (one.high, "high")):
+            ends = figures[f"limit_{side}_mm"].interval
             axes.axhline(value, color=_SECOND, linewidth=1.2, label=f"limit {value:.1f}")
             if ends is not None:
                 axes.axhspan(*ends, color=_SECOND, alpha=0.13, linewidth=0)
@@ -125,7 +139,7 @@ def _draw_differences(axes: Axes, report: ModalityReport, found: ModalitySizes) 
 def _draw_pit(axes: Axes, found: Calibration) -> None:
     edges = np.linspace(0, 1, BINS + 1)
     axes.bar(edges[:-1], found.pit, width=1 / BINS, align="edge", color=_DOTS, edgecolor="white", alpha=0.85)
-    axes.axhline(found.n / BINS, color=_LINE, linewidth=1.2, label="if honest")
+    axes.axhline(found.n / BINS, color=_LINE, linewidth=1.2, label="if calibrated")
     axes.set_xlim(0, 1)
     _label(axes, "Integral transforms", "share of the stated distribution below excision", "readings")
 
@@ -137,7 +151,7 @@ def _draw_ecdf(axes: Axes, prediction: Prediction, found: Calibration) -> None:
     share = np.arange(1, len(pit) + 1) / len(pit)
     line = np.array([0.0, 1.0])
     axes.fill_between(line, line - found.ecdf_band, line + found.ecdf_band, color=_LINE, alpha=0.15, linewidth=0)
-    axes.plot(line, line, color=_LINE, linewidth=1.2, label=f"if honest, band for {found.masses} masses")
+    axes.plot(line, line, color=_LINE, linewidth=1.2, label=f"if calibrated, band for {found.masses} masses")
     axes.step(np.concatenate([[0], pit, [1]]), np.concatenate([[0], share, [1]]), where="post", color=_DOTS)
     axes.set(xlim=(0, 1), ylim=(0, 1))
     _label(axes, "Their distribution", "integral transform", "share of readings")
@@ -147,7 +161,7 @@ def _draw_coverage(axes: Axes, found: Calibration) -> None:
     nominal = np.array([one.probability for one in found.levels])
     share = np.array([one.covered / one.n for one in found.levels])
     low, high = (np.array([one.interval[i] for one in found.levels]) for i in (0, 1))
-    axes.plot([0, 1], [0, 1], color=_LINE, linewidth=1.2, label="if honest")
+    axes.plot([0, 1], [0, 1], color=_LINE, linewidth=1.2, label="if calibrated")
     reach = np.stack([np.maximum(share - low, 0), np.maximum(high - share, 0)])
     axes.errorbar(
         nominal, share, yerr=reach, fmt="o", color=_DOTS, markersize=5, capsize=3, label="found, exact interval"

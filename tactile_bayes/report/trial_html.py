@@ -10,7 +10,7 @@ from typing import Any
 
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.trial_figures import calibration_figure, differences_figure, sizes_figure
-from tactile_bayes.report.trial_methods_text import shown
+from tactile_bayes.report.trial_methods_text import growing_line, limit_rows, shown
 from tactile_bayes.report.trial_text import ratio_line
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
@@ -80,7 +80,7 @@ def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -
         *_next_mass(document),
         *_interval_check(document),
         *_origin(document),
-        f"<h2>As text</h2><pre>{html.escape(text)}</pre>",
+        f"<details><summary>The report as text</summary><pre>{html.escape(text)}</pre></details>",
         f'<p class="mark">{html.escape(RESEARCH_USE)}</p></body></html>',
     ]
     return "\n".join(parts) + "\n"
@@ -112,6 +112,10 @@ def _errors(report: TrialReport) -> Iterator[str]:
         for caution in one.cautions:
             yield f'<p class="note">{html.escape(f"{one.name}: {caution}")}.</p>'
     yield _picture(sizes_figure(report), "Size against ex-vivo size for each modality, with identity and fitted line")
+    yield (
+        '<p class="note">Points are means over the replicates of a mass. Bars: 1 SD of the ex-vivo size where the '
+        "table gives it (across) and 1 SD of the replicates (up). Hollow points: masses not found, at size 0.</p>"
+    )
 
 
 def _agreement(report: TrialReport) -> Iterator[str]:
@@ -120,25 +124,37 @@ def _agreement(report: TrialReport) -> Iterator[str]:
     rows = [[one.name, *_cells(one.methods.figures, _METHODS)] for one in report.modalities.values()]
     yield _table(["", *(words for words, _ in _METHODS.values())], rows)
     yield (
-        '<p class="note">Masses found only; limits are for single readings. '
+        '<p class="note">Masses found only; limits of agreement are for single readings. '
         f"Error ratio of the Deming lines (ex vivo over modality): {ratio:g}.</p>"
     )
-    limits = [(one.name, key, two) for one in report.modalities.values() for key, two in one.methods.limits.items()]
     yield _table(
-        ["", "scale", "bias", "lower limit", "upper limit", "SD of one difference"],
+        ["", "scale", "bias", "lower limit", "upper limit"],
         [
-            [
-                name,
-                "mm" if key == "mm" else "ln ratio",
-                _with(two.bias, two.bias_interval),
-                _with(two.low, two.low_interval),
-                _with(two.high, two.high_interval),
-                f"{two.sd:.3g}",
-            ]
-            for name, key, two in limits
+            [one.name, row.words, row.bias, row.low, row.high]
+            for one in report.modalities.values()
+            for row in limit_rows(one)
         ],
     )
+    for note in (growing_line(report), *map(_trend, report.modalities.values())):
+        if note:
+            yield f"<p>{html.escape(note)}</p>"
     yield _picture(differences_figure(report), "Difference to the ex-vivo size against the mean of both, with limits")
+    yield (
+        '<p class="note">Points are means over the replicates of a mass; the limits are for single readings and so are '
+        "wider than the points where there are replicates. Bands: intervals of the limits over patients. All panels "
+        "have the same axes.</p>"
+    )
+
+
+def _trend(report: ModalityReport) -> str | None:
+    """Whether the difference changes with the ex-vivo size, where a test says so."""
+    found = report.methods.trends.get("on_ex_vivo")
+    if found is None or found.p_value is None or found.p_value >= 0.05:
+        return None
+    return (
+        f"{report.name}: the difference changes by {found.slope:+.2f} mm per mm of ex-vivo size "
+        f"(p {found.p_value:.3f}, masses taken as independent)."
+    )
 
 
 def _replicates(report: TrialReport) -> Iterator[str]:
@@ -214,7 +230,12 @@ def _next_mass(document: Mapping[str, Any]) -> Iterator[str]:
     if not found:
         return
     yield "<h2>The next mass</h2>"
-    columns = {"mape_percent": "expected error %", "bias_percent": "bias %", "log_slope": "slope of ln size"}
+    columns = {
+        "mape_percent": "expected error %",
+        "mape_detected_percent": "if found %",
+        "bias_percent": "bias %",
+        "log_slope": "slope of ln size",
+    }
     columns |= {"patient_sd": "SD patients", "mass_sd": "SD masses", "replicate_sd": "SD maps"}
     rows = [
         [name, *(_with(one[key]["median"], (one[key]["low"], one[key]["high"])) for key in columns)]
@@ -234,8 +255,8 @@ def _interval_check(document: Mapping[str, Any]) -> Iterator[str]:
     found = document.get("interval_check")
     if not found:
         return
-    yield "<h2>Do the intervals hold?</h2>"
-    heads = ["", "simulated trials", "true MAPE %", "held it", "lay above", "lay below"]
+    yield "<h2>Simulated coverage of the intervals</h2>"
+    heads = ["", "simulated trials", "true MAPE %", "covered", "interval above it", "interval below it"]
     rows = [
         [
             name,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.paired import PairedComparison
@@ -51,18 +52,33 @@ def _modality_lines(report: ModalityReport) -> Iterator[str]:
 
 
 def _limits_lines(report: ModalityReport) -> Iterator[str]:
+    for row in limit_rows(report):
+        yield f"{report.name}: limits of agreement {row.words}: bias {row.bias}, {row.low} to {row.high}"
+
+
+@dataclass(frozen=True, slots=True)
+class LimitRow:
+    """Limits of agreement on one scale, as they are printed."""
+
+    words: str
+    bias: str
+    low: str
+    high: str
+
+
+def limit_rows(report: ModalityReport) -> Iterator[LimitRow]:
+    """Of the ratio, then in mm."""
     figures = report.methods.figures
-    for unit, words in (("log_ratio", "of size / ex vivo"), ("mm", "in mm")):
+    for unit in ("log_ratio", "mm"):
         one = report.methods.limits.get(unit)
         if one is None:
             continue
         low, high = figures[f"limit_low_{unit}"], figures[f"limit_high_{unit}"]
-        bias, spec = one.bias, ".3g"
-        if unit == "log_ratio":
-            low, high, bias, spec = low.mapped(math.exp), high.mapped(math.exp), math.exp(bias), ".2f"
-        yield (
-            f"{report.name}: limits of agreement {words}: bias {bias:{spec}}, {shown(low, spec)} to {shown(high, spec)}"
-        )
+        if unit == "mm":
+            yield LimitRow("in mm", f"{one.bias:.3g}", shown(low, ".3g"), shown(high, ".3g"))
+            continue
+        low, high = low.mapped(math.exp), high.mapped(math.exp)
+        yield LimitRow("of size / ex vivo", f"{math.exp(one.bias):.2f}", shown(low, ".2f"), shown(high, ".2f"))
 
 
 def growing_line(report: TrialReport) -> str | None:

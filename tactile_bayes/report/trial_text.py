@@ -41,8 +41,8 @@ def trial_text(
 def _check_line(name: str, check: IntervalCheck) -> str:
     low, high = check.interval
     return (
-        f"{name}: in {check.trials} simulated trials of this size, MAPE intervals held the true {check.share:.1%} "
-        f"[{low:.1%}, {high:.1%}] of the time; {check.low_misses} lay above it, {check.high_misses} below"
+        f"{name}: in {check.trials} simulated trials of this size {check.share:.1%} [{low:.1%}, {high:.1%}] of the "
+        f"MAPE intervals covered the true one; {check.low_misses} were above it, {check.high_misses} below"
     )
 
 

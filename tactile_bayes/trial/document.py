@@ -31,12 +31,16 @@ CONVENTIONS: dict[str, str] = {
     "'analytic_intervals' take masses as independent, the others are over patients",
     "error_ratio": "variance of the ex-vivo error over that of the modality's, for the two Deming lines",
     "passing_bablok": "shifted median of slopes, middle slopes averaged as angles",
-    "limits": "of agreement, for single readings, 95 % of differences; 'log_ratio' as ln(size / ex vivo)",
+    "limits": "of agreement, for single readings, 95 % of differences; 'log_ratio' as ln(size / ex vivo); their "
+    "intervals take masses as independent and differences as normal, those of 'limit_low_mm' etc. are over patients",
+    "mape_ratio_to_tactile": "on the masses that both looked for, or that both found",
     "repeatability": "change between two readings of one mass in 95 % of pairs, by the within-mass SD of ln size",
     "calibration": "stated intervals as normal on ln size, the caliper's error added in quadrature",
     "paired_comparisons": "masses that both modalities looked for; not detected counts as size 0; sign-flip test by "
     "patient, p_holm corrected for all pairs",
-    "intervals": "leave-one-patient-out jackknife with Student's t; shares: Clopper-Pearson",
+    "intervals": "over patients, as the setting 'intervals' says: 'corrected' and 'jackknife' leave one patient out "
+    "and take Student's t, 'corrected' allowing for misses not seen and few influential patients; shares: "
+    "Clopper-Pearson",
 }
 
 
