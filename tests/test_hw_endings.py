@@ -52,8 +52,8 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def wait_until(done) -> None:
-    for _ in range(2000):
+def wait_until(done, *, looks: int = 2000) -> None:
+    for _ in range(looks):
         if done():
             return
         time.sleep(0.01)
@@ -186,11 +186,12 @@ def test_a_header_given_twice_is_refused(header):
     server.close()
 
 
-def test_pages_that_do_not_read_are_cut_off():
+@pytest.mark.parametrize("states", [0, 2], ids=["waiting", "full"])
+def test_pages_that_do_not_read_are_cut_off(states):
     server = LiveServer("127.0.0.1", 0)
     lines = [handshake(server) for _ in range(5)]
     wait_until(lambda: len(server._pages) == 5)
-    blocked = [threading.Thread(target=server.show, args=(LiveState(size="x" * 5_000_000),)) for _ in range(2)]
+    blocked = [threading.Thread(target=server.show, args=(LiveState(size="x" * 5_000_000),)) for _ in range(states)]
     for thread in blocked:
         thread.start()
         thread.join()
@@ -200,7 +201,8 @@ def test_pages_that_do_not_read_are_cut_off():
     closing.join(20.0)
     assert not closing.is_alive()
     wait_until(lambda: not server._pages)
-    wait_until(lambda: not [one for one in server._server.handler_threads if one.is_alive()])
+    # a page that says no goodbye was waited for 10 s
+    wait_until(lambda: not [one for one in server._server.handler_threads if one.is_alive()], looks=500)
     for line in lines:
         line.close()
 

@@ -26,7 +26,8 @@ from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
 from tactile_bayes.mapping.orientation import orientation_of
 
 _PAGE: Final = Path(__file__).with_name("live_page.html")
-# How long pages may take to say goodbye.
+# How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
+OPEN_S: Final = 4.0
 CLOSE_S: Final = 0.5
 _SECURITY: Final = (
     "default-src 'none'; connect-src 'self' ws://{host}; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
@@ -78,7 +79,15 @@ class LiveServer:
         self._text, self._number, self._over = "", 0, False
         self._pages: set[Any] = set()
         try:
-            self._server = serve(self._talk, host, port, process_request=self._admit, compression=None)
+            self._server = serve(
+                self._talk,
+                host,
+                port,
+                process_request=self._admit,
+                compression=None,
+                open_timeout=OPEN_S,
+                close_timeout=CLOSE_S,
+            )
         except OSError as error:
             raise UsageError(f"--serve {host}:{port}: {error.strerror}; give another port, 0 for any") from None
         name, number = self._server.socket.getsockname()[:2]
