@@ -16,7 +16,7 @@ from tactile_bayes.printing import ReaderGoneError, protect_streams, release_str
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("demo", "Run the main job on an embedded scan: map, estimate, figures, a table."),
+    "demo": ("demo", "Run the main job on an embedded scan: map, estimate, the report of a trial."),
     "import": ("import_", "Bring other people's arrays, grids and images in."),
     "map": ("map", "Build a tactile map from one or more scans (paper steps i-iii)."),
     "calibrate": ("calibrate", "Learn a calibration: `calibrate size`, `calibrate array`."),
@@ -76,7 +76,7 @@ class LazyGroup(click.Group):
 def cli() -> None:
     """Lump size with an honest credible interval from tactile maps. Research use only.
 
-    The way through: import (or simulate) -> map -> calibrate size -> estimate -> validate.
+    The way through: import (or simulate) -> map -> estimate -> validate.
     Start with `tactile-bayes demo`.
     """
 

@@ -12,7 +12,10 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes
+from tactile_bayes.commands.calibrate import table_recipe
 from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.posterior.size_calibration import Recipe
 
 Run = Callable[..., "CompletedProcess[str]"]
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
@@ -28,7 +31,8 @@ def rows(n: int = 12, *, header: str = "d_mm,amplitude,sigma_x_mm") -> str:
 
 def test_phantoms_become_a_calibration(run_cli: Run, tmp_path: Path) -> None:
     options = ("--normalise", "gain", "--background", "free", "--fit-radius-mm", 15, "--seed", 4)
-    done = run_cli("calibrate", "size", PHANTOMS, "-o", "size.json", *options, cwd=tmp_path)
+    (tmp_path / "silent.csv").write_text(PHANTOMS.read_text().replace(",mean,fixed,20,independent", ",,,,"))
+    done = run_cli("calibrate", "size", "silent.csv", "-o", "size.json", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for words in (
         "Eq 6: d = m sigma / (e a^f) + b",
@@ -45,6 +49,15 @@ def test_phantoms_become_a_calibration(run_cli: Run, tmp_path: Path) -> None:
     provenance = json.loads(path.read_text())["provenance"]
     assert provenance["seed"] == 4
     assert [one["role"] for one in provenance["inputs"]] == ["table"]
+
+
+def test_the_packaged_phantoms_say_how_their_maps_were_made(tmp_path: Path) -> None:
+    done = run_here("calibrate", "size", PHANTOMS, "-o", "size.json", "--normalise", "gain", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "its normalise is mean, not gain as --normalise says" in done.stderr
+    table = read_table(PHANTOMS, "size_table.table.json")
+    same = table_recipe(table, {"normalise": "mean", "background": None, "fit_radius_mm": 20.0, "noise": None})
+    assert same == Recipe("mean", "fixed", 20.0, declared=False, noise="independent", flat_field=None)
 
 
 def test_a_small_table_without_depths_teaches_the_ratio(tmp_path: Path) -> None:

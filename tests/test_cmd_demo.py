@@ -2,61 +2,108 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from subprocess import CompletedProcess
 
 import pytest
 
+from tactile_bayes.commands.demo import _how_to_type
+from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.forward.solid_scene import SolidLump
+
 Run = Callable[..., "CompletedProcess[str]"]
+TRUE_MM = 15.0
+STEPS = ["map", "estimate", "map", "calibrate", "estimate", "validate"]
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("demo")
+    return tmp_path_factory.mktemp("a demo")
 
 
 @pytest.fixture(scope="module")
 def shown(run_cli: Run, place: Path) -> CompletedProcess[str]:
-    return run_cli("demo", "-o", "out", "--method", "laplace", cwd=place)
+    return run_cli("demo", "-o", "my demo", "--method", "laplace", cwd=place)
 
 
-def test_it_shows_the_way_through_and_ends_with_the_truth(shown: CompletedProcess[str]) -> None:
+def typed(shown: CompletedProcess[str]) -> list[list[str]]:
+    """The commands that the demo prints, as a shell splits them."""
+    return [shlex.split(line)[2:] for line in shown.stdout.splitlines() if line.startswith("$ tactile-bayes ")]
+
+
+def test_it_shows_the_default_road_first_and_ends_with_truth_and_results(shown: CompletedProcess[str]) -> None:
     assert shown.returncode == 0, shown.stderr
-    for name in ("map", "calibrate size", "estimate", "validate"):
-        assert f"$ tactile-bayes {name} " in shown.stdout
-    assert "The scan was simulated about a lump of 15 mm." in shown.stdout
+    assert [words[0] for words in typed(shown)] == STEPS
+    first_map, first_estimate = typed(shown)[:2]
+    assert "--normalise" not in first_map
+    assert "--size-calibration" not in first_estimate
+    summary = shown.stdout.partition("Largest size of the lump")[2]
+    assert re.search(rf"^true +{TRUE_MM:.1f}$", summary, flags=re.MULTILINE)
     assert shown.stdout.rstrip().endswith("Research use only: not a diagnostic device.")
     assert shown.stderr == ""
 
 
-def test_the_interval_holds_the_truth(shown: CompletedProcess[str]) -> None:
-    line = next(line for line in shown.stdout.splitlines() if line.startswith("largest size"))
-    low, _, high = line.split()[-4:-1]
-    assert float(low) < 15.0 < float(high)
+@pytest.mark.parametrize("road", ["estimate, the default", "the paper's Eq 6"])
+def test_the_interval_covers_the_truth_and_says_so(shown: CompletedProcess[str], road: str) -> None:
+    (line,) = [line for line in shown.stdout.splitlines() if line.startswith(road)]
+    figures = [float(number) for number in re.findall(r"\d+\.\d", line)]
+    assert len(figures) == 3
+    assert figures[1] < TRUE_MM < figures[2]
+    assert line.endswith("covers the true size")
+
+
+def test_the_scan_is_of_a_body_that_the_calibration_has_seen(run_cli: Run, place: Path) -> None:
+    """The README's two commands on the packaged scan: within 20 % of the truth, and nothing outside the range."""
+    scene = read_scene(place / "my demo" / "scene.toml")
+    assert scene.solid_lumps == (SolidLump(d_mm=TRUE_MM, stiffness_ratio=30.0, seat=0.0),)
+    assert run_cli("map", "my demo/scan.mcap", "-o", "by hand.nc", cwd=place).returncode == 0
+    done = run_cli("estimate", "by hand.nc", "--json", cwd=place)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["max_size_mm"]["median"] == pytest.approx(TRUE_MM, rel=0.2)
+    assert found["diagnostics"]["outside_calibration"] == []
 
 
 def test_it_leaves_every_file_behind_for_its_owner_only(shown: CompletedProcess[str], place: Path) -> None:
     assert shown.returncode == 0
-    files = {path.name: path for path in (place / "out").iterdir()}
+    files = {path.name: path for path in (place / "my demo").iterdir()}
     made = {"scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "map.nc", "size.json", "posterior.nc"}
-    assert made | {"size.png", "map.png", "trial.json"} <= set(files)
+    assert made | {"size.png", "map.png", "trial.json", "trial.html"} <= set(files)
     assert {path.stat().st_mode & 0o777 for path in files.values()} == {0o600}
 
 
 def test_the_printed_commands_do_it_by_hand(run_cli: Run, shown: CompletedProcess[str], place: Path) -> None:
-    """Each as printed, with --force, gives the same bytes again."""
-    before = {path.name: path.read_bytes() for path in (place / "out").iterdir()}
-    typed = [line.removeprefix("$ tactile-bayes ") for line in shown.stdout.splitlines() if line.startswith("$ ")]
-    assert len(typed) == 4
-    for line in typed:
-        done = run_cli(*line.split(), "--force", cwd=place)
+    """Each as printed, in a folder whose name has a space, works and gives the same bytes again."""
+    before = {path.name: path.read_bytes() for path in (place / "my demo").iterdir()}
+    for words in typed(shown):
+        done = run_cli(*words, cwd=place)
         assert done.returncode == 0, done.stderr
-    assert {path.name: path.read_bytes() for path in (place / "out").iterdir()} == before
+    assert {path.name: path.read_bytes() for path in (place / "my demo").iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("found", "started", "words"),
+    [
+        ("/usr/bin/tactile-bayes", "/usr/bin/tactile-bayes", ""),
+        (None, ".venv/bin/tactile-bayes", "type .venv/bin/tactile-bayes for it"),
+        (None, "/somewhere/tactile_bayes/__main__.py", "-m tactile_bayes for it"),
+    ],
+)
+def test_it_says_what_to_type_where_the_program_is_not_on_the_path(
+    monkeypatch: pytest.MonkeyPatch, found: str | None, started: str, words: str
+) -> None:
+    monkeypatch.setattr("sys.argv", [started, "demo"])
+    said = _how_to_type(which=lambda _: found)
+    assert words in said
+    assert bool(said) == bool(words)
 
 
 def test_another_demo_does_not_overwrite_the_first(run_cli: Run, shown: CompletedProcess[str], place: Path) -> None:
     assert shown.returncode == 0
-    done = run_cli("demo", "-o", "out", cwd=place)
+    done = run_cli("demo", "-o", "my demo", cwd=place)
     assert done.returncode == 2
     assert "--force" in done.stderr

@@ -32,7 +32,9 @@ def test_a_grid_becomes_a_table_and_a_summary(folder: Path) -> None:
     assert [(row["d_mm"], row["depth_ratio"]) for row in rows[:2]] == [("10", "0.8"), ("10", "1")]
     assert {row["seat"] for row in rows} == {"centred"}
     assert {row["detectable"] for row in rows} == {"true"}
-    assert "background" not in rows[0]  # a matter of the solid model
+    recipe = {"normalise": "mean", "background": "fixed", "fit_radius_mm": "48", "noise": "independent"}
+    assert recipe.items() <= rows[0].items()
+    assert "flat_field" not in rows[0]  # a matter of the solid model
     said = (folder / "stdout.txt").read_text()
     assert "9 cases, 0 not detectable" in said
     assert "centred, E2/E1 = 100: d = " in said
@@ -104,7 +106,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
     done = run_cli("study", "--grid", "grid.csv", "-o", "study.csv", "--fineness", 1, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     resumed = (tmp_path / "study.csv").read_text().splitlines()
-    assert resumed[1] == "centred,10,0.8,100,0.123,4.5,0.01,true,,"  # what the store had was not computed again
+    assert resumed[1] == "centred,10,0.8,100,0.123,4.5,0.01,true,,,,,,"  # what the store had was not computed again
     assert resumed[2:] == (folder / "study.csv").read_text().splitlines()[2:]
     assert not store.exists()
 

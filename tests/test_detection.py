@@ -10,11 +10,15 @@ import pytest
 from mapping_scans import shared_scan
 from posterior_maps import bump_map, correlated_field, grid_map
 
+import tactile_bayes
+from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.detection import detect
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions, find_bump
+from tactile_bayes.posterior.fit import FitOptions, find_bump, fitted_candidates
 
 SIZE = 51
 NOISE = 0.02
@@ -56,6 +60,51 @@ def test_lump_free_maps_show_none() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_false_lumps_are_rarer_than_one_in_fifty(kind: str) -> None:
     assert false_lumps(kind, maps=300) <= 6
+
+
+def few_at_the_rim(rng: np.random.Generator) -> TactileMap:
+    """Lump-free, with a tenth of the readings near two edges and errors that go with the root of their number.
+
+    As where the strokes end: few frames reach the rim, and what a frame's readings share does not average out there.
+    """
+    size, edge = 41, np.minimum(np.arange(41), np.arange(41)[::-1])[:, None]
+    count = np.where(edge >= 9, 100, 10) * np.ones((size, size), dtype=np.int64)
+    errors = correlated_field(rng, size, length_cells=12.0) + 0.5 * rng.standard_normal((size, size))
+    return replace(grid_map(1 + 0.003 * errors * np.sqrt(100 / count)), count=count)
+
+
+def test_few_readings_at_the_rim_make_no_lump() -> None:
+    """A negative control: the same maps, whose counts say that the rim was read as often, do show lumps."""
+    rng = np.random.default_rng(31)
+    maps = [few_at_the_rim(rng) for _ in range(10)]
+    free = FitOptions("free", 20.0, "off")
+
+    def most(tactile_map: TactileMap) -> float:
+        places = [
+            one.fit for one in list(fitted_candidates(tactile_map, free))[:4] if not one.fault and one.fit is not None
+        ]
+        found = [
+            detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=BumpPrior())
+            for fit in places
+        ]
+        return max((one.probability for one in found), default=0.0)
+
+    assert max(map(most, maps)) < 0.95
+    assert max(most(replace(one, count=np.full_like(one.count, 100))) for one in maps) >= 0.95
+
+
+@pytest.mark.parametrize("scan", ["empty.toml", "s08_no_mass.npz"])
+def test_an_empty_scan_gets_no_size_by_a_solid_study(scan: str, request: pytest.FixtureRequest) -> None:
+    """With the recipe of `study --model solid`: a flat field, frame means, a free level and independent errors."""
+    if scan == "empty.toml":
+        scene = read_scene(Path(tactile_bayes.__file__).parent / "demo" / scan)
+        empty = simulate(scene, rng=np.random.default_rng(scene.seed)).scan
+    else:
+        empty = shared_scan(request.getfixturevalue("shared_data") / "scans" / scan)
+    tactile_map = build_map([empty], normalise="mean", flat_field=True)
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "independent"))
+    found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
+    assert found.status == "no_estimate"
 
 
 def test_a_lump_on_each_of_those_maps_is_seen() -> None:

@@ -119,14 +119,15 @@ def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
 def test_the_table_has_a_width_for_each_axis_of_the_head() -> None:
     head, *_, last = table_text(rows()).splitlines()
     names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,sigma_y_mm,fit_rms,detectable"
-    names += ",thickness_mm,head_radius_mm,background,flat_field"
+    names += ",thickness_mm,head_radius_mm,normalise,background,fit_radius_mm,noise,flat_field"
     assert head == names
     cells = dict(zip(names.split(","), last.split(","), strict=True))
     assert cells["seat"] == "1.2"
     assert float(cells["sigma_x_mm"]) > float(cells["sigma_y_mm"])  # a ball looks longer across the head
     assert cells["detectable"] == "true"
     assert (cells["thickness_mm"], cells["head_radius_mm"]) == ("70", "35")
-    assert (cells["background"], cells["flat_field"]) == ("free", "true")
+    recipe = {"normalise": "mean", "background": "free", "fit_radius_mm": "20", "noise": "independent"}
+    assert {name: cells[name] for name in (*recipe, "flat_field")} == recipe | {"flat_field": "true"}
 
 
 def test_a_ball_too_small_for_the_array_is_marked() -> None:
@@ -237,17 +238,23 @@ def test_a_calibration_is_learned_from_the_table_by_defaults(folder: Path, run_c
     assert "background free, fit radius 20 mm" in done.stdout
 
 
-def test_a_table_says_how_its_background_was_fitted(folder: Path, run_cli: Run, tmp_path: Path) -> None:
+def test_a_table_says_how_its_maps_were_made(folder: Path, run_cli: Run, tmp_path: Path) -> None:
+    """An option that contradicts the study is refused: sizes would be a third off by the wrong normalising."""
     text = (folder / "study.csv").read_text()
     (tmp_path / "same.csv").write_text(text)
-    (tmp_path / "mixed.csv").write_text(text.replace(",free,true", ",fixed,true", 1))
+    (tmp_path / "mixed.csv").write_text(text.replace(",mean,free,", ",mean,fixed,", 1))
     for table, words, said in (
-        ("same.csv", ("--background", "fixed"), "same.csv: its background is free; leave out --background"),
+        ("same.csv", ("--normalise", "gain"), "same.csv: its normalise is mean, not gain as --normalise says"),
+        ("same.csv", ("--normalise", "gain"), "leave out --normalise, and size maps made with `map --normalise mean`"),
+        ("same.csv", ("--background", "fixed"), "its background is free, not fixed as --background says"),
+        ("same.csv", ("--fit-radius-mm", 48), "its fit_radius_mm is 20.0, not 48.0 as --fit-radius-mm says"),
+        ("same.csv", ("--noise", "field"), "its noise is independent, not field as --noise says"),
         ("mixed.csv", (), "mixed.csv: background differs between rows"),
     ):
         done = run_cli("calibrate", "size", table, "-o", "size.json", *words, cwd=tmp_path)
         assert done.returncode == EXIT_BAD_DATA
         assert said in done.stderr
+        assert not (tmp_path / "size.json").exists()
 
 
 OPTIONS: dict[tuple[str, ...], tuple[str, bool]] = {
@@ -316,7 +323,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
     done = run_cli(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     resumed = (tmp_path / "study.csv").read_text().splitlines()
-    assert resumed[1] == "centred,10,1,100,0.123,4.5,3.5,0.01,true,,,,"
+    assert resumed[1] == "centred,10,1,100,0.123,4.5,3.5,0.01,true,,,,,,,"
     assert resumed[2] == (folder / "study.csv").read_text().splitlines()[1]
 
 

@@ -11,11 +11,13 @@ from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from datetime import datetime
 
+    from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.tables import Table
     from tactile_bayes.posterior.learn_size import SizeTable, StudyCases
-    from tactile_bayes.posterior.size_calibration import LeftOutErrors
+    from tactile_bayes.posterior.size_calibration import LeftOutErrors, Recipe
 
 _FILE = FilePath()
 
@@ -38,29 +40,25 @@ def command() -> None:
 @click.option(
     "--normalise",
     type=click.Choice(NORMALISE),
-    default="mean",
-    show_default=True,
-    help="How the table's maps were normalised (declared).",
+    help="How the table's maps were normalised, for a table that does not say. Default: mean.",
 )
 @click.option(
     "--background",
     type=click.Choice(["fixed", "free"]),
-    help="How the table's maps were fitted (declared). Default: what a study's table says; else fixed, or free with "
+    help="Level of the table's maps in their fits, for a table that does not say. Default: fixed, or free with "
     "--normalise none.",
 )
 @click.option(
     "--fit-radius-mm",
     type=click.FloatRange(min=0.0, min_open=True),
-    default=FIT_RADIUS_MM,
-    show_default=True,
-    help="Radius about the lump within which they were fitted (declared).",
+    help="Radius about the lump within which they were fitted, for a table that does not say. "
+    f"Default: {FIT_RADIUS_MM:g}.",
 )
 @click.option(
     "--noise",
     type=click.Choice(NOISE),
-    default="independent",
-    show_default=True,
-    help="The errors they were fitted under (declared); least squares is independent.",
+    help="Errors they were fitted under, for a table that does not say; least squares is independent. "
+    "Default: independent.",
 )
 @click.option(
     "--least-stiffness-ratio",
@@ -78,10 +76,10 @@ def size(
     table: Path,
     output: Path,
     form: str,
-    normalise: str,
+    normalise: str | None,
     background: str | None,
-    fit_radius_mm: float,
-    noise: str,
+    fit_radius_mm: float | None,
+    noise: str | None,
     least_stiffness_ratio: float,
     seed: int,
     force: bool,
@@ -89,13 +87,14 @@ def size(
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or a quadratic in logarithms.
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
-    stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. The
-    declared options say how the table's maps were made; `estimate` refuses a map made otherwise. The table of
-    `study --model solid` has a column for its background. With depth_ratio and
-    stiffness_ratio the table is a study: each geometry (seat, d_mm, depth_ratio) is also left out of the learning in
-    turn, and the report tells how far Eq 6 and a quadratic in logarithms then miss the hard lumps' sizes. Where seat,
-    stiffness below 8, thickness_mm or head_radius_mm vary in it, the report tells what each does to the size that Eq 6
-    gives, and how much of its scatter would go if it were known; `estimate` does not use that.
+    stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. How the
+    table's maps were made and fitted stands in its columns normalise, background, fit_radius_mm, noise and flat_field,
+    as in a table of `study`, or is declared by the options; an option that contradicts the table is refused, and
+    `estimate` refuses a map made otherwise. With depth_ratio and stiffness_ratio the table is a study: each geometry
+    (seat, d_mm, depth_ratio) is also left out of the learning in turn, and the report tells how far Eq 6 and a
+    quadratic in logarithms then miss the hard lumps' sizes. Where seat, stiffness below 8, thickness_mm or
+    head_radius_mm vary in it, the report tells what each does to the size that Eq 6 gives, and how much of its scatter
+    would go if it were known; `estimate` does not use that.
 
     The log-quadratic form, ln d as a quadratic in ln a and ln sigma, tells apart what differs between bodies and
     between exams of one body. Its table comes from `population`, which made the maps: nothing is declared. From the
@@ -114,7 +113,6 @@ def size(
     from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.posterior.learn_size import learn_size_calibration
-    from tactile_bayes.posterior.size_calibration import Recipe
     from tactile_bayes.posterior.size_terms import size_terms
     from tactile_bayes.report.calibration_text import calibration_text
 
@@ -124,9 +122,8 @@ def size(
         click.echo(_log_quadratic(table, output, force=force), nl=False)
         return
     rows = read_table(table, "size_table.table.json")
-    background = _background(rows, background, normalise)
-    flat_field = rows.columns["flat_field"][0]
-    recipe = Recipe(normalise, background, fit_radius_mm, declared=True, noise=noise, flat_field=flat_field)
+    declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
+    recipe = table_recipe(rows, declared)
     rng = np.random.default_rng(seed)
     try:
         lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
@@ -137,10 +134,10 @@ def size(
     except BadDataError as error:
         raise error.at(table) from None
     settings = {
-        "normalise": normalise,
-        "background": background,
-        "fit_radius_mm": fit_radius_mm,
-        "noise": noise,
+        "normalise": recipe.normalise,
+        "background": recipe.background,
+        "fit_radius_mm": recipe.radius_mm,
+        "noise": recipe.noise,
         "least_stiffness_ratio": least_stiffness_ratio,
     }
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
@@ -148,21 +145,59 @@ def size(
     click.echo(calibration_text(calibration, terms=size_terms(lumps), not_left_out=silent), nl=False)
 
 
-def _background(table: Table, declared: str | None, normalise: str) -> str:
-    """How the table's maps were fitted: what its rows say, else what is declared, else fixed where there is a level."""
-    from tactile_bayes.errors import BadDataError, UsageError
+def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
+    """How the maps of a size table were made and fitted: what its columns say, else what is declared, else the default.
 
-    for name in ("background", "flat_field"):
-        if len(set(table.columns[name])) > 1:
-            what = f"{name} differs between rows"
-            raise BadDataError(what, way_out="join tables of maps made alike only", path=str(table.path))
-    said: str | None = table.columns["background"][0]
-    if said and declared and said != declared:
-        raise BadDataError(f"its background is {said}", way_out="leave out --background", path=str(table.path))
-    found = said or declared or ("free" if normalise == "none" else "fixed")
-    if normalise == "none" and found == "fixed":
+    Parameters
+    ----------
+    declared
+        The options ``normalise``, ``background``, ``fit_radius_mm`` and ``noise``; None where one was not given.
+
+    Raises
+    ------
+    BadDataError
+        When rows differ in it, or the table says something else than an option.
+    UsageError
+        When a level is to be fixed on maps that have none.
+    """
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.posterior.size_calibration import Recipe
+
+    said = {name: _alike(table, name) for name in (*declared, "flat_field")}
+    for name, value in declared.items():
+        if None not in (value, said[name]) and value != said[name]:
+            raise _contradiction(table, name, said[name], value)
+    found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
+    normalise = found["normalise"] or "mean"
+    background = found["background"] or ("free" if normalise == "none" else "fixed")
+    if normalise == "none" and background == "fixed":
         raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
-    return found
+    radius_mm, noise = found["fit_radius_mm"] or FIT_RADIUS_MM, found["noise"] or "independent"
+    by_hand = any(said[name] is None for name in declared)
+    return Recipe(normalise, background, radius_mm, declared=by_hand, noise=noise, flat_field=said["flat_field"])
+
+
+def _alike(table: Table, name: str) -> Any:
+    """The value of a column that must be alike in all rows."""
+    from tactile_bayes.errors import BadDataError
+
+    values = table.columns[name]
+    if len(set(values)) > 1:
+        what = f"{name} differs between rows"
+        raise BadDataError(what, way_out="join tables of maps made alike only", path=str(table.path))
+    return values[0]
+
+
+def _contradiction(table: Table, name: str, said: object, declared: object) -> BadDataError:
+    from tactile_bayes.errors import BadDataError
+
+    option = f"--{name.replace('_', '-')}"
+    way_out = f"leave out {option}"
+    if name == "normalise":
+        way_out += f", and size maps made with `map --normalise {said}`"
+        way_out += "; `population` and --form log-quadratic give a calibration for --normalise gain"
+    what = f"its {name} is {said}, not {declared} as {option} says"
+    return BadDataError(what, way_out=way_out, path=str(table.path))
 
 
 def _refuse_declared(ctx: click.Context) -> None:

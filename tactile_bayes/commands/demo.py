@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,7 +16,11 @@ from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import METHODS, RESEARCH_USE
 
+if TYPE_CHECKING:
+    from tactile_bayes.files.size_posterior import StatedSize
+
 EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.toml", "empty.toml")
+PROGRAM = "tactile-bayes"
 
 
 @click.command("demo")
@@ -27,43 +35,109 @@ EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.tom
 )
 @click.option(
     "--method",
-    type=click.Choice(METHODS),
+    type=click.Choice(METHODS[:3]),
     default="importance",
     show_default=True,
-    help="Of the estimate.",
+    help="Method of both estimates, see `estimate --help`.",
 )
 @click.option("--force", is_flag=True, help="Overwrite the files of an earlier demo.")
 @click.pass_context
 def command(ctx: click.Context, output: Path, method: str, force: bool) -> None:
-    """Run the main job on an embedded scan: map, calibrate, estimate, validate.
+    """Run the main job on an embedded scan: map, estimate, and the report of a trial.
 
-    The scan is simulated (a 15 mm lump, one diameter deep); the phantoms are simulated by another, three-dimensional
-    model; the trial is synthetic. Each step is printed as the command that would do it by hand.
+    The scan is simulated: a hard ball of 15 mm, one diameter deep in a breast of fat and gland, with the noise and
+    tracker errors of a real examination. It is sized twice, with the calibration that comes with the program and by the
+    paper's Eq 6, and both results are compared with the true size. The trial is synthetic. Each step is printed as the
+    command that does it by hand.
     """
-    from tactile_bayes.commands import calibrate, estimate, map, validate
-
     _prepare(output, force=force)
-    scan, table, trial, excision = (output / name for name in EMBEDDED[:4])
-    tactile_map, size = output / "map.nc", output / "size.json"
-    # as the phantoms' maps were made
-    _step(ctx, map.command, "map", scans=(scan,), output=tactile_map, normalise="mean", force=force)
-    _step(ctx, calibrate.size, "calibrate size", table=table, output=size, force=force)
-    results = {"output": output / "posterior.nc", "figure": output / "size.png", "map_figure": output / "map.png"}
-    _step(
-        ctx,
-        estimate.command,
-        "estimate",
-        maps=(tactile_map,),
-        size_calibration=str(size),
-        method=method,
-        force=force,
-        **results,
-    )
-    _step(ctx, validate.command, "validate", trial=trial, excision=excision, output=output / "trial.json", force=force)
-    truth = _truth(scan)
-    click.echo(f"The scan was simulated about a lump of {truth:g} mm.")
+    steps = Steps(ctx, output, method=method, force=force)
+    truth = _truth(output / "scan.mcap")
+    click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")
+    click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
+    results = {
+        "estimate, the default": steps.default_road(),
+        "the paper's Eq 6": steps.paper_road(),
+    }
+    steps.trial()
+    click.echo(_summary(truth, results))
     click.echo(f"Written to {output}: {', '.join(sorted(path.name for path in output.iterdir()))}.")
+    click.echo(f"Your own data: `{PROGRAM} import --help` says how arrays, grids and images come in.")
     click.echo(RESEARCH_USE)
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """The commands of the demo, in the folder that has its inputs.
+
+    Parameters
+    ----------
+    ctx
+        Of the demo itself; every step is invoked from it.
+    folder
+        Holds the embedded files and takes what is made of them.
+    method
+        Of the estimates.
+    force
+        Whether files of an earlier demo are overwritten.
+    """
+
+    ctx: click.Context
+    folder: Path
+    method: str
+    force: bool
+
+    def default_road(self) -> StatedSize:
+        """Map and estimate as they are without options; the size that is stated."""
+        from tactile_bayes.commands import estimate, map
+
+        self._say("1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.")
+        tactile_map, posterior = self.folder / "map.nc", self.folder / "posterior.nc"
+        self._run(map.command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map)
+        self._say("2. Estimate the size of the lump, with the calibration that comes with the program.")
+        figures = {"figure": self.folder / "size.png", "map_figure": self.folder / "map.png"}
+        self._estimate(estimate.command, tactile_map, output=posterior, **figures)
+        return _stated(posterior)
+
+    def paper_road(self) -> StatedSize:
+        """The scan mapped as the phantoms were, and sized by the Eq 6 that they give."""
+        from tactile_bayes.commands import calibrate, estimate, map
+
+        self._say(
+            "3. The same scan by the paper's Eq 6, learned from a table of phantoms. The phantoms' maps are of frames\n"
+            "   divided by their means, so this map has to be too."
+        )
+        tactile_map, size = self.folder / "map_mean.nc", self.folder / "size.json"
+        posterior = self.folder / "posterior_eq6.nc"
+        self._run(map.command, "map", scans=(self.folder / "scan.mcap",), output=tactile_map, normalise="mean")
+        self._run(calibrate.size, "calibrate size", table=self.folder / "phantoms.csv", output=size)
+        self._estimate(estimate.command, tactile_map, size_calibration=str(size), output=posterior)
+        return _stated(posterior)
+
+    def trial(self) -> None:
+        """The report of a synthetic trial."""
+        from tactile_bayes.commands import validate
+
+        self._say("4. Compare sizes with excision, in a synthetic trial of the paper's size.")
+        inputs = {"trial": self.folder / "trial.csv", "excision": self.folder / "excision.csv"}
+        outputs = {"output": self.folder / "trial.json", "html": self.folder / "trial.html"}
+        self._run(validate.command, "validate", **inputs, **outputs)
+
+    def _estimate(self, command: click.Command, tactile_map: Path, **options: Any) -> None:
+        self._run(command, "estimate", maps=(tactile_map,), method=self.method, **options)
+
+    def _say(self, text: str) -> None:
+        click.echo(f"\n{text}\n")
+
+    def _run(self, command: click.Command, name: str, **parameters: Any) -> None:
+        # typed again, it meets what the demo made
+        click.secho(f"$ {PROGRAM} {name} {_as_typed(command, parameters | {'force': True})}", bold=True)
+        try:
+            self.ctx.invoke(command, **parameters, force=self.force)
+        except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it
+            if end.exit_code:
+                raise
+        click.echo()
 
 
 def _prepare(output: Path, *, force: bool) -> None:
@@ -79,14 +153,13 @@ def _prepare(output: Path, *, force: bool) -> None:
         target.chmod(0o600)
 
 
-def _step(ctx: click.Context, command: click.Command, name: str, **parameters: Any) -> None:
-    click.secho(f"$ tactile-bayes {name} {_as_typed(command, parameters)}", bold=True)
-    try:
-        ctx.invoke(command, **parameters)
-    except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it
-        if end.exit_code:
-            raise
-    click.echo()
+def _how_to_type(which: Callable[[str], str | None] = shutil.which) -> str:
+    """What to type where the program is not on the PATH, as after `make demo`; empty where it is."""
+    if which(PROGRAM):
+        return ""
+    started = Path(sys.argv[0])
+    typed = str(started) if started.name == PROGRAM else f"{shlex.quote(sys.executable)} -m tactile_bayes"
+    return f" {PROGRAM} is not on your PATH: type {typed} for it."
 
 
 def _as_typed(command: click.Command, parameters: dict[str, Any]) -> str:
@@ -101,7 +174,7 @@ def _as_typed(command: click.Command, parameters: dict[str, Any]) -> str:
             words.append(parameter.opts[0])
             values = [] if parameter.is_flag else values
         words += values
-    return " ".join(words)
+    return shlex.join(words)
 
 
 def _truth(scan: Path) -> float:
@@ -111,3 +184,21 @@ def _truth(scan: Path) -> float:
     if truth is None:
         raise UsageError(f"{scan} holds no truth; it is not the embedded scan")
     return float(truth["lumps"][0]["d_mm"])
+
+
+def _stated(posterior: Path) -> StatedSize:
+    from tactile_bayes.files.size_posterior import read_stated_size
+
+    return read_stated_size(posterior)
+
+
+def _summary(truth_mm: float, results: dict[str, StatedSize]) -> str:
+    """True size and estimates, one a line."""
+    lines = [f"{'Largest size of the lump':28}{'mm':>9}   95 % interval", f"{'true':28}{truth_mm:>9.1f}"]
+    for name, size in results.items():
+        if size.size_mm is None or size.low_mm is None or size.high_mm is None:
+            lines.append(f"{name:28}{'none':>9}")
+            continue
+        covered = "covers the true size" if size.low_mm <= truth_mm <= size.high_mm else "misses the true size"
+        lines.append(f"{name:28}{size.size_mm:>9.1f}   {size.low_mm:.1f} to {size.high_mm:.1f} mm, {covered}")
+    return "\n".join(lines)

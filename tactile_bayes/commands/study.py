@@ -25,6 +25,8 @@ _ABOVE_0 = click.FloatRange(min=0.0, min_open=True)
 _NO_CHANGE_MM = 1e6
 _GRID_SCHEMA = "study_grid.table.json"
 MODELS = ("plane-strain", "solid")
+RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
+"""Columns that say how the maps of a table were made and fitted; `calibrate size` refuses what contradicts them."""
 
 
 @click.command("study")
@@ -90,9 +92,9 @@ def command(
     a cylinder in two dimensions, with the background at 1, Eq 7 over a ball in three. There the head's few lines leave
     stripes and the lump a trough, which a flat field and a free background take off. Cases with an amplitude below
     0.02 or a width that is not resolved are marked as not detectable. With -o an interrupted study goes on where it
-    stopped. `calibrate size` learns from the table of the solid model as it is, for maps made with `map --flat-field`,
-    and from the other with --fit-radius-mm 48. From the joined tables of several seats, thicknesses or heads it also
-    tells what each would change.
+    stopped. `calibrate size` learns from either table as it is: the table says how its maps were made and fitted. A
+    calibration from the solid model is for maps made with `map --normalise mean --flat-field`. From the joined tables
+    of several seats, thicknesses or heads `calibrate size` also tells what each would change.
 
     A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
     lump's centre on the fat-gland boundary, 1 (resting) its lowest point; above 1 the lump stands clear of the gland.
@@ -325,7 +327,7 @@ def table_text(rows: list[StudyRow]) -> str:
     if any(row.sigma_y_mm is not None for row in rows):
         names.append("sigma_y_mm")
     names += ["fit_rms", "detectable", "thickness_mm", "head_radius_mm"]
-    names += [name for name in ("background", "flat_field") if any(getattr(row, name) is not None for row in rows)]
+    names += [name for name in RECIPE if any(getattr(row, name) is not None for row in rows)]
     lines = [",".join(names)]
     lines += [",".join(_cell(getattr(row, name)) for name in names) for row in rows]
     return "\n".join(lines) + "\n"

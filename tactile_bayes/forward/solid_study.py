@@ -250,8 +250,11 @@ def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: Rast
                 found.sigma_y_mm,
                 body.layers.thickness_mm,
                 settings.head.radius_mm,
-                settings.background,
-                settings.flat_field,
+                normalise="mean",
+                background=settings.background,
+                fit_radius_mm=settings.fit_radius_mm,
+                noise="independent",
+                flat_field=settings.flat_field,
             )
         )
     return rows

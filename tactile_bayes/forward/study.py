@@ -125,8 +125,9 @@ class StudyRow:
     """One case and the Gaussian its map shows; the fields are the columns of a size table.
 
     A map in two dimensions has no `sigma_y_mm`. `thickness_mm` (depth of the chest wall) and `head_radius_mm` (of its
-    arc) are what the case was computed with. `background` (``"fixed"`` or ``"free"``) and `flat_field` say how a map in
-    three dimensions was fitted and divided; in two they are None: the level is 1 and nothing is divided.
+    arc) are what the case was computed with. The rest is the recipe of the map: how its frames were normalised, whether
+    its level was ``"fixed"`` at 1 or ``"free"``, the radius of the fit, the errors it was fitted under, and whether the
+    head's own response was divided out (None in two dimensions, which have none).
     """
 
     seat: str
@@ -140,7 +141,10 @@ class StudyRow:
     sigma_y_mm: float | None = None
     thickness_mm: float | None = None
     head_radius_mm: float | None = None
+    normalise: str | None = None
     background: str | None = None
+    fit_radius_mm: float | None = None
+    noise: str | None = None
     flat_field: bool | None = None
 
 
@@ -199,6 +203,10 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
                 bool(found.amplitude >= DETECTABLE and found.resolved),
                 thickness_mm=body.layers.thickness_mm,
                 head_radius_mm=settings.head.radius_mm,
+                normalise="mean",
+                background="fixed",
+                fit_radius_mm=settings.fit_radius_mm,
+                noise="independent",
             )
         )
     return rows

@@ -14,8 +14,8 @@ from tactile_bayes.records import dataclass
 
 LENGTHS_IN_WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
 """Correlation lengths tried for the noise, in widths of the bump under test."""
-FIELD_SHARES = (0.0, 0.5, 0.9, 0.99)
-"""Share of the error variance that is correlated."""
+FIELD_SHARES = (0.5, 0.9, 0.99)
+"""Share of the error variance that is correlated; none of it is as likely as each of them, at every length."""
 MOST_BLOCKS = 480
 
 
@@ -62,9 +62,12 @@ def detect(
     Notes
     -----
     Both models carry the same noise, an exponentially correlated field plus independent errors, whose length and
-    share are averaged over a grid. Level, amplitude and noise scale are integrated out; position and widths enter by
-    their Laplace volume against the map's area and the prior, so that a search over a large map costs what it should.
-    A lump-free map has bumps of its own, and with independent noise each would be "detected".
+    share are averaged over a grid. The field is either alike all over the map, as what the model misses is, or larger
+    where readings are few, as errors are that a frame's readings share: few frames reach the map's rim, and with the
+    same errors there as in the middle a rise of the rim would be "detected". Level, amplitude and noise scale are
+    integrated out; position and widths enter by their Laplace volume against the map's area and the prior, so that a
+    search over a large map costs what it should. A lump-free map has bumps of its own, and with independent noise each
+    would be "detected".
 
     References
     ----------
@@ -75,17 +78,9 @@ def detect(
         return Detection(0.0, -np.inf)
     sigma_x, sigma_y, _ = bump.widths(theta)
     width = float(np.sqrt(sigma_x * sigma_y))
-    distance = np.hypot(blocks.x_mm[:, None] - blocks.x_mm, blocks.y_mm[:, None] - blocks.y_mm)
-    null, lump = [], []
-    for length in LENGTHS_IN_WIDTHS:
-        field = np.exp(-distance / (length * width))
-        for share in FIELD_SHARES:
-            pair = _log_evidence_pair(blocks, field, share, amplitude_sd=prior.amplitude_sd * bump.scale)
-            null.append(pair[0])
-            lump.append(pair[1])
+    null, lump = _log_evidences(blocks, width, amplitude_sd=prior.amplitude_sd * bump.scale)
     occam = _log_occam_factor(tactile_map, bump, theta=theta, covariance=covariance, prior=prior)
-    log_factor = float(np.logaddexp.reduce(lump) - np.logaddexp.reduce(null)) + occam
-    return detection_from_odds(log_factor)
+    return detection_from_odds(lump - null + occam)
 
 
 def detection_from_odds(log_bayes_factor: float, *, ridge: str = "") -> Detection:
@@ -118,11 +113,28 @@ def _average(cells: FitCells, template: FloatArray, side: int) -> _Blocks:
     )
 
 
-def _log_evidence_pair(blocks: _Blocks, field: FloatArray, share: float, *, amplitude_sd: float) -> tuple[float, float]:
-    """Log evidence without and with the bump for one noise field, up to a common constant."""
-    n = len(blocks.value)
+def _log_evidences(blocks: _Blocks, width_mm: float, *, amplitude_sd: float) -> tuple[float, float]:
+    """Log evidence without and with the bump, averaged over the noise fields, up to a common constant."""
+    distance = np.hypot(blocks.x_mm[:, None] - blocks.x_mm, blocks.y_mm[:, None] - blocks.y_mm)
     nugget = blocks.reading_variance / blocks.reading_variance.mean()
-    factor = np.linalg.cholesky(share * field + (1.0 - share) * np.diag(nugget) + 1e-9 * np.eye(n))
+    scales = (np.ones_like(nugget), np.sqrt(nugget))
+    white = _log_evidence_pair(blocks, np.diag(nugget), amplitude_sd=amplitude_sd)
+    pairs = [np.array(white) + log(len(scales) * len(LENGTHS_IN_WIDTHS))]
+    for length in LENGTHS_IN_WIDTHS:
+        alike = np.exp(-distance / (length * width_mm))
+        for scale in scales:
+            field = alike * scale[:, None] * scale
+            for share in FIELD_SHARES:
+                errors = share * field + (1.0 - share) * np.diag(nugget)
+                pairs.append(np.array(_log_evidence_pair(blocks, errors, amplitude_sd=amplitude_sd)))
+    null, lump = np.logaddexp.reduce(pairs, axis=0)
+    return float(null), float(lump)
+
+
+def _log_evidence_pair(blocks: _Blocks, errors: FloatArray, *, amplitude_sd: float) -> tuple[float, float]:
+    """Log evidence without and with the bump for errors of one covariance (n, n), up to a common constant."""
+    n = len(blocks.value)
+    factor = np.linalg.cholesky(errors + 1e-9 * np.eye(n))
     white = np.linalg.solve(factor, np.stack([np.ones(n), blocks.value, blocks.template], axis=1))
     one, y, g = white.T
     half_log_det = float(np.log(np.diag(factor)).sum())
