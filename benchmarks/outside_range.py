@@ -2,13 +2,16 @@
 
     python -m benchmarks.outside_range simulate ROWS.csv [--bodies 8] [--workers 2]
     python -m benchmarks.outside_range table ROWS.csv
+    python -m benchmarks.outside_range eq6 PHANTOMS.csv
 
 `simulate` draws bodies with one property (or all) beyond the ranges of `forward.population.BodyPrior`, scans each once
 with the solid model, maps it as `map` does and sizes it as `estimate` does, also where the calibration's range does not
 hold the map. An interrupted run goes on where it stopped. Rows of the kind `bump` are no body: a Gaussian with the
 amplitude and widths that a body inside the range showed, on an even pressure, with that body's diameter as the truth.
 
-`table` prints error and coverage of the 95 % intervals by how far the map lies outside the range, and by kind.
+`table` prints error and coverage of the 95 % intervals by how far the map lies outside the range, and by kind; then the
+maps that are unlike any body at the depth of fat that the head's pressure told, sized with that depth and without.
+`eq6` learns Eq 6 from the phantoms in the middle of the range of amplitudes, and of sigma_x, and sizes the others.
 """
 
 from __future__ import annotations
@@ -17,16 +20,18 @@ import argparse
 import csv
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.commands.calibrate import size_table
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.population import BodyPrior, draw_mass
 from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
@@ -34,8 +39,11 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import EstimateOptions, calibration_for, estimate_map
 from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.learn_size import SizeTable, learn_size_calibration
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.size import push_sizes
+from tactile_bayes.posterior.size_calibration import Recipe, SizeCalibration
 
 SEED = 20261123
 FRAME_RATE_HZ = 40.0
@@ -253,6 +261,50 @@ def table(path: Path) -> list[str]:
     return lines
 
 
+def unlike_depths(path: Path) -> list[str]:
+    """Lines on the maps that no body of the table looks like at the depth of fat that was told."""
+    rows = [row for row in read(path) if row["code"] == "size" and row["fat_mm"] and float(row["leverage"]) > 1]
+    anew = [row | without_depth(row) for row in rows]
+    lines = [_line("depth used", rows), _line("depth not used, as stated", anew)]
+    return lines + [_line(f"  {row['kind']}, {float(row['d_mm']):.1f} mm", [row]) for row in anew]
+
+
+def without_depth(row: Row) -> Row:
+    """The size of a row's amplitude and widths, known to 2 %, by the calibration for any depth."""
+    rng = np.random.default_rng(1)
+    names = ("amplitude", "sigma_x_mm", "sigma_y_mm")
+    draws = (float(row[name]) * np.exp(0.02 * rng.standard_normal(DRAWS)) for name in names)
+    maps = [ShapeDraws.of(*draws, np.zeros(DRAWS))]
+    size = pooled_size(maps, calibration=replace(shipped(), fat_cubic=None), priors=SizePriors(), rng=rng)
+    low, median, high = np.nanquantile(size.max_size_mm, [0.025, 0.5, 0.975])
+    return {"median": median, "low": low, "high": high}
+
+
+def eq6(path: Path) -> list[str]:
+    """Lines on Eq 6 beyond the table it was learned from, one a phantom, and how many are covered."""
+    whole = size_table(read_table(path, "size_table.table.json"))
+    lines = []
+    for name, (low, high) in {"amplitude": (0.06, 1.0), "sigma_x_mm": (2.5, 6.0)}.items():
+        values = np.asarray(getattr(whole, name))
+        inside = (values >= low) & (values <= high)
+        columns = {f.name: getattr(whole, f.name) for f in fields(whole) if f.name != "cases"}
+        kept = SizeTable(**{column: None if v is None else v[inside] for column, v in columns.items()})
+        learned = learn_size_calibration(kept, recipe=Recipe(), rng=np.random.default_rng(3))
+        for i in np.flatnonzero(~inside):
+            times = values[i] / (high if values[i] > high else low)
+            lines.append(_beyond_eq6(learned, whole, int(i), f"{name} {times:.2f}"))
+    return lines
+
+
+def _beyond_eq6(learned: SizeCalibration, table: SizeTable, row: int, name: str) -> str:
+    shown = (table.amplitude[row], table.sigma_x_mm[row], np.asarray(table.sigma_y_mm)[row], 0.0)
+    draws = (np.full((1, DRAWS), value) for value in shown)
+    size = push_sizes(*draws, calibration=learned, rng=np.random.default_rng(row))
+    low, median, high = np.nanquantile(size.max_size_mm, [0.025, 0.5, 0.975])
+    return _line(f"{name} times the end", [{"d_mm": table.d_mm[row], "median": median, "low": low, "high": high}])
+
+
+DRAWS = 4000
 LEVERAGES = ((1.0, 1.5), (1.5, 3.0), (3.0, 10.0), (10.0, 1e9))
 
 
@@ -279,11 +331,11 @@ def _line(name: str, rows: Sequence[Row]) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", choices=["simulate", "table"])
+    parser.add_argument("step", choices=["simulate", "table", "eq6"])
     parser.add_argument("rows", type=Path)
     parser.add_argument("--bodies", type=int, default=8)
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     if given.step == "simulate":
         run(given.rows, bodies=given.bodies, workers=given.workers)
-    print("\n".join(table(given.rows)))
+    print("\n".join(eq6(given.rows) if given.step == "eq6" else [*table(given.rows), "", *unlike_depths(given.rows)]))

@@ -14,6 +14,9 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes
+from tactile_bayes.commands.import_ import command
+from tactile_bayes.files.arrays_layout import LAYOUT
+from tactile_bayes.files.arrays_npz import _SHAPES
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 
@@ -95,6 +98,11 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
         (["none.npz", "-o", "a.mcap"], 3, "cannot be read"),
         (["g.csv", "-o", "a.mcap", "--as", "scan"], 3, "not an .npz file"),
         (["g.npz", "-o", "a.mcap"], 3, "give --as map"),
+        (["g.npz", "-o", "a.mcap"], 3, "position_mm (m, 3), quaternion_wxyz (m, 4)"),
+        (["g.npz", "-o", "a.mcap"], 3, "`tactile-bayes import --help` says what they are"),
+        (["x.mat", "-o", "a.nc"], 3, "scipy.io.loadmat"),
+        (["x.h5", "-o", "a.nc"], 3, "h5py"),
+        (["x.tsv", "-o", "a.nc"], 3, "save the grid as .csv"),
     ],
 )
 def test_mistakes_end_in_one_line_and_their_code(
@@ -108,6 +116,21 @@ def test_mistakes_end_in_one_line_and_their_code(
     assert done.stderr.count("\n") == 1
     assert words in done.stderr
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_grid_in_npz_becomes_a_map_where_the_output_says_so(run_cli: Run, tmp_path: Path) -> None:
+    np.savez(tmp_path / "g.npz", mean=np.ones((2, 3)), spacing_mm=1.0)
+    done = run_cli("import", "g.npz", "-o", "g.nc", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "g.nc: map" in done.stdout
+
+
+def test_the_help_has_the_layout_that_the_reader_checks() -> None:
+    said = command.help or ""
+    assert set(LAYOUT) == set(_SHAPES)
+    for name, shape in _SHAPES.items():
+        assert LAYOUT[name][0] == (", ".join(map(str, shape)) or "one number")
+        assert f"- {name} ({LAYOUT[name][0]}" in said
 
 
 @pytest.mark.parametrize("name", ["import", "simulate"])

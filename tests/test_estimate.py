@@ -139,8 +139,14 @@ def test_outside_the_calibration_is_flagged() -> None:
         f"{axis}: amplitude 1.2 (table: 0.05 to 0.8)" for axis in "xy"
     ]
     text = estimate_text(flagged, bump_map(), probability=0.95)
-    assert "Outside the calibration's range: x: amplitude 1.2" in text
+    assert text.startswith("CAUTION: outside the calibration's range: x: amplitude 1.2")
     assert run(use=calibration()).diagnostics["outside_calibration"] == []
+
+
+def test_far_outside_the_calibration_there_is_no_size() -> None:
+    found = run(use=calibration(), amplitude=2.0)
+    assert (found.status, found.code, found.size) == ("no_estimate", "extrapolated", None)
+    assert "x: amplitude 2 (table: 0.05 to 0.8)" in found.reason
 
 
 def test_a_calibration_that_gives_no_size_gives_no_estimate() -> None:

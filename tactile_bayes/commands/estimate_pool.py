@@ -50,7 +50,7 @@ def estimate_pool(
 
     # the maps' digests in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(int(digest[:16], 16) for digest in digests.values())
-    pooled = pool_maps(
+    pooled = _too_far(answers) or pool_maps(
         [answer.shape for answer in answers],
         calibration=calibration,
         priors=size_priors(settings),
@@ -71,6 +71,16 @@ def estimate_pool(
         _write(pooled, maps, settings, output, figure, provenance=provenance, force=force)
     click.echo(dump_json(document) if as_json else pooled_text(document), nl=False)
     return EXIT_DONE if pooled.size is not None else EXIT_NO_ESTIMATE
+
+
+def _too_far(answers: list[Answer]) -> PooledEstimate | None:
+    """No size where a map shows a lump too far outside the calibration's range; None where none does."""
+    from tactile_bayes.posterior.pooling import PooledEstimate
+
+    for i, answer in enumerate(answers):
+        if answer.document is not None and answer.document["reason_code"] == "extrapolated":
+            return PooledEstimate("no_estimate", f"map {i + 1}: {answer.document['reason']}")
+    return None
 
 
 def _shipped_for(answers: list[Answer]) -> str:

@@ -86,7 +86,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import default_for
-    from tactile_bayes.posterior.estimate import calibration_for, estimate_map
+    from tactile_bayes.posterior.estimate import calibration_for, estimate_map, fitting_calibration
 
     tactile_map = read_map(path)
     shipped = default_for(tactile_map.recipe.normalise)
@@ -110,8 +110,9 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         raise error.at(path) from None
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
-    if calibration is not None and estimate.size is not None:
-        words = _calibration_words(settings.calibration or shipped, calibration)
+    used = None if estimate.map_posterior is None else fitting_calibration(estimate.map_posterior, calibration)
+    if used is not None and estimate.size is not None:
+        words = _calibration_words(settings.calibration or shipped, used)
         estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
     recorded = {
         "size_calibration": settings.calibration or (f"{shipped} (shipped)" if calibration is not None else "none"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.files.arrays_layout import layout_lines
 from tactile_bayes.presets import NORMALISE, RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ _LONGEST_UNITS = 20
     "--as",
     "kind",
     type=click.Choice(["scan", "map"]),
-    help="What SRC holds; by default a scan in .npz and .mcap files, a map in tables and images.",
+    help="What SRC holds. Default: a map where the output ends in .nc or SRC is a table or an image, else a scan.",
 )
 @click.option("--spacing-mm", type=float, metavar="H", help="Map: side of the square cells, in mm.")
 @click.option(
@@ -57,7 +58,7 @@ def command(
     from tactile_bayes.files.atomic import refuse_existing
 
     refuse_existing(output, force=force)
-    kind = kind or ("scan" if source.suffix.lower() in (".npz", ".mcap") else "map")
+    kind = kind or _kind_of(source, output)
     if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
         raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
     _check_units(units, normalise)
@@ -69,6 +70,17 @@ def command(
         )
     for line in (f"{output}: {kind}", *lines, RESEARCH_USE):
         click.echo(line)
+
+
+_HEADING = "Arrays of a scan in an .npz file, in mm, kPa and s, for n frames and m poses:"
+_ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines()])
+command.help = f"{command.help}\n\n{_ARRAYS}"
+
+
+def _kind_of(source: Path, output: Path) -> str:
+    """What comes out, where nothing is said: a map where the output is .nc or the source can only be a grid."""
+    as_map = output.suffix.lower() == ".nc" and source.suffix.lower() != ".mcap"
+    return "scan" if source.suffix.lower() in (".npz", ".mcap") and not as_map else "map"
 
 
 def _check_units(units: str | None, normalise: str | None) -> None:

@@ -229,10 +229,11 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
         return LiveAnswer()
     if found.status != "estimate" or found.map_posterior is None:
         why = f"the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
-        return LiveAnswer(f"no estimate: {why}")
+        return LiveAnswer(f"no estimate: {found.reason if found.code == 'extrapolated' else why}")
     lump = _in_base(tactile_map, found.map_posterior)
     if found.size is not None:
-        return LiveAnswer(_interval("largest size", found.size.max_size_mm, INTERVAL), lump)
+        caution = "CAUTION: outside the calibration's range: " if found.diagnostics.get("outside_calibration") else ""
+        return LiveAnswer(caution + _interval("largest size", found.size.max_size_mm, INTERVAL), lump)
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     return LiveAnswer(_interval("map width sigma", widths, INTERVAL), lump)
 

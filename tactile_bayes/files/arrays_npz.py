@@ -1,20 +1,6 @@
 """Other people's arrays: one .npz with raw counts, poses and calibration becomes a scan.
 
-Arrays (mm, kPa, s; read without pickle):
-
-| array | shape | meaning |
-|---|---|---|
-| counts | (n, rows, columns) integer | raw readings, 0 to 65535; axis 1 across the head (x), axis 2 along it (y) |
-| frame_time_s | (n,) | time of each frame |
-| position_mm | (m, 3) | tracker sensor in the tracker's base frame |
-| quaternion_wxyz | (m, 4) | its rotation, scalar first: p_base = position + R(q) p_tracker |
-| pose_time_s | (m,) | time stamps of the poses, on the frames' clock |
-| gain_kpa_per_count, offset_kpa | (rows, columns) | pressure = gain x counts + offset |
-| pitch_mm | scalar | distance between neighbouring elements |
-| array_from_tracker | (4, 4) | lever arm: p_scanhead = array_from_tracker p_tracker |
-| head_surface_mm | (rows, columns, 3) | element centres in `scanhead`: origin at the face's apex, z into the tissue |
-| landmarks_mm | (2, 3), may be left out | sternal notch and xiphoid in the base frame |
-| saturation_count | scalar, may be left out (4095) | readings at or above it carry no pressure |
+Arrays in mm, kPa and s, read without pickle; `arrays_layout.LAYOUT` says what each is.
 """
 
 from __future__ import annotations
@@ -26,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL
 from tactile_bayes.files.npz import Arrays, load_npz
 from tactile_bayes.geometry import check_rigid
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
@@ -45,7 +32,6 @@ _SHAPES: Final[Mapping[str, tuple[str | int, ...]]] = {
     "landmarks_mm": (2, 3),
     "saturation_count": (),
 }
-_OPTIONAL: Final = ("landmarks_mm", "saturation_count")
 
 
 def read_arrays(path: Path) -> Scan:
@@ -57,7 +43,9 @@ def read_arrays(path: Path) -> Scan:
         Naming the file, the array, its value and the way out.
     """
     try:
-        arrays = load_npz(path, required=[name for name in _SHAPES if name not in _OPTIONAL], optional=_OPTIONAL)
+        required = [name for name in _SHAPES if name not in OPTIONAL]
+        shapes = {name: shape for name, (shape, _) in LAYOUT.items()}
+        arrays = load_npz(path, required=required, optional=OPTIONAL, shapes=shapes)
         _check_shapes(arrays)
         _check_numbers(arrays)
         _check_units(arrays)

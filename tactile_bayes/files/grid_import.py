@@ -62,10 +62,23 @@ def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "
             mean = _table(path)
         else:
             known = ", ".join((".npz", *TABLE_SUFFIXES, *IMAGE_SUFFIXES))
-            raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=f"grids are read from {known}")
+            way_out = _CONVERT.get(suffix, f"grids are read from {known}; scans from .npz and .mcap")
+            raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=way_out)
         return _map({"mean": mean}, spacing_mm=_spacing(None, given=spacing_mm), normalise=normalise, units=units)
     except BadDataError as error:
         raise error.at(path) from None
+
+
+_FROM_ARRAYS = "`tactile-bayes import --help` says which arrays a scan has; a grid has one, mean"
+_CONVERT = {
+    ".mat": f"read it with scipy.io.loadmat and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
+    **dict.fromkeys(
+        (".h5", ".hdf5"), f"read it with h5py and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}"
+    ),
+    **dict.fromkeys((".tsv", ".txt", ".dat"), "save the grid as .csv, with commas between cells and points in numbers"),
+    ".npy": f"save it with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
+    ".xlsx": "save the grid as .csv, with commas between cells and points in numbers",
+}
 
 
 def _spacing(held: np.ndarray[Any, Any] | None, *, given: float | None) -> float:

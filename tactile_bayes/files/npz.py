@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -24,8 +24,15 @@ _HEADERS: Final = {
 }
 
 
-def load_npz(path: Path, *, required: Sequence[str], optional: Sequence[str]) -> Arrays:
+def load_npz(
+    path: Path, *, required: Sequence[str], optional: Sequence[str], shapes: Mapping[str, str] | None = None
+) -> Arrays:
     """The named arrays of an .npz file.
+
+    Parameters
+    ----------
+    shapes
+        In words, for the error where an array is missing.
 
     Raises
     ------
@@ -39,7 +46,7 @@ def load_npz(path: Path, *, required: Sequence[str], optional: Sequence[str]) ->
             members = {name.removesuffix(".npy"): archive.getinfo(name) for name in archive.namelist()}
             missing = [name for name in required if name not in members]
             if missing:
-                raise _missing(missing, found=list(members))
+                raise _missing(missing, found=list(members), shapes=shapes or {})
             wanted = {name: members[name] for name in (*required, *optional) if name in members}
             unpacked = sum(member.file_size for member in wanted.values())
             most = unpacked_limit(os.fstat(stream.fileno()).st_size)
@@ -58,10 +65,12 @@ def _check_zip(stream: IO[bytes]) -> None:
     raise BadDataError(f"is not an .npz file (it starts with {start!r})", way_out="save it with numpy.savez_compressed")
 
 
-def _missing(missing: Sequence[str], *, found: Sequence[str]) -> BadDataError:
+def _missing(missing: Sequence[str], *, found: Sequence[str], shapes: Mapping[str, str]) -> BadDataError:
+    lacks = ", ".join(f"{name} ({shapes[name]})" if name in shapes else name for name in missing)
+    see = "; `tactile-bayes import --help` says what they are" if shapes else ""
     has = ", ".join(sorted(found)[:12]) or "nothing"
     grid = " (for a grid of values give --as map)" if "mean" in found else ""
-    return BadDataError(f"lacks {', '.join(missing)} (it has {has})", way_out=f"add the missing arrays{grid}")
+    return BadDataError(f"lacks {lacks} (it has {has})", way_out=f"add the missing arrays{grid}{see}")
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.ndarray[Any, np.dtype[Any]]:

@@ -142,6 +142,15 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
     return None
 
 
+def extrapolated(far: Sequence[str]) -> Abstention:
+    """The map lies so far outside the calibration's table that nothing is known of the size's error."""
+    advice = (
+        "learn a calibration whose table holds such lumps (`population`, `calibrate size`), or give "
+        "--size-calibration none for amplitude and widths"
+    )
+    return Abstention("extrapolated", f"too far outside the calibration's range for a size: {'; '.join(far)}", advice)
+
+
 def prior_share(sigma_x: FloatArray, sigma_y: FloatArray, prior: BumpPrior) -> float:
     """Posterior over prior SD of the less certain log width."""
     sd = max(float(np.std(np.log(sigma_x))), float(np.std(np.log(sigma_y))))

@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import Abstention, no_bump, shape_fault, undetected
+from tactile_bayes.posterior.abstention import Abstention, extrapolated, no_bump, shape_fault, undetected
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
@@ -201,9 +201,12 @@ def estimate_map(
     )
     if fault is not None:
         return _none(fault, candidates, detection)
-    size = _size(posterior, calibration, options.size_priors, rng=rng)
+    calibration = fitting_calibration(posterior, calibration)
     diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | noise
     diagnostics["method"] = draws.method
+    if far := range_faults(posterior, calibration, "too_far"):
+        return _none(extrapolated(far), candidates, detection, diagnostics)
+    size = _size(posterior, calibration, options.size_priors, rng=rng)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         outside = Abstention("extrapolated", reason, "learn a calibration whose table holds such lumps")
@@ -345,25 +348,47 @@ def _draw_under_field(
     )
 
 
+def _medians(posterior: MapPosterior) -> tuple[float, float, float]:
+    """sigma_x_mm, sigma_y_mm and amplitude in the middle of the posterior."""
+    x, y, a = (np.median(v) for v in (posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.amplitude))
+    return float(x), float(y), float(a)
+
+
+def fitting_calibration(
+    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None
+) -> SizeCalibration | LogQuadratic | None:
+    """The calibration without the depth of fat where no body of its table looks like the map at that depth."""
+    if not isinstance(calibration, LogQuadratic):
+        return calibration
+    sigma_x, sigma_y, amplitude = _medians(posterior)
+    return calibration.fitting(amplitude, float(np.sqrt(sigma_x * sigma_y)))
+
+
+def range_faults(
+    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None, how: Literal["outside", "too_far"]
+) -> list[str]:
+    """In what a map lies outside the calibration's table, or too far outside it for a size, in words."""
+    sigma_x, sigma_y, amplitude = _medians(posterior)
+    if calibration is None:
+        return []
+    if isinstance(calibration, LogQuadratic):
+        return list(getattr(calibration, how)(amplitude, float(np.sqrt(sigma_x * sigma_y))))
+    found = [f"x: {text}" for text in getattr(calibration.x, how)(sigma_x, amplitude)]
+    return found + [f"y: {text}" for text in getattr(calibration.y, how)(sigma_y, amplitude)]
+
+
 def _diagnostics(
     tactile_map: TactileMap,
     fit: BumpFit,
     posterior: MapPosterior,
     calibration: SizeCalibration | LogQuadratic | None,
 ) -> dict[str, object]:
-    medians = (np.median(v) for v in (posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.amplitude))
-    sigma_x, sigma_y, amplitude = (float(value) for value in medians)
-    outside: list[str] = []
-    if isinstance(calibration, LogQuadratic):
-        outside = calibration.outside(amplitude, float(np.sqrt(sigma_x * sigma_y)))
-    elif calibration is not None:
-        outside += [f"x: {text}" for text in calibration.x.outside(sigma_x, amplitude)]
-        outside += [f"y: {text}" for text in calibration.y.outside(sigma_y, amplitude)]
+    sigma_x, sigma_y, _ = _medians(posterior)
     return {
         "cells": len(fit.cells),
         "covered_share": fit.covered_share,
         "coarse_cells": tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(sigma_x, sigma_y),
-        "outside_calibration": outside,
+        "outside_calibration": range_faults(posterior, calibration, "outside"),
         **({"fat_mm": calibration.fat_mm} if isinstance(calibration, LogQuadratic) else {}),
     }
 

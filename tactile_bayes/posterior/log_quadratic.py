@@ -22,16 +22,20 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.body_terms import HiddenTerms, RoundLumps
+from tactile_bayes.posterior.calibration_range import outside_domain, too_far
 from tactile_bayes.posterior.fat_depth import ORDER as FAT_ORDER
 from tactile_bayes.posterior.fat_depth import SPREADS, FatCubic
 from tactile_bayes.posterior.monomials import monomials, powers
 from tactile_bayes.posterior.size_calibration import Recipe
 from tactile_bayes.records import dataclass
 
+UNLIKE = "is unlike any body of the table"
 QUADRATIC = ("1", "u", "v", "u2", "uv", "v2")
 PARAMETERS = (*QUADRATIC, "log_body_sd", "body_sd_slope", "log_exam_sd")
 MOST_LEVERAGE = 1.0
 """A map is outside the table where its leverage exceeds this multiple of the table's largest."""
+FARTHEST_LEVERAGE = 3.0
+"""Beyond this multiple there is no size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +71,8 @@ class LogQuadratic:
         Depth F that this calibration is for; None where it is for any.
     fat_note
         Why the depth is not used though the calibration could; empty otherwise.
+    any_depth
+        Of a calibration for one depth, that for any.
     """
 
     centre: tuple[float, float]
@@ -83,6 +89,7 @@ class LogQuadratic:
     fat_cubic: FatCubic | None = None
     fat_mm: float | None = None
     fat_note: str = ""
+    any_depth: LogQuadratic | None = None
 
     def __post_init__(self) -> None:
         k = len(PARAMETERS) if self.fat_mm is None else len(powers(FAT_ORDER)) + SPREADS
@@ -122,7 +129,18 @@ class LogQuadratic:
             fit=cubic.fit,
             fat_cubic=None,
             fat_mm=float(np.exp(log_depth)),
+            any_depth=replace(self, fat_cubic=None),
         )
+
+    def fitting(self, amplitude: float, sigma_mm: float) -> LogQuadratic:
+        """This calibration, or the one for any depth where no body of the table looks like the map at this depth.
+
+        A polynomial of third order says nothing beyond its table: there sizes were wrong by up to a factor of 11.
+        """
+        if self.any_depth is None or self.leverage(amplitude, sigma_mm) <= MOST_LEVERAGE:
+            return self
+        what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
+        return replace(self.any_depth, fat_note=f"{what} {UNLIKE}")
 
     @property
     def unknowns(self) -> dict[str, float]:
@@ -164,22 +182,34 @@ class LogQuadratic:
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         return np.asarray(self.mean + rng.standard_normal((number, len(self.mean))) @ root.T)
 
+    def leverage(self, amplitude: float, sigma_mm: float) -> float:
+        """Leverage of a map over the largest in the table; infinite without a rise."""
+        if not (amplitude > 0 and sigma_mm > 0):
+            return float("inf")
+        x = self.terms(np.log(np.array(amplitude)), np.log(np.array(sigma_mm)))
+        return float(x @ self.information_inverse @ x) / self.most_leverage
+
     def outside(self, amplitude: float, sigma_mm: float) -> list[str]:
         """In what a map lies outside the table, in words; empty when it lies inside."""
-        found = []
-        for name, value, unit in (("amplitude", amplitude, ""), ("sigma_mm", sigma_mm, " mm")):
-            low, high = self.domain[name]
-            if not low <= value <= high:
-                found.append(f"{name.removesuffix('_mm')} {value:.3g}{unit} (table: {low:.3g} to {high:.3g}{unit})")
-        if not found and amplitude > 0 and sigma_mm > 0:
-            x = self.terms(np.log(np.array(amplitude)), np.log(np.array(sigma_mm)))
-            ratio = float(x @ self.information_inverse @ x) / self.most_leverage
-            if ratio > MOST_LEVERAGE:
-                found.append(
-                    f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike any of the table "
-                    f"(leverage {ratio:.1f} times its largest)"
-                )
+        found = outside_domain(self.domain, amplitude, sigma_mm)
+        if not found and self.leverage(amplitude, sigma_mm) > MOST_LEVERAGE:
+            found.append(self._unlike(amplitude, sigma_mm))
+        if self.fat_note.endswith(UNLIKE):
+            found.append(f"{self.fat_note}, so that depth is not used")
         return found
+
+    def too_far(self, amplitude: float, sigma_mm: float) -> list[str]:
+        """In what a map lies so far outside the table that there is no size, in words."""
+        found = too_far(self.domain, amplitude, sigma_mm)
+        if not found and self.leverage(amplitude, sigma_mm) > FARTHEST_LEVERAGE:
+            found.append(self._unlike(amplitude, sigma_mm))
+        return found
+
+    def _unlike(self, amplitude: float, sigma_mm: float) -> str:
+        return (
+            f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike any of the table "
+            f"(leverage {self.leverage(amplitude, sigma_mm):.1f} times its largest)"
+        )
 
 
 def quadratic_terms(u: FloatArray, v: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy as np
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.abstention import extrapolated
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.roundness import Elongation, ShapePrior, elongation, turned
 from tactile_bayes.posterior.size import SizePosterior
@@ -98,6 +99,12 @@ class ShapeDraws:
         angle = angle_rad.ravel()
         p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
         return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad, profile)
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Medians of the amplitude and of the geometric mean width in mm."""
+        amplitude, sigma_mm = (float(np.exp(np.nanmedian(v))) for v in (self.log_amplitude, self.log_width))
+        return amplitude, sigma_mm
 
     def rows(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> ShapeDraws:
         """Some of the draws."""
@@ -225,6 +232,13 @@ def pool_maps(
         return PooledEstimate("no_estimate", f"a lump was found on {len(found)} of {len(shapes)} maps")
     used = [shape for shape in shapes if shape is not None]
     calibration = calibration.at_fat([one.profile for one in used])
+    middles = [one.middle for one in used]
+    for middle in middles:  # one map that does not go with the depth is enough: it is the same body
+        calibration = calibration.fitting(*middle)
+    named = list(zip(found, middles, strict=True))
+    far = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.too_far(*middle)]
+    if far:
+        return PooledEstimate("no_estimate", extrapolated(far).reason)
     size = pooled_size(used, calibration=calibration, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
@@ -232,10 +246,7 @@ def pool_maps(
         i: float(np.nanmean(calibration.log_size(shape.log_amplitude, shape.log_width)))
         for i, shape in zip(found, used, strict=True)
     }
-    outside = []
-    for i, shape in zip(found, used, strict=True):
-        amplitude, width = (float(np.exp(np.nanmedian(v))) for v in (shape.log_amplitude, shape.log_width))
-        outside += [f"map {i + 1}: {text}" for text in calibration.outside(amplitude, width)]
+    outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
     outlying = tuple(found[i] for i in size.outliers)
     return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration)

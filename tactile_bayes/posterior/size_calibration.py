@@ -9,6 +9,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.calibration_range import outside_domain, too_far
 from tactile_bayes.records import dataclass
 
 COEFFICIENTS = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
@@ -131,12 +132,11 @@ class AxisCalibration:
 
     def outside(self, sigma_mm: float, amplitude: float) -> list[str]:
         """Which inputs lie outside the table's range, in words."""
-        found = []
-        for name, value, unit in (("amplitude", amplitude, ""), ("sigma_mm", sigma_mm, " mm")):
-            low, high = self.domain[name]
-            if not low <= value <= high:
-                found.append(f"{name.removesuffix('_mm')} {value:.3g}{unit} (table: {low:.3g} to {high:.3g}{unit})")
-        return found
+        return outside_domain(self.domain, amplitude, sigma_mm)
+
+    def too_far(self, sigma_mm: float, amplitude: float) -> list[str]:
+        """Which inputs lie so far outside that there is no size, in words."""
+        return too_far(self.domain, amplitude, sigma_mm)
 
 
 @dataclass(frozen=True, slots=True)

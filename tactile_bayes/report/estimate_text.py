@@ -13,7 +13,7 @@ from tactile_bayes.posterior.quantity import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_quantities
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
-from tactile_bayes.report.size_text import shape_text, variance_text
+from tactile_bayes.report.size_text import range_cautions, shape_text, variance_text
 
 ROWS = (
     ("max_size_mm", "largest size", "mm"),
@@ -58,7 +58,7 @@ def estimate_text(
         return "\n".join([*first, *_looked_at(estimate), RESEARCH_USE]) + "\n"
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
-    lines = [_table(quantities, probability), ""]
+    lines = [*_cautions(estimate), _table(quantities, probability), ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
     lines += [*_findings(estimate), *_scene(estimate), *_warnings(estimate), *_left_out(estimate)]
@@ -120,9 +120,14 @@ def _scene(estimate: Estimate) -> list[str]:
     return [*lines, prior] if prior else lines
 
 
+def _cautions(estimate: Estimate) -> list[str]:
+    """What must be read before any number: that the map lies outside the calibration's range."""
+    return range_cautions(_texts(estimate.diagnostics.get("outside_calibration")))
+
+
 def _warnings(estimate: Estimate) -> list[str]:
     found = estimate.diagnostics
-    lines = [f"Outside the calibration's range: {text}." for text in _texts(found.get("outside_calibration"))]
+    lines = []
     if found.get("coarse_cells"):
         lines.append("The cells are coarse for this width: map again with a smaller --cell-mm.")
     offset = found.get("level_offset")

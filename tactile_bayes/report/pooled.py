@@ -13,7 +13,7 @@ from tactile_bayes.posterior.pooling import PooledEstimate, fat_left_out
 from tactile_bayes.posterior.quantity import summarise
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
-from tactile_bayes.report.size_text import shape_text, variance_text
+from tactile_bayes.report.size_text import range_cautions, shape_text, variance_text
 
 SCHEMA = "tactile-bayes/pooled/1"
 
@@ -72,7 +72,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
 
 def pooled_text(document: Mapping[str, Any]) -> str:
     """The report of a mass for people."""
-    lines = [_map_line(one) for one in document["maps"]]
+    lines = [*range_cautions(document["outside_calibration"]), *map(_map_line, document["maps"])]
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
     largest = document["max_size_mm"]
@@ -85,7 +85,6 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} % (median).")
     lines.append(shape_text(figures))
     lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
-    lines += [f"Outside the calibration's range: {text}." for text in document["outside_calibration"]]
     if document["left_out"]:
         lines.append(f"Left out: {'; '.join(document['left_out'])}.")
     if document["reason"]:

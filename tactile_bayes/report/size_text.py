@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 SOURCES = {
     "map": "the map",
@@ -13,6 +13,11 @@ SOURCES = {
     "body": "what no map shows of a body",
     "shape": "round or oval",
 }
+
+
+def range_cautions(outside: Sequence[str]) -> list[str]:
+    """The first lines of a report of a size outside its calibration's range."""
+    return [f"CAUTION: outside the calibration's range: {text}." for text in outside]
 
 
 def variance_text(share: Mapping[str, float]) -> str:

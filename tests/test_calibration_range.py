@@ -1,0 +1,130 @@
+"""Maps outside a calibration's range: sized with the caution first, without the depth of the fat, or not at all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run_here
+from posterior_files import MADE
+from posterior_maps import bump_map
+
+from tactile_bayes.commands.live_view import Turn, live_estimate
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pool_maps
+from tactile_bayes.presets import HEAD_PROFILE
+
+SHIPPED = size_calibration_path("solid")
+EVEN = (0.0, 0.0, 0.0)
+BUMP = (0.348, 5.69)
+"""Amplitude and sigma in mm of a bump on an even pressure, which stood for a lump of 15 mm; no body gives the two."""
+
+
+@pytest.fixture(scope="module")
+def shipped() -> LogQuadratic:
+    assert SHIPPED is not None
+    found = read_size_calibration(SHIPPED)
+    assert isinstance(found, LogQuadratic)
+    return found
+
+
+def log_size(calibration: LogQuadratic, amplitude: float, sigma_mm: float) -> float:
+    return float(calibration.log_size(np.log(np.array(amplitude)), np.log(np.array(sigma_mm))))
+
+
+def test_a_depth_that_no_body_goes_with_is_not_used(shipped: LogQuadratic) -> None:
+    told = shipped.at_fat([EVEN])
+    assert told.fat_mm is not None
+    assert np.exp(log_size(told, *BUMP)) < 8  # what was stated before, with an interval of 3.3 to 11.2 mm
+    used = told.fitting(*BUMP)
+    assert used.fat_mm is None
+    assert np.exp(log_size(used, *BUMP)) == pytest.approx(15.0, rel=0.1)
+    (words,) = used.outside(*BUMP)
+    assert "mm of fat is unlike any body of the table, so that depth is not used" in words
+    assert used.too_far(*BUMP) == []
+
+
+def test_a_depth_that_goes_with_the_map_stays(shipped: LogQuadratic) -> None:
+    told = shipped.at_fat([(-0.024, -0.002, 0.0)])
+    assert told.fat_mm is not None
+    assert told.fitting(0.323, 5.1) is told
+    assert told.outside(0.323, 5.1) == []
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "sigma_mm", "outside", "far"),
+    [(0.3, 5.0, "", ""), (8.0, 6.0, "amplitude 8", ""), (12.0, 6.0, "amplitude 12", "amplitude 12"),
+     (0.7, 14.0, "sigma 14 mm", ""), (0.7, 16.0, "sigma 16 mm", "sigma 16 mm"), (0.01, 5.0, "0.01", "0.01")],
+)  # fmt: skip
+def test_how_far_decides(shipped: LogQuadratic, amplitude: float, sigma_mm: float, outside: str, far: str) -> None:
+    found = shipped.outside(amplitude, sigma_mm), shipped.too_far(amplitude, sigma_mm)
+    for texts, words in zip(found, (outside, far), strict=True):
+        assert words in "; ".join(texts)
+        assert bool(texts) == bool(words)
+
+
+def gain_map(*, profile: tuple[float, ...] | None = None, **bump: float) -> TactileMap:
+    noise = 0.01 * np.random.default_rng(2).standard_normal((51, 51))
+    plain = bump_map(noise=noise, x=0.0, y=0.0, **bump)
+    quality = {} if profile is None else dict(zip(HEAD_PROFILE, profile, strict=True))
+    return replace(plain, recipe=replace(plain.recipe, normalise="gain"), quality={**plain.quality, **quality})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("range")
+    maps = {
+        "bump.nc": gain_map(profile=EVEN, amplitude=0.348, sigma_x=6.1, sigma_y=5.2),
+        "far.nc": gain_map(amplitude=15.0, sigma_x=5.0, sigma_y=5.0),
+        "sound.nc": gain_map(amplitude=0.35, sigma_x=5.0, sigma_y=5.0),
+    }
+    for name, tactile_map in maps.items():
+        write_map(place / name, tactile_map, provenance=MADE)
+    return place
+
+
+def test_the_caution_is_the_first_line(folder: Path) -> None:
+    done = run_here("estimate", "bump.nc", "--method", "laplace", cwd=folder)
+    assert done.returncode == EXIT_DONE, done.stderr
+    assert done.stdout.startswith("CAUTION: outside the calibration's range: amplitude 0.3")
+    row = next(line for line in done.stdout.splitlines() if line.startswith("largest size"))
+    assert float(row.split()[-4]) < 15.0 < float(row.split()[-2])
+
+
+def test_too_far_is_no_number_with_the_way_out(folder: Path) -> None:
+    done = run_here("estimate", "far.nc", "--method", "laplace", cwd=folder)
+    assert done.returncode == EXIT_NO_ESTIMATE
+    assert done.stdout.startswith("No estimate: too far outside the calibration's range for a size: amplitude 15")
+    assert "--size-calibration none for amplitude and widths" in done.stdout
+    found = json.loads(run_here("estimate", "far.nc", "--method", "laplace", "--json", cwd=folder).stdout)
+    assert (found["status"], found["reason_code"], found["max_size_mm"]) == ("no_estimate", "extrapolated", None)
+    assert found["diagnostics"]["outside_calibration"] != []
+    widths = run_here("estimate", "far.nc", "--method", "laplace", "--size-calibration", "none", cwd=folder)
+    assert widths.returncode == EXIT_DONE, widths.stderr
+
+
+def test_one_map_too_far_stops_a_pool_and_a_caution_comes_first(folder: Path, shipped: LogQuadratic) -> None:
+    done = run_here("estimate", "sound.nc", "far.nc", "--pool", "--method", "laplace", cwd=folder)
+    assert done.returncode == EXIT_NO_ESTIMATE
+    assert "No estimate: map 2: too far outside the calibration's range" in done.stdout
+    ones = np.ones(200)
+    far = ShapeDraws.of(15.0 * ones, 5.0 * ones, 5.0 * ones, 0.0 * ones)
+    pooled = pool_maps([far], calibration=shipped, priors=SizePriors(), rng=np.random.default_rng(1))
+    assert (pooled.status, pooled.size) == ("no_estimate", None)
+    cautioned = run_here("estimate", "bump.nc", "sound.nc", "--pool", "--method", "laplace", cwd=folder)
+    assert cautioned.stdout.startswith("CAUTION: outside the calibration's range: map 1: amplitude 0.3")
+
+
+def test_the_live_view_says_it_first() -> None:
+    said = live_estimate(gain_map(profile=EVEN, amplitude=0.348, sigma_x=6.1, sigma_y=5.2), str(SHIPPED), Turn()).text
+    assert said.startswith("CAUTION: outside the calibration's range: largest size")
+    far = live_estimate(gain_map(amplitude=15.0, sigma_x=5.0, sigma_y=5.0), str(SHIPPED), Turn()).text
+    assert far.startswith("no estimate: too far outside the calibration's range")
