@@ -59,7 +59,7 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
     """The figures from the (f, 4) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
 
     A lump, or the edge of a rib, is no smooth profile: the residual of a frame shows it, also where most frames feel
-    one. Rows of NaN are left out.
+    one. Rows of NaN, from an array without a profile, give no figures.
     """
     if len(rows) < LEAST_FRAMES:
         return {}
