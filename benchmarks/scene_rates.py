@@ -26,6 +26,7 @@ from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.other_rises import other_rises
 from tactile_bayes.posterior.sbc import draw_field, draw_truth
 
 HALF_MM, RADIUS_MM = 35.0, 20.0
@@ -34,7 +35,7 @@ AMPLITUDE, SIGMA_MM, NOISE_SD = 0.3, 5.0, 0.01
 RATIO = 1.33
 SLOPE = 0.03
 """Of the level over half a window: a tenth of the amplitude."""
-COLUMNS = ("lump", "oval", "ellipse", "rotated", "tilt", "second lump", "rib", "departure")
+COLUMNS = ("lump", "oval", "ellipse", "rotated", "tilt", "second lump", "rib", "departure", "another rise")
 Draw = Callable[[np.random.Generator], FloatArray]
 
 
@@ -73,6 +74,14 @@ def second_lump(rng: np.random.Generator) -> FloatArray:
     away, angle = rng.uniform(16.0, 22.0), rng.uniform(0.0, 2.0 * np.pi)
     height = AMPLITUDE * rng.uniform(1.0 / 3.0, 1.0)
     return height * gaussian(away * np.cos(angle), away * np.sin(angle), sigmas=np.array([4.0, 4.0]))
+
+
+def far_apart(rng: np.random.Generator) -> FloatArray:
+    """A lump and another, 30 to 40 mm away and a sixth to the whole as high: outside the window, on the map."""
+    half, angle = rng.uniform(15.0, 20.0), rng.uniform(0.0, 2.0 * np.pi)
+    x, y = half * np.cos(angle), half * np.sin(angle)
+    other = rng.uniform(1.0 / 6.0, 1.0) * gaussian(-x, -y, sigmas=np.array([4.0, 4.0]))
+    return np.asarray(AMPLITUDE * (gaussian(x, y, sigmas=np.array([SIGMA_MM, SIGMA_MM])) + other))
 
 
 def rib(rng: np.random.Generator) -> FloatArray:
@@ -123,6 +132,7 @@ ROWS = (
     Truths("a rib and no lump", rib_anywhere, ("rib",)),
     Truths("two ribs and no lump", two_ribs, ("rib",)),
     Truths("round, flatter than a Gaussian", flatter, ("lump", "departure")),
+    Truths("round and another far away", far_apart, ("lump", "another rise")),
 )
 
 
@@ -149,9 +159,10 @@ def found_on(tactile_map: TactileMap, rng: np.random.Generator) -> set[str]:
     """Names of `COLUMNS` that the report of one map would have."""
     options = EstimateOptions(method="laplace", fit=FitOptions("free", RADIUS_MM, "auto", None, "field"), draws=1000)
     answer = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
+    others = {"another rise"} if other_rises(tactile_map, answer, options) else set()
     if answer.scene is None:
-        return set()
-    found = {"lump"} | {one.name for one in answer.scene.structures if one.supported}
+        return others
+    found = {"lump"} | others | {one.name for one in answer.scene.structures if one.supported}
     return found | {"oval"} if found & {"ellipse", "rotated"} else found
 
 

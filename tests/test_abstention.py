@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,36 @@ def test_a_bump_that_cannot_be_measured_has_its_code(
     answer = fault_code(tactile_map, Candidate((0.0, 0.0), fit, found))
     assert answer[0] == code
     assert advice in answer[1]
+
+
+@pytest.mark.parametrize("centre", [None, (3.0, 2.0)])
+def test_no_lump_is_said_first_with_its_probability_and_the_place(centre: tuple[float, float] | None) -> None:
+    tactile_map = grid_map(1 + WHITE)
+    fit = replace(FIELD, centre_mm=centre)
+    found = estimate_map(tactile_map, calibration=None, options=EstimateOptions(fit=fit), rng=np.random.default_rng(1))
+    first = estimate_text(found, tactile_map, probability=0.95).splitlines()[0]
+    assert first.startswith("No lump found ")
+    assert ("on the 26 cm2 that the map covers" if centre is None else "near (3.0, 2.0) mm") in first
+    assert "strokes" not in found.advice
+    assert found.detection is None or found.detection.probability < 0.5
+    if centre is None:
+        assert "(probability of one " in first
+
+
+def test_rises_at_the_rim_of_an_empty_map_do_not_ask_for_strokes() -> None:
+    """The heads of an empty scan press harder at the map's rim: no reason to send anybody back."""
+    across = np.linspace(-1.0, 1.0, 51)
+    found = run(1 + 0.3 * across**8 + WHITE)
+    assert found.code == "undetected"
+    assert found.reason.startswith("no lump found on the 26 cm2")
+    assert "strokes" not in found.advice
+
+
+@pytest.mark.parametrize("centre", [(26.0, 0.0), (0.0, -300.0), (float("nan"), 0.0)])
+def test_a_place_off_the_map_is_a_usage_error(centre: tuple[float, float]) -> None:
+    options = EstimateOptions(fit=replace(FIELD, centre_mm=centre))
+    with pytest.raises(UsageError, match=r"off the map, which has x from -25.5 to 25.5 mm and y from -25.5 to 25.5 mm"):
+        estimate_map(grid_map(1 + WHITE), calibration=None, options=options, rng=np.random.default_rng(1))
 
 
 def test_a_measurable_lump_has_neither() -> None:

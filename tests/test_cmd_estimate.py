@@ -349,3 +349,23 @@ def test_options_that_do_not_go_together_are_refused(folder: Path, words: list[s
     done = run_here("estimate", *words, "--size-calibration", "none", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert message in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--centre-mm", 300, 2), "off the map, which has x from"),
+        (("--centre-mm", "nan", 2), "not a finite number"),
+        (("--fit-radius-mm", "nan"), "not a finite number"),
+        (("--fit-radius-mm", "inf"), "not a finite number"),
+        (("--interval", "nan"), "not a finite number"),
+        (("--accuracy-mm", "nan"), "not a finite number"),
+        (("--between-map-sd", "nan"), "not a finite number"),
+        (("--known", "depth_mm", "inf"), "not a finite number"),
+    ],
+)
+def test_a_place_or_a_range_that_makes_no_sense_is_a_usage_error(
+    folder: Path, words: tuple[object, ...], message: str
+) -> None:
+    done = run_here("estimate", "a.nc", *FAST, "--size-calibration", "none", *words, cwd=folder)
+    assert (done.returncode, message in done.stderr) == (2, True), done.stderr

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
@@ -50,7 +51,7 @@ def command() -> None:
 )
 @click.option(
     "--fit-radius-mm",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     help="Radius about the lump within which they were fitted, for a table that does not say. "
     f"Default: {FIT_RADIUS_MM:g}.",
 )
@@ -62,7 +63,7 @@ def command() -> None:
 )
 @click.option(
     "--least-stiffness-ratio",
-    type=click.FloatRange(min=0.0),
+    type=FiniteRange(min=0.0),
     default=0.0,
     show_default=True,
     help="Leave out softer lumps: above 8 the paper's widths change by less than 5 %.",

@@ -13,7 +13,7 @@ import click
 
 from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.number_or import WholeOrAuto
+from tactile_bayes.commands.number_or import FiniteRange, WholeOrAuto
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tactile_bayes.batch import Outcome
 
 _FILE = FilePath()
-_PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
+_PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 
 
 @click.command("estimate")
@@ -61,9 +61,7 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free where the level is "
     "not known (normalise none).",
 )
-@click.option(
-    "--fit-radius-mm", type=click.FloatRange(min=0.0, min_open=True), help="As the calibration's, if not given."
-)
+@click.option("--fit-radius-mm", type=FiniteRange(min=0.0, min_open=True), help="As the calibration's, if not given.")
 @click.option(
     "--rotation",
     type=click.Choice(["auto", "on", "off"]),
@@ -72,7 +70,10 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="auto: turn the ellipse only where the map asks for it.",
 )
 @click.option(
-    "--centre-mm", type=(float, float), metavar="X Y", help="Where on the map to look; else the highest bump."
+    "--centre-mm",
+    type=(FiniteRange(), FiniteRange()),
+    metavar="X Y",
+    help="Where on the map to look; else the highest bump.",
 )
 @click.option(
     "--scene",
@@ -105,24 +106,24 @@ _PROBABILITY = click.FloatRange(min=0.0, max=1.0, min_open=True, max_open=True)
 )
 @click.option(
     "--accuracy-sd",
-    type=click.FloatRange(min=0.001, max=0.5),
+    type=FiniteRange(min=0.001, max=0.5),
     help="Monte-Carlo error of interval ends, in posterior SDs; if not given, 0.02 for importance, 0.1 for the "
     "ensemble.",
 )
 @click.option(
     "--accuracy-mm",
-    type=click.FloatRange(min=0.0001, max=10.0),
+    type=FiniteRange(min=0.0001, max=10.0),
     help="The same of the map's widths, in mm; the finer of the two holds.",
 )
 @click.option(
     "--between-map-sd",
-    type=click.FloatRange(min=0.0, max=2.0),
+    type=FiniteRange(min=0.0, max=2.0),
     metavar="SD",
     help="Spread of ln size between maps of one mass, taken as known; if not given, learned, about the paper's 0.15.",
 )
 @click.option(
     "--known",
-    type=(str, float),
+    type=(str, FiniteRange()),
     multiple=True,
     metavar="NAME VALUE",
     help="Of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, stiffness_ratio, fat_kpa, "

@@ -87,6 +87,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import default_for
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map, fitting_calibration
+    from tactile_bayes.posterior.other_rises import other_rises
 
     tactile_map = read_map(path)
     shipped = default_for(tactile_map.recipe.normalise)
@@ -108,6 +109,7 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
     except BadDataError as error:
         raise error.at(path) from None
+    estimate = replace(estimate, other_rises=other_rises(tactile_map, estimate, options))
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     used = None if estimate.map_posterior is None else fitting_calibration(estimate.map_posterior, calibration)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
 
 _FILE = FilePath()
-_ABOVE_0 = click.FloatRange(min=0.0, min_open=True)
+_ABOVE_0 = FiniteRange(min=0.0, min_open=True)
 # The line is a map that does not change in y: a bump of this width there.
 _NO_CHANGE_MM = 1e6
 _GRID_SCHEMA = "study_grid.table.json"

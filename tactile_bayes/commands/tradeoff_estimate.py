@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
+from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM
 
@@ -18,7 +19,7 @@ _FILE = FilePath()
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error against time.")
 @click.option(
     "--fit-radius-mm",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     default=FIT_RADIUS_MM,
     show_default=True,
     help="As of `estimate`.",
@@ -26,7 +27,7 @@ _FILE = FilePath()
 @click.option("--prior", metavar="PRIOR.toml", type=_FILE, help="As of `estimate`.")
 @click.option(
     "--tolerance-sd",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     default=0.05,
     show_default=True,
     help="A smaller error of an interval's end is not worth paying for.",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
+from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ LEARNED = "learned"
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error in size against time.")
 @click.option(
     "--tolerance-percent",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     default=0.5,
     show_default=True,
     help="A smaller error in size is not worth paying for.",

@@ -214,8 +214,8 @@ def _check_options(
         raise BadDataError(f"pressure_window_kpa starts at {window[0]:g}", way_out="frames are divided by their mean")
     if latency_ms != "auto" and (isinstance(latency_ms, str) or not np.isfinite(latency_ms)):
         raise BadDataError(f"latency_ms is {latency_ms}", way_out="give a finite time in ms, or auto")
-    if plane_radius_mm not in (None, "auto") and (isinstance(plane_radius_mm, str) or not plane_radius_mm > 0):
-        raise BadDataError(f"plane_radius_mm is {plane_radius_mm}", way_out="give a distance above 0 mm, or auto")
+    if plane_radius_mm not in (None, "auto") and (isinstance(plane_radius_mm, str) or not 0 < plane_radius_mm < np.inf):
+        raise BadDataError(f"plane_radius_mm is {plane_radius_mm}", way_out="give a distance above 0 mm, auto or all")
 
 
 def _as_map(

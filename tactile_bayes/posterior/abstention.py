@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
@@ -16,6 +17,7 @@ from tactile_bayes.records import dataclass
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 CODES = ("empty", "undetected", "unresolved", "window", "prior", "extrapolated", "method")
+FEEL_AGAIN = "if a lump is felt, go over the place again, more slowly or with more lines, and map all scans together"
 NEEDED_IN_WIDTHS = 2.0
 """Widths of the bump beyond its centre that strokes should reach, so that its flank shows on every side."""
 LEAST_SEEN = 0.25
@@ -49,13 +51,74 @@ class Abstention:
     advice: str = ""
 
 
-def no_bump(tactile_map: TactileMap, candidates: Sequence[Candidate]) -> Abstention:
-    """None of the candidates can be measured: the highest one's fault decides."""
-    first = candidates[0]
-    where = f"near ({first.centre_mm[0]:.1f}, {first.centre_mm[1]:.1f}) mm"
-    reason = f"no bump can be measured ({len(candidates)} looked at); the highest, {where}: {first.fault}"
-    code, advice = fault_code(tactile_map, first)
+def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
+    """Where a lump is looked for, in words: the place that was given, or the area that the map covers.
+
+    Raises
+    ------
+    UsageError
+        When the place lies off the map.
+    """
+    if centre_mm is None:
+        area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
+        return f"on the {area:.2g} cm2 that the map covers"
+    half = tactile_map.recipe.cell_mm / 2.0
+    ends = [(float(axis[0]) - half, float(axis[-1]) + half) for axis in (tactile_map.x_mm, tactile_map.y_mm)]
+    if not all(low <= at <= high for at, (low, high) in zip(centre_mm, ends, strict=True)):
+        reach = " and ".join(
+            f"{name} from {low:g} to {high:g} mm" for name, (low, high) in zip("xy", ends, strict=True)
+        )
+        place = f"--centre-mm {centre_mm[0]:g} {centre_mm[1]:g}"
+        raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
+    return f"near ({centre_mm[0]:.1f}, {centre_mm[1]:.1f}) mm"
+
+
+def chance_text(probability: float) -> str:
+    """A probability as far as it means anything."""
+    return "below 0.001" if probability < 0.001 else f"{probability:.2g}"
+
+
+def no_bump(
+    tactile_map: TactileMap,
+    candidates: Sequence[Candidate],
+    likeliest: tuple[Candidate, Detection] | None,
+    *,
+    where: str,
+) -> Abstention:
+    """None of the candidates can be measured: no lump, or one that the map does not show well enough.
+
+    Parameters
+    ----------
+    likeliest
+        The candidate that is most likely a lump all the same, see `search.best_chance`.
+    where
+        What was searched, see `searched`.
+    """
+    first, chance = candidates[0], ""
+    if likeliest is not None:
+        if likeliest[1].probability >= 0.5:
+            return _unmeasured(tactile_map, *likeliest)
+        chance = f" (probability of one {chance_text(likeliest[1].probability)})"
+    reason = f"no lump found {where}{chance}: {first.fault}"
+    if len(candidates) > 1:
+        rises = f"none of {len(candidates)} rises can be one; the highest, {_place(first)}"
+        reason = f"no lump found {where}{chance}: {rises}: {first.fault}"
+    if likeliest is None and "covered cells" in first.fault:
+        short = missing_strokes(tactile_map, first.centre_mm, reach_mm=10.0)
+        return Abstention("window", reason, extend_advice(short) or "cover the place with more strokes")
+    return Abstention("undetected", reason, FEEL_AGAIN)
+
+
+def _unmeasured(tactile_map: TactileMap, candidate: Candidate, detection: Detection) -> Abstention:
+    """What is a lump by the evidence, and why it has no size."""
+    chance = f"probability of a lump {detection.probability:.2g}"
+    code, advice = fault_code(tactile_map, candidate)
+    reason = f"the rise {_place(candidate)} ({chance}) cannot be measured: {candidate.fault}"
     return Abstention(code, reason, advice)
+
+
+def _place(candidate: Candidate) -> str:
+    return f"near ({candidate.centre_mm[0]:.1f}, {candidate.centre_mm[1]:.1f}) mm"
 
 
 def fault_code(tactile_map: TactileMap, candidate: Candidate) -> tuple[str, str]:
@@ -112,14 +175,13 @@ def extend_advice(short: dict[str, float]) -> str:
     return f"extend the strokes {' and '.join(parts[:2])}" if parts else ""
 
 
-def undetected(detection: Detection, least: float) -> Abstention:
+def undetected(detection: Detection, least: float, *, where: str) -> Abstention:
     """No lump that the noise, or a ridge as a rib makes, would not explain as well."""
-    figures = f"(probability {detection.probability:.2g}, needed {least:g})"
+    figures = f"(probability of one {chance_text(detection.probability)}, needed {least:g})"
     if detection.ridge:
-        reason = f"no lump detected: {detection.ridge}, explains what rises {figures}"
+        reason = f"no lump found {where} {figures}: {detection.ridge}, explains what rises"
         return Abstention("undetected", reason, "feel whether it is a rib; name a lump's place with --centre-mm")
-    again = "go over the place again, more slowly or with more lines, and map all scans together"
-    return Abstention("undetected", f"no lump detected {figures}", again)
+    return Abstention("undetected", f"no lump found {where} {figures}", FEEL_AGAIN)
 
 
 def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, prior: BumpPrior) -> Abstention | None:
@@ -135,7 +197,7 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
     share = prior_share(sigma_x, sigma_y, prior)
     if share > MOST_PRIOR_SHARE:
         reason = (
-            f"the map hardly tells the widths: their posterior SD is {share:.2f} of the prior's "
+            f"the map hardly narrows the widths: their posterior SD is {share:.2f} of the prior's "
             f"(at most {MOST_PRIOR_SHARE:g})"
         )
         return Abstention("prior", reason, "scan again, more slowly or with more lines, and map all scans together")

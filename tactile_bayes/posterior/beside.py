@@ -57,7 +57,7 @@ def _beside_questions(
     lumps = second_lumps(plain, fitter)
     places: dict[Extra, FloatArray] = {
         "second lump": lumps[rises(plain, surroundings, "second lump", lumps)],
-        "rib": ridges,
+        "rib": _apart(plain, ridges),
     }
     fits = {
         extra: _fit_beside(fitter, plain, surroundings, extra, rising, forced=WANTED.get(scene) == extra)
@@ -156,6 +156,13 @@ def ribs(fitter: Fitter) -> FloatArray:
     angles = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
     grids = np.meshgrid(angles, offsets, np.log(GRID_WIDTHS_MM), indexing="ij")
     return np.stack([v.ravel() for v in grids], axis=1)
+
+
+def _apart(plain: FieldFit, ridges: FloatArray) -> FloatArray:
+    """Those of some ridges that lie beside a bump, not under it."""
+    scene = replace(plain.scene, extra="rib")
+    theta = np.column_stack([np.tile(plain.mode, (len(ridges), 1)), ridges])
+    return np.asarray(ridges[scene.rib_apart(theta, plain.target.window.middle)])
 
 
 def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:

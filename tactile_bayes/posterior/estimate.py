@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import Abstention, extrapolated, no_bump, shape_fault, undetected
+from tactile_bayes.posterior.abstention import Abstention, extrapolated, no_bump, searched, shape_fault, undetected
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
@@ -20,7 +20,7 @@ from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, check_ba
 from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, fat_left_out, pooled_size
-from tactile_bayes.posterior.search import ROTATION_ODDS, scene_asked, search
+from tactile_bayes.posterior.search import ROTATION_ODDS, best_chance, scene_asked, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.size import SizePosterior, push_sizes
 from tactile_bayes.posterior.size_calibration import SizeCalibration
@@ -30,6 +30,7 @@ from tactile_bayes.records import dataclass
 if TYPE_CHECKING:
     from tactile_bayes.posterior.chain_state import ChainStore
     from tactile_bayes.posterior.field_estimate import FieldAnswer
+    from tactile_bayes.posterior.other_rises import Rise
     from tactile_bayes.posterior.scene_choice import SceneChoice
 
 Status = Literal["estimate", "no_estimate"]
@@ -119,6 +120,8 @@ class Estimate:
         Under a noise field: what the window holds, and what was asked about it.
     sensitivity
         How far the answer leans on the prior of the widths.
+    other_rises
+        Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked.
     """
 
     status: Status
@@ -135,6 +138,7 @@ class Estimate:
     advice: str = ""
     scene: SceneChoice | None = None
     sensitivity: Sensitivity | None = None
+    other_rises: tuple[Rise, ...] = ()
 
 
 def estimate_map(
@@ -168,15 +172,18 @@ def estimate_map(
         calibration = calibration_for(tactile_map, calibration)
     if not tactile_map.covered.any():
         return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place"))
+    where = searched(tactile_map, options.fit.centre_mm)
     candidates, seen = search(tactile_map, options)
     if not candidates:
-        return _none(Abstention("empty", "nothing rises above the background"))
+        return _none(Abstention("empty", f"no lump found {where}: nothing rises above the background"))
     fit = candidates[-1].fit
     if seen is None or fit is None:
-        return _none(no_bump(tactile_map, candidates), candidates)
+        likeliest = best_chance(tactile_map, candidates, options)
+        why = no_bump(tactile_map, candidates, likeliest, where=where)
+        return _none(why, candidates, None if likeliest is None else likeliest[1])
     detection = seen if isinstance(seen, Detection) else seen.detection
     if detection.probability < options.least_probability:
-        return _none(undetected(detection, options.least_probability), candidates, detection)
+        return _none(undetected(detection, options.least_probability, where=where), candidates, detection)
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)

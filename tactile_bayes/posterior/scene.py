@@ -21,7 +21,8 @@ Extra = Literal["", "second lump", "rib"]
 REACH_IN_RADII = 1.5
 """How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
 APART = 2.0
-"""A second lump lies at least this many widths from the first: closer, two Gaussians have one top."""
+"""A second structure lies at least this many widths from the bump: closer, two Gaussians have one top, and a wide ridge
+under a lump is the level's own curve."""
 STEP = {
     "u": 0.06,
     "v": 0.06,
@@ -154,6 +155,8 @@ class Scene:
         total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
         if self.extra == "rib":
             allowed, volume = ridge_place(self.column(theta, "offset"), radius_mm)
+            if self.shape != "ridge":
+                allowed &= self.rib_apart(theta, middle)
             return total - np.log(volume), allowed
         x2, y2 = self.column(theta, "x2"), self.column(theta, "y2")
         allowed = np.hypot(x2 - middle[0], y2 - middle[1]) <= reach
@@ -162,6 +165,13 @@ class Scene:
             p, _, _ = self.widths(theta)
             allowed &= away >= APART * np.exp(np.maximum(p, w))
         return total - np.log(np.pi * reach**2), allowed
+
+    def rib_apart(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
+        """(m,) whether a rib's middle line lies `APART` widths or more from the bump's centre."""
+        angle, (p, _, _) = self.column(theta, "angle"), self.widths(theta)
+        x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
+        away = np.abs(self.column(theta, "offset") - x * np.cos(angle) - y * np.sin(angle))
+        return np.asarray(away >= APART * np.exp(np.maximum(p, self.column(theta, "w2"))))
 
 
 def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -128,6 +128,29 @@ def _close_search(
         if looks == MOST_LOOKS:
             break
     return None
+
+
+def best_chance(
+    tactile_map: TactileMap, candidates: Sequence[Candidate], options: EstimateOptions
+) -> tuple[Candidate, Detection] | None:
+    """The likeliest lump among the highest rises, none of which can be measured; None where none can be weighed.
+
+    `MOST_LOOKS` of them are weighed all the same, from a smaller window where the fit ran away or outgrew its own. A
+    fit to a single cell says nothing of a lump and is passed over.
+    """
+    weighed: list[tuple[Candidate, Detection]] = []
+    settings, found_on = _search_options(tactile_map, options.fit), levelled(tactile_map)
+    for candidate in candidates:
+        fit = candidate.fit
+        if fit is None or candidate.fault.startswith(OUTGROWN):
+            fit, _ = fit_close(found_on, candidate.centre_mm, options=settings)
+        if fit is None or min(fit.widths()[:2]) < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
+            continue
+        seen, _ = _look(tactile_map, _with_cells_of(tactile_map, fit, settings), options)
+        weighed.append((candidate, _detection(seen)))
+        if len(weighed) == MOST_LOOKS:
+            break
+    return max(weighed, key=lambda one: one[1].probability) if weighed else None
 
 
 def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:

@@ -13,8 +13,10 @@ from tactile_bayes.records import dataclass
 CLEAR_IN_WIDTHS = 2.0
 """Cells nearer to the bump than this many of its widths say nothing of what lies beside it."""
 STRIP_MM = 0.5
-LEAST_CELLS = 4.0
-"""Of a place's weight: with less of it on the map there is nothing to see."""
+PIECE_MM = 10.0
+"""Length of the pieces of a ridge whose rises are compared."""
+LEAST_CELLS, LEAST_IN_PIECE = 4.0, 1.0
+"""Of a place's weight, and of a piece's: with less of it on the map there is nothing to see."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +49,10 @@ class Surroundings:
         amplitude: float,
         middle: tuple[float, float],
     ) -> FloatArray:
-        """(g,) mean excess under second lumps or ribs, the bump taken off; -inf where the map does not show the place.
+        """(g,) excess under second lumps or ribs, the bump taken off; -inf where the map does not show the place.
+
+        Under a lump it is the mean. Along a rib it is the median over pieces of `PIECE_MM` if that is lower: a rib
+        rises along its whole length, while another lump on its line lifts the mean and only a piece or two.
 
         A head under constant force presses less beside a lump: the map dips there and comes back to its level. In a
         window that looks like a ridge along its rim. A rib or a lump rises above the level; a dip's far side does not.
@@ -62,26 +67,48 @@ class Surroundings:
         wide = bump_width_mm**2 + SMOOTHING_MM**2
         bump = amplitude * bump_width_mm**2 / wide * np.exp(-0.5 * away**2 / wide)
         excess = np.where(clear, self.excess - bump, 0.0)
-        weigh = self._under_lumps if extra == "second lump" else self._under_ribs
-        number, total = weigh(places, np.stack([clear.astype(np.float64), excess]), middle)
-        return np.where(number > LEAST_CELLS, total / np.maximum(number, 1e-300), -np.inf)
+        values = np.stack([clear.astype(np.float64), excess])
+        if extra == "rib":
+            return self._along_ribs(places, values, middle)
+        number, total = self._under_lumps(places, values)
+        return _mean(number, total, LEAST_CELLS)
 
-    def _under_lumps(self, places: FloatArray, values: FloatArray, _: tuple[float, float]) -> FloatArray:
+    def _under_lumps(self, places: FloatArray, values: FloatArray) -> FloatArray:
         """(2, g) sums of (2, ny, nx) values under round lumps: products of a profile along each axis."""
         x, y, width = places[:, 0, None], places[:, 1, None], np.exp(places[:, 2, None])
         columns = np.exp(-0.5 * ((self.x_mm - x) / width) ** 2)
         rows = np.exp(-0.5 * ((self.y_mm - y) / width) ** 2)
         return np.asarray(np.einsum("vgx,gx->vg", rows @ values, columns))
 
-    def _under_ribs(self, places: FloatArray, values: FloatArray, middle: tuple[float, float]) -> FloatArray:
-        """(2, g) sums of (2, ny, nx) values under ridges: those of one direction see the same strips of cells."""
-        found, flat = np.empty((2, len(places))), values.reshape(2, -1)
+    def _along_ribs(self, places: FloatArray, values: FloatArray, middle: tuple[float, float]) -> FloatArray:
+        """(g,) medians over a ridge's pieces; ridges of one direction see the same strips of cells."""
+        found, flat = np.empty(len(places)), values.reshape(2, -1)
+        x, y = self.x_mm - middle[0], self.y_mm[:, None] - middle[1]
         for angle in np.unique(places[:, 0]):
             these = places[:, 0] == angle
-            along = np.cos(angle) * (self.x_mm - middle[0]) + np.sin(angle) * (self.y_mm[:, None] - middle[1])
-            strip = np.rint((along - along.min()) / STRIP_MM).astype(np.intp).ravel()
-            strips = np.stack([np.bincount(strip, one) for one in flat])
-            at = along.min() + STRIP_MM * np.arange(strips.shape[1])
+            across = np.cos(angle) * x + np.sin(angle) * y
+            strip = np.rint((across - across.min()) / STRIP_MM).astype(np.intp)
+            piece = np.floor((np.cos(angle) * y - np.sin(angle) * x) / PIECE_MM).astype(np.intp)
+            piece -= piece.min()
+            pieces = int(piece.max()) + 1
+            cells, size = (strip * pieces + piece).ravel(), (int(strip.max()) + 1) * pieces
+            sums = np.stack([np.bincount(cells, one, minlength=size) for one in flat]).reshape(2, -1, pieces)
+            at = across.min() + STRIP_MM * np.arange(sums.shape[1])
             near = (at - places[these, 1, None]) / np.exp(places[these, 2, None])
-            found[:, these] = strips @ np.exp(-0.5 * near**2).T
+            number, total = np.exp(-0.5 * near**2) @ sums
+            mean = _mean(number.sum(axis=1), total.sum(axis=1), LEAST_CELLS)
+            found[these] = np.minimum(mean, _median_piece(number, total))
         return found
+
+
+def _mean(number: FloatArray, total: FloatArray, least: float) -> FloatArray:
+    """Means where there is enough weight, else -inf."""
+    return np.where(number > least, total / np.maximum(number, 1e-300), -np.inf)
+
+
+def _median_piece(number: FloatArray, total: FloatArray) -> FloatArray:
+    """(g,) median of the means of (g, pieces) that the map shows, the lower one of two; inf where it shows none."""
+    shown = number > LEAST_IN_PIECE
+    ordered = np.sort(np.where(shown, _mean(number, total, LEAST_IN_PIECE), np.inf), axis=1)
+    middle = np.maximum(shown.sum(axis=1) - 1, 0) // 2
+    return np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0]

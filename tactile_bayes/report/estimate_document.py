@@ -81,6 +81,7 @@ def estimate_document(
             {"x_mm": _round(c.centre_mm[0]), "y_mm": _round(c.centre_mm[1]), "fault": c.fault}
             for c in estimate.candidates
         ],
+        "other_rises": [rise.as_dict() for rise in estimate.other_rises],
         "left_out": list(estimate.left_out),
         "prior": prior.as_dict(),
         "research_use": RESEARCH_USE,

@@ -12,6 +12,7 @@ from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.quantity import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_quantities
+from tactile_bayes.report.rise_text import rise_lines
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
 from tactile_bayes.report.size_text import range_cautions, shape_text, variance_text
 
@@ -54,8 +55,9 @@ def estimate_text(
     `quantities` where they are at hand.
     """
     if estimate.status == "no_estimate":
-        first = [f"No estimate: {estimate.reason}.", *_advice(estimate)]
-        return "\n".join([*first, *_looked_at(estimate), RESEARCH_USE]) + "\n"
+        found = estimate.reason if estimate.reason.startswith("no lump") else f"no estimate: {estimate.reason}"
+        first = [f"{found[0].upper()}{found[1:]}.", *_advice(estimate)]
+        return "\n".join([*first, *rise_lines(estimate.other_rises), *_looked_at(estimate), RESEARCH_USE]) + "\n"
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
     lines = [*_cautions(estimate), _table(quantities, probability), ""]
@@ -86,6 +88,7 @@ def _findings(estimate: Estimate) -> list[str]:
     lines = []
     if estimate.detection is not None:
         lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
+    lines += rise_lines(estimate.other_rises)
     if estimate.size is not None:
         lines.append(variance_text(estimate.size.variance_share))
         if "oval_probability" in estimate.size.figures:

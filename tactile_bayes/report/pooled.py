@@ -62,6 +62,7 @@ def pooled_document(
 def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstimate) -> dict[str, Any]:
     return {
         "map": name,
+        "other_rises": list(document["other_rises"]),
         "status": document["status"],
         "reason": document["reason"],
         "detected_probability": document["detected_probability"],
@@ -73,6 +74,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
 def pooled_text(document: Mapping[str, Any]) -> str:
     """The report of a mass for people."""
     lines = [*range_cautions(document["outside_calibration"]), *map(_map_line, document["maps"])]
+    lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
     largest = document["max_size_mm"]
@@ -97,6 +99,12 @@ def _map_line(one: Mapping[str, Any]) -> str:
         return f"{one['map']}: no estimate ({one['reason']})"
     apart = "  lies apart from the others: look at this map" if one["outlying"] else ""
     return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{apart}"
+
+
+def _rise_line(name: str, rise: Mapping[str, float]) -> str:
+    where = f"({rise['x_mm']:.1f}, {rise['y_mm']:.1f}) mm"
+    chance = f"probability of a lump {rise['probability']:.3f}"
+    return f"{name}: another rise stands at {where} ({chance}); check that every map was sized at the same mass."
 
 
 def _unknowns(shares: Mapping[str, float], fat_mm: float | None) -> str:

@@ -12,22 +12,23 @@ from tactile_bayes.posterior.sensitivity import Sensitivity
 
 ASKED = {
     "ellipse": "an ellipse, not a circle",
-    "rotated": "a turned ellipse",
+    "rotated": "a rotated ellipse",
     "tilt": "a sloping level",
-    "second lump": "a second lump",
-    "rib": "a rib",
+    "second lump": "a second lump in this window",
+    "rib": "a rib in this window",
     "departure": "a departure from a Gaussian",
 }
-BUMP = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a turned ellipse"}
+BUMP = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a rotated ellipse"}
 LEAST_SHIFT_SD = 0.005
 
 
 def scene_lines(choice: SceneChoice) -> list[str]:
-    """The scene with its odds, what was kept in it all the same, and what was left out."""
-    beside = [one for one in choice.structures if one.used and one.place]
-    names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}" for one in beside)]
-    lines = [f"Scene: {' and '.join(names)}, the simplest that the map supports."]
-    for one in beside:
+    """The fit window's scene with its odds, what was kept in it all the same, and what was left out."""
+    used = [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
+    names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}".rstrip() for one in used)]
+    window = f"the fit window of {choice.fit.target.radius_mm:g} mm about the lump"
+    lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
+    for one in used:
         lines.append(f"{_sentence(ASKED[one.name])} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
     kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
     lines += [f"Kept open: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]

@@ -1,0 +1,157 @@
+"""Rises of a map other than the lump that was measured: where they stand, and how likely each is a lump."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tactile_bayes.forward.gaussian import cell_mean_gaussian
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.beside import LEAST_RISE
+from tactile_bayes.posterior.cells import SMOOTHING_MM, candidate_centres, levelled, smoothed_excess
+from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.fit import BumpFit
+from tactile_bayes.posterior.search import search
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, MapPosterior
+    from tactile_bayes.posterior.field_estimate import FieldAnswer
+
+BESIDE_IN_WIDTHS = 2.5
+"""Nearer to the lump than this many of its larger width, what a lump that is no Gaussian leaves looks like a rise."""
+MOST_NAMED, MOST_LOOKS = 4, 3
+"""Rises that are named, and places that turn out to be none before the search ends: each look costs some 50 ms."""
+LEAST_PROBABILITY = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Rise:
+    """Another rise.
+
+    Parameters
+    ----------
+    x_mm, y_mm
+        Its centre in `plane`.
+    distance_mm
+        From the lump that was measured; None where there is none.
+    amplitude, sigma_x_mm, sigma_y_mm
+        Of its bump at the mode; widths along the axes of its ellipse.
+    probability
+        That it is a lump, as `Detection` has it.
+    """
+
+    x_mm: float
+    y_mm: float
+    distance_mm: float | None
+    amplitude: float
+    sigma_x_mm: float
+    sigma_y_mm: float
+    probability: float
+
+    def as_dict(self) -> dict[str, float | None]:
+        """As JSON holds it."""
+        return {name: None if value is None else float(f"{value:.6g}") for name, value in asdict(self).items()}
+
+
+def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOptions) -> tuple[Rise, ...]:
+    """Rises that are lumps by the evidence once the measured lump is taken off the map, the highest first.
+
+    A structure that the lump's own scene holds (a second lump, a rib) is named there. Without an estimate the whole map
+    has been searched, unless a place was given: then the rest of the map is searched here.
+    """
+    if estimate.map_posterior is None and options.fit.centre_mm is None:
+        return ()
+    rest = tactile_map if estimate.map_posterior is None else _without(tactile_map, estimate.map_posterior)
+    rises: list[Rise] = []
+    misses = 0
+    for centre in _places(rest, estimate):
+        given = replace(options, fit=replace(options.fit, centre_mm=centre, start_width_mm=None), scene="auto")
+        candidates, seen = search(rest, given)
+        fit = candidates[-1].fit if candidates else None
+        found = None if seen is None or fit is None else _rise(seen, fit, estimate)
+        if found is None or found.probability < LEAST_PROBABILITY or _is_known(found, rises, estimate):
+            misses += 1
+        else:
+            rises.append(found)
+        if misses == MOST_LOOKS or len(rises) == MOST_NAMED:
+            break
+    return tuple(rises)
+
+
+def _median(posterior: MapPosterior, name: str) -> float:
+    return float(np.median(getattr(posterior, name)))
+
+
+def _without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
+    """The map less the bump of the posterior's medians."""
+    x, y, angle = (_median(posterior, name) for name in ("x_mm", "y_mm", "angle_rad"))
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    squares = [_median(posterior, name) ** 2 for name in ("sigma_x_mm", "sigma_y_mm")]
+    u, v = np.meshgrid(tactile_map.x_mm - x, tactile_map.y_mm - y)
+    bump = cell_mean_gaussian(
+        u.ravel(), v.ravel(), covariance_mm2=turn @ np.diag(squares) @ turn.T, cell_mm=tactile_map.recipe.cell_mm
+    )
+    return replace(tactile_map, mean=tactile_map.mean - _median(posterior, "amplitude") * bump.reshape(u.shape))
+
+
+def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float]]:
+    """Local maxima that stand out by a share of the lump's amplitude and lie clear of it, highest first."""
+    found_on, posterior = levelled(rest), estimate.map_posterior
+    least = 0.0 if posterior is None else LEAST_RISE * _median(posterior, "amplitude")
+    height = smoothed_excess(found_on)
+    for x, y in candidate_centres(found_on):
+        row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
+        if height[row, column] > least and _beside(x, y, estimate):
+            yield x, y
+
+
+def _beside(x: float, y: float, estimate: Estimate) -> bool:
+    """Whether a place is clear of the measured lump and of what its scene holds beside it."""
+    posterior = estimate.map_posterior
+    if posterior is None:
+        return True
+    wide = max(_median(posterior, name) for name in ("sigma_x_mm", "sigma_y_mm"))
+    away = float(np.hypot(x - _median(posterior, "x_mm"), y - _median(posterior, "y_mm")))
+    return away > BESIDE_IN_WIDTHS * wide and not _in_scene(x, y, estimate)
+
+
+def _in_scene(x: float, y: float, estimate: Estimate) -> bool:
+    """Whether a place belongs to the second lump or the rib of the lump's scene."""
+    if estimate.scene is None or not estimate.scene.fit.scene.extra:
+        return False
+    fit = estimate.scene.fit
+    one, two, log_width = (float(value) for value in fit.mode[-3:])
+    if fit.scene.extra == "second lump":
+        away = np.hypot(x - one, y - two)
+    else:
+        middle = fit.target.window.middle
+        away = abs((x - middle[0]) * np.cos(one) + (y - middle[1]) * np.sin(one) - two)
+    return bool(away < BESIDE_IN_WIDTHS * np.exp(log_width))
+
+
+def _rise(seen: Detection | FieldAnswer, fit: BumpFit, estimate: Estimate) -> Rise:
+    """What was seen at a place, as a rise."""
+    if isinstance(seen, Detection):
+        amplitude, x, y = (float(value) for value in fit.theta[:3])
+        sigma_x, sigma_y, _ = fit.widths()
+        probability = seen.probability
+    else:
+        from tactile_bayes.posterior.field_posterior import shape_draws
+
+        chosen, probability = seen.choice.fit, seen.detection.probability
+        sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(chosen, chosen.mode[None]))
+        x, y = (float(chosen.scene.column(chosen.mode, name)) for name in "xy")
+        amplitude = chosen.target.amplitude_at(chosen.mode)
+    lump = estimate.map_posterior
+    distance = None if lump is None else float(np.hypot(x - _median(lump, "x_mm"), y - _median(lump, "y_mm")))
+    return Rise(x, y, distance, amplitude, sigma_x, sigma_y, probability)
+
+
+def _is_known(rise: Rise, rises: list[Rise], estimate: Estimate) -> bool:
+    """Whether a fit has run to a place that is named already, or back to the measured lump."""
+    again = any(np.hypot(rise.x_mm - one.x_mm, rise.y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
+    return again or not _beside(rise.x_mm, rise.y_mm, estimate)

@@ -1,0 +1,93 @@
+"""Other rises than the lump that was measured: named where they stand, and rarely where none does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run_here
+from posterior_maps import bump_values, correlated_field, grid_map
+
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.other_rises import Rise, other_rises
+
+HALF_MM = 35.0
+SMALL = (15.0, 2.0)
+
+
+def values(*, second: float, seed: int = 1) -> np.ndarray:
+    """A lump at (-18, 2) mm on errors with a length of 3 mm, and 33 mm from it a second of some amplitude."""
+    rng = np.random.default_rng(seed)
+    first = bump_values(half_mm=HALF_MM, x=-18.0, y=2.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.5)
+    other = bump_values(half_mm=HALF_MM, x=SMALL[0], y=SMALL[1], sigma_x=4.0, sigma_y=4.0, amplitude=second, level=0.0)
+    field = correlated_field(rng, len(first), length_cells=3.0)
+    return first + other + 0.005 * field + 0.005 * rng.standard_normal(first.shape)
+
+
+def looked(mean: np.ndarray, centre: tuple[float, float] | None = None) -> tuple[Estimate, tuple[Rise, ...]]:
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", centre, "field"), draws=400)
+    tactile_map = grid_map(mean)
+    found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
+    return found, other_rises(tactile_map, found, options)
+
+
+def test_another_lump_far_away_is_named_where_it_stands() -> None:
+    found, rises = looked(values(second=0.1))
+    assert found.fit is not None
+    assert len(rises) == 1
+    assert np.hypot(rises[0].x_mm - SMALL[0], rises[0].y_mm - SMALL[1]) < 1.0
+    assert rises[0].distance_mm == pytest.approx(33.0, abs=1.0)
+    assert rises[0].probability > 0.95
+    assert rises[0].amplitude == pytest.approx(0.1, abs=0.03)
+
+
+def test_one_lump_is_not_named_twice() -> None:
+    """The control of the test above; `benchmarks.scene_rates` has the shares over hundreds of maps."""
+    for seed in range(3):
+        assert looked(values(second=0.0, seed=seed))[1] == ()
+
+
+def test_at_a_place_that_was_given_the_rest_of_the_map_is_named() -> None:
+    found, rises = looked(values(second=0.1), SMALL)
+    assert found.status == "estimate"
+    assert [round(rise.x_mm) for rise in rises] == [-18]
+    found, rises = looked(values(second=0.1), (0.0, -25.0))
+    assert found.status == "no_estimate"
+    assert [round(rise.x_mm) for rise in rises] == [-18, 15]
+    assert rises[0].distance_mm is None
+
+
+def test_a_larger_lump_far_away_is_no_rib_under_a_small_one() -> None:
+    """A rib of sigma 10 mm was once laid through both masses of a scan, 2 mm from the smaller one's centre."""
+    level = 0.02 * np.cos(np.arange(-HALF_MM, HALF_MM + 1) / 12.0)[:, None]  # a level that curves, as gains leave it
+    found, _ = looked(values(second=0.1) + level, SMALL)
+    assert found.scene is not None
+    assert found.scene.fit.scene.extra != "rib"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("two")
+    for name, second in (("two.nc", 0.1), ("one.nc", 0.0)):
+        write_map(place / name, grid_map(values(second=second)), provenance=Provenance("import", {}))
+    return place
+
+
+def test_text_json_and_pool_name_it(folder: Path) -> None:
+    text = run_here("estimate", "two.nc", cwd=folder).stdout
+    assert "Another rise stands at (15." in text or "Another rise stands at (14." in text
+    assert "To measure it: --centre-mm" in text
+    assert "a second lump in this window (odds" in text
+    assert "Scene in the fit window of 20 mm about the lump: " in text
+    rise = json.loads(run_here("estimate", "two.nc", "--json", cwd=folder).stdout)["other_rises"][0]
+    assert (rise["x_mm"], rise["y_mm"]) == pytest.approx(SMALL, abs=1.0)
+    alone = run_here("estimate", "one.nc", cwd=folder).stdout
+    assert "Another rise" not in alone
+    pooled = run_here("estimate", "one.nc", "two.nc", "--pool", cwd=folder).stdout
+    assert "two.nc: another rise stands at (1" in pooled
+    assert "one.nc: another rise" not in pooled
