@@ -220,7 +220,7 @@ def test_documents_say_null_where_there_is_nothing() -> None:
     assert document["reason"]
     for name in ("max_size_mm", "d_x_mm", "amplitude", "sigma_x_mm", "centre_mm", "variance_share", "noise_sd"):
         assert document[name] is None
-    assert estimate_text(nothing, bump_map(), probability=0.95).startswith("No estimate: ")
+    assert estimate_text(nothing, bump_map(), probability=0.95).startswith("No lump found on the ")
 
 
 def test_the_centre_is_told_in_the_patients_frame() -> None:

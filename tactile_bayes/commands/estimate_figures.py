@@ -68,11 +68,14 @@ def draw_size(
 
 
 def _draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path, *, name: str, force: bool) -> None:
+    from tactile_bayes.report.estimate_text import no_estimate_line
     from tactile_bayes.report.map_figure import Place, map_figure
 
     places = [Place(one.centre_mm, one.fault) for one in estimate.candidates if one.fault]
-    why = {"no_estimate": f"No estimate: {estimate.reason}.", "estimate": f"No size: {estimate.reason}."}
-    note = why[estimate.status] if estimate.reason and estimate.size is None else ""
+    note = ""
+    if estimate.reason and estimate.size is None:
+        gone = estimate.status == "no_estimate"
+        note = no_estimate_line(estimate.reason) if gone else f"No size: {estimate.reason}."
     map_figure(
         tactile_map,
         path,

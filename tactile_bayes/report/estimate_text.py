@@ -55,8 +55,7 @@ def estimate_text(
     `quantities` where they are at hand.
     """
     if estimate.status == "no_estimate":
-        found = estimate.reason if estimate.reason.startswith("no lump") else f"no estimate: {estimate.reason}"
-        first = [f"{found[0].upper()}{found[1:]}.", *_advice(estimate)]
+        first = [no_estimate_line(estimate.reason), *_advice(estimate)]
         return "\n".join([*first, *rise_lines(estimate.other_rises), *_looked_at(estimate), RESEARCH_USE]) + "\n"
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
@@ -66,6 +65,11 @@ def estimate_text(
     lines += [*_findings(estimate), *_scene(estimate), *_warnings(estimate), *_left_out(estimate)]
     lines += [] if prior is None else [prior_line(prior, field=estimate.diagnostics.get("noise") == "field")]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def no_estimate_line(reason: str) -> str:
+    """What a report without an estimate begins with; that there is no lump is said first."""
+    return f"{reason[0].upper()}{reason[1:]}." if reason.startswith("no lump found") else f"No estimate: {reason}."
 
 
 def _advice(estimate: Estimate) -> list[str]:
