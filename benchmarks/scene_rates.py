@@ -3,8 +3,8 @@
 Prints the table of docs/decisions/0055. Every map goes the whole way through `estimate_map`. A structure is found where
 the report says that the map supports it (`Structure.supported`): odds above 3 for an ellipse, a rotation, a tilt or a
 departure from a Gaussian; above 10, and a rise of 5 % of the lump's amplitude, for a second lump or a rib. Oval is an
-ellipse or a rotation. Another rise is one that `other_rises` names. A lump is found where a size is given; a map without
-a size is one on which nothing was found.
+ellipse or a rotation. Another rise is one that `other_rises` names. A lump is found where a size is given; a map
+without a size is one on which nothing was found.
 
 Lumps have an amplitude of 0.3 and sigma 5 mm (geometric mean). Errors are 0.01 from cell to cell and a field of 0.01
 with a correlation length of 1.5 to 12 mm, a thirtieth of the amplitude each; or as large and long as `sbc` draws them.
