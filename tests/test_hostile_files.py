@@ -83,6 +83,15 @@ def test_a_bomb_is_refused_before_memory_is_taken(case: str, tmp_path: Path, req
     assert "\n" not in str(refusal.value)
 
 
+def test_an_image_chunk_that_claims_4_gb_takes_what_is_there(tmp_path: Path, request) -> None:
+    path = tmp_path / "image.png"
+    there, claimed = (struct.pack(">I", number) + b"IDAT" for number in (12, 2**32 - 1))
+    path.write_bytes(hostile.png(8, 8).replace(there, claimed))
+    assert claimed in path.read_bytes()
+    request.getfixturevalue("little_memory")
+    assert read_grid(path, spacing_mm=1.0).mean.shape == (8, 8)
+
+
 def test_a_packed_chunk_of_a_map_gives_no_more_than_it_declares(plain: Path, request) -> None:
     hostile.deflate_bomb(plain, megabytes=500)
     request.getfixturevalue("little_memory")

@@ -18,7 +18,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.npz import load_npz
-from tactile_bayes.files.reading import CELLS, TABLE_BYTES, check_limit, decoding, open_input, read_text
+from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, TABLE_BYTES, check_limit, decoding, read_bytes, read_text
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 
@@ -220,14 +220,14 @@ def _field(text: str, row: int, column: int) -> float:
 def _image(path: Path) -> FloatArray:
     from PIL import Image, UnidentifiedImageError
 
+    data = read_bytes(path, most=IMAGE_BYTES)  # from memory: a chunk cannot claim more than there is
     with (
-        open_input(path) as file,
         decoding("cannot be decoded", way_out="save it again as TIFF, PGM or PNG"),
         warnings.catch_warnings(action="ignore"),  # damage is told by the errors
     ):
         Image.MAX_IMAGE_PIXELS = None  # the limit below is the one that can be raised
         try:
-            image = Image.open(file, formats=("TIFF", "PPM", "PNG"))
+            image = Image.open(io.BytesIO(data), formats=("TIFF", "PPM", "PNG"))
         except UnidentifiedImageError:
             raise BadDataError("is not an image", way_out="give a grey TIFF, PGM or PNG") from None
         check_limit(image.width * image.height, CELLS, what="it has {} pixels")

@@ -8,6 +8,7 @@ number, 1 where it is not set), so that a sound file that is too large for them 
 | TOML | 1 MB, keys of up to 16 parts |
 | JSON | 16 MB, 64 levels deep |
 | CSV and text tables | 32 MB |
+| an image | 128 MB |
 | netCDF | 256 MB |
 | a grid, an image or a map | 2^24 cells |
 | what is packed (MCAP, npz, netCDF) | unpacked 64 MB or 32 times the file, whichever is more |
@@ -29,6 +30,7 @@ LIMITS_VARIABLE: Final = "TACTILE_BAYES_LIMITS"
 TOML_BYTES: Final = 10**6
 JSON_BYTES: Final = 16 * 10**6
 TABLE_BYTES: Final = 32 * 10**6
+IMAGE_BYTES: Final = 128 * 10**6
 NETCDF_BYTES: Final = 256 * 10**6
 CELLS: Final = 2**24
 _UNPACKED_BYTES: Final = 64 * 10**6
