@@ -11,10 +11,10 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.posterior.importance import (
     ImportanceOptions,
     importance,
-    normal_quantile,
     systematic,
     weighted_quantile,
 )
+from tactile_bayes.posterior.normal import normal_quantile
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, fit_generalised_pareto, smooth_weights
 from tactile_bayes.posterior.sobol import BITS, MOST_DIMENSIONS, shifted_sobol, sobol_integers
 

@@ -10,7 +10,7 @@ import pytest
 from tactile_bayes.commands.sbc import _shipped
 from tactile_bayes.posterior import sbc
 from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.estimate import MapPosterior
+from tactile_bayes.posterior.drawn import MapPosterior
 from tactile_bayes.posterior.field import LENGTHS_MM
 from tactile_bayes.posterior.rank_tests import (
     BAND,

@@ -107,13 +107,13 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--accuracy-sd",
     type=FiniteRange(min=0.001, max=0.5),
-    help="Monte-Carlo error of interval ends, in posterior SDs; if not given, 0.02 for importance, 0.1 for the "
-    "ensemble.",
+    help="Wanted Monte-Carlo error of the interval ends of sizes and map widths, in posterior SDs. Default: 0.02 for "
+    "importance, 0.1 for ensemble.",
 )
 @click.option(
     "--accuracy-mm",
     type=FiniteRange(min=0.0001, max=10.0),
-    help="The same of the map's widths, in mm; the finer of the two holds.",
+    help="The same in mm; the finer of the two holds.",
 )
 @click.option(
     "--between-map-sd",

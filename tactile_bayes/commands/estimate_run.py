@@ -51,7 +51,8 @@ class Settings:
 class Answer:
     """What one map came to: its JSON object and its text, or an error with its exit code.
 
-    `shape` holds what pooling needs of a map on which a lump was found, `normalise` how the map's frames were.
+    `shape` holds what pooling needs of a map on which a lump was found, `normalise` how the map's frames were,
+    `fingerprint` what its values seed random numbers with.
     """
 
     document: dict[str, Any] | None
@@ -59,6 +60,7 @@ class Answer:
     exit_code: int
     shape: ShapeDraws | None = None
     normalise: str = ""
+    fingerprint: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +88,8 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
     from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import default_for
-    from tactile_bayes.posterior.estimate import calibration_for, estimate_map, fitting_calibration
+    from tactile_bayes.posterior.drawn import fitting_calibration
+    from tactile_bayes.posterior.estimate import calibration_for, estimate_map
     from tactile_bayes.posterior.other_rises import other_rises
 
     tactile_map = read_map(path)
@@ -103,8 +106,8 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
 
         context = digests.get("size_calibration", "no calibration")
         options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
-    # the map's own digest is part of the seed: a map's answer does not depend on its place in a list
-    rng = np.random.default_rng([settings.seed, int(digests["map"][:16], 16)])
+    # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history
+    rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
     try:
         estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
     except BadDataError as error:
@@ -264,7 +267,8 @@ def answer_of(tactile_map: TactileMap, estimate: Estimate, provenance: Provenanc
     )
     text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
-    return Answer(document, text, exit_code, _shape(tactile_map, estimate), tactile_map.recipe.normalise)
+    shape, normalise = _shape(tactile_map, estimate), tactile_map.recipe.normalise
+    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint)
 
 
 def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
@@ -275,7 +279,7 @@ def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     from tactile_bayes.posterior.pooling import ShapeDraws
 
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
-    if posterior is None:
+    if posterior is None or estimate.draws is None:
         return None
     angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
     return ShapeDraws.of(
@@ -285,4 +289,5 @@ def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
         posterior.angle_rad,
         turn_rad=angle,
         profile=head_profile(tactile_map.quality),
+        labels=estimate.draws.replicates,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import field
 
@@ -130,6 +131,22 @@ class TactileMap:
         covered = self.count > 0
         if np.isinf(self.mean[covered]).any():
             raise BadDataError("mean holds infinite values", way_out="mark cells without data by count 0")
+
+    @property
+    def fingerprint(self) -> int:
+        """64 bits of a hash of the cells and their values: what seeds random numbers, whatever file the map is in.
+
+        Where the map came from, where it lies in the patient and what the file says of it are no part of it.
+        """
+        digest = hashlib.sha256(np.array(self.mean.shape, dtype="<i8").tobytes())
+        covered = self.covered
+        for values in (self.mean, self.variance, self.count):
+            # a NaN has many bit patterns, and what a file holds where there are no data is nobody's business
+            held = np.where(covered & np.isfinite(values), values, 0.0)
+            digest.update(np.ascontiguousarray(held, dtype="<f8").tobytes())
+        for axis in (self.x_mm, self.y_mm):
+            digest.update(np.ascontiguousarray(axis, dtype="<f8").tobytes())
+        return int.from_bytes(digest.digest()[:8], "big")
 
     @property
     def covered(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

@@ -14,6 +14,14 @@ END_ERROR = 2.67
 """Monte-Carlo error of an end of a 95 % interval, in SDs, times the root of the independent draws (normal tails)."""
 INDEPENDENT_DRAWS = 4000
 """Draws of the methods that draw independently: end-point Monte-Carlo error of a 95 % interval about 0.04 SD."""
+REPLICATES = 4
+"""Independent parts of every set of draws; what differs between them is the Monte-Carlo error."""
+Labels = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+
+def even_replicates(number: int) -> Labels:
+    """(number,) labels that divide independent draws into `REPLICATES` parts."""
+    return np.arange(number) * REPLICATES // max(number, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,16 +35,27 @@ class ParameterDraws:
         One of `presets.METHODS`.
     diagnostics
         Figures of the method (R-hat, effective draws, evaluations...), for the report.
+    labels : (chain * draw,) array or None
+        The independent replicate that each draw comes from, for draws in one chain; None for independent draws.
     """
 
     theta: FloatArray
     method: str
     diagnostics: Mapping[str, float] = field(default_factory=dict)
+    labels: Labels | None = None
 
     @property
     def flat(self) -> FloatArray:
         """(chain * draw, p) all draws."""
         return self.theta.reshape(-1, self.theta.shape[-1])
+
+    @property
+    def replicates(self) -> Labels:
+        """(chain * draw,) label of the independent replicate of each draw; chains are independent of each other."""
+        chains, draws = self.theta.shape[:2]
+        if self.labels is not None:
+            return self.labels
+        return even_replicates(draws) if chains == 1 else np.repeat(np.arange(chains), draws) % REPLICATES
 
     @property
     def effective_draws(self) -> float:

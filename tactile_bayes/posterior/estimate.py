@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field, replace
+from dataclasses import field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import Abstention, extrapolated, no_bump, searched, shape_fault, undetected
+from tactile_bayes.posterior.abstention import Abstention, extrapolated, no_bump, searched, undetected
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.drawn import MapPosterior, draw_sized, medians, range_faults
 from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
 from tactile_bayes.posterior.fat_depth import head_profile
 from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, check_background
-from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, fat_left_out, pooled_size
-from tactile_bayes.posterior.search import ROTATION_ODDS, best_chance, scene_asked, search
+from tactile_bayes.posterior.pooling import SizePriors, fat_left_out
+from tactile_bayes.posterior.search import ROTATION_ODDS, best_chance, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
-from tactile_bayes.posterior.size import SizePosterior, push_sizes
+from tactile_bayes.posterior.size import SizePosterior
 from tactile_bayes.posterior.size_calibration import SizeCalibration
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.chain_state import ChainStore
-    from tactile_bayes.posterior.field_estimate import FieldAnswer
     from tactile_bayes.posterior.other_rises import Rise
     from tactile_bayes.posterior.scene_choice import SceneChoice
 
@@ -55,13 +53,14 @@ class EstimateOptions:
     max_steps
         Of the ensemble; None for its default.
     accuracy_sd
-        Of interval ends, in posterior SDs, for importance sampling; None for its default.
+        Wanted Monte-Carlo error of the ends of 95 % intervals, of sizes and widths alike, in posterior SDs; None for
+        the method's default.
     size_priors
         Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
     scene
         One of `scene_choice.SCENES`, under a noise field.
     accuracy_mm
-        As `accuracy_sd`, of the widths in mm; the finer of the two holds. Under a noise field.
+        The same in mm; the finer of the two holds. Under a noise field.
     store
         Where an ensemble keeps its state between runs, under a noise field.
     draws
@@ -79,20 +78,6 @@ class EstimateOptions:
     accuracy_mm: float | None = None
     store: ChainStore | None = None
     draws: int = INDEPENDENT_DRAWS
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapPosterior:
-    """Joint draws of what Eq 7 describes, each (chain, draw)."""
-
-    amplitude: FloatArray
-    sigma_x_mm: FloatArray
-    sigma_y_mm: FloatArray
-    x_mm: FloatArray
-    y_mm: FloatArray
-    angle_rad: FloatArray
-    background: FloatArray
-    noise_sd: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,33 +172,21 @@ def estimate_map(
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)
-    scene: SceneChoice | None = None
-    if not isinstance(seen, Detection):
-        try:
-            seen = _draw_under_field(seen, tactile_map, options, rng=rng, progress=progress)
-        except NotConvergedError as error:
-            if options.method == "ensemble":
-                raise
-            advice = "give --method ensemble with more --max-steps"
-            return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection)
-        detection, draws, noise, scene = seen.detection, seen.draws, dict(seen.diagnostics), seen.choice
-        assert draws is not None
-        posterior = MapPosterior(**seen.posterior)
-    else:
-        fit, odds = chosen_rotation(tactile_map, fit, options=options.fit, prior=options.prior)
-        draws, figures = draw_independent(fit, options, rng=rng, progress=progress)
-        posterior, noise = MapPosterior(**figures), judged_noise(fit, odds)
-    fault = shape_fault(
-        posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
-    )
-    if fault is not None:
-        return _none(fault, candidates, detection)
-    calibration = fitting_calibration(posterior, calibration)
-    diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | noise
+    try:
+        found = draw_sized(tactile_map, fit, seen, calibration, options, rng=rng, progress=progress)
+    except NotConvergedError as error:
+        if options.method == "ensemble" or isinstance(seen, Detection):
+            raise
+        advice = "give --method ensemble with more --max-steps"
+        return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection)
+    detection, fit, draws, posterior, size = found.detection, found.fit, found.draws, found.posterior, found.size
+    if found.fault is not None:
+        return _none(found.fault, candidates, detection)
+    calibration = found.calibration
+    diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | dict(found.figures)
     diagnostics["method"] = draws.method
-    if far := range_faults(posterior, calibration, "too_far"):
-        return _none(extrapolated(far), candidates, detection, diagnostics)
-    size = _size(posterior, calibration, options.size_priors, rng=rng)
+    if found.too_far:
+        return _none(extrapolated(list(found.too_far)), candidates, detection, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         outside = Abstention("extrapolated", reason, "learn a calibration whose table holds such lumps")
@@ -230,7 +203,7 @@ def estimate_map(
         candidates=candidates,
         diagnostics=diagnostics,
         left_out=_left_out(tactile_map, options, calibration, diagnostics),
-        scene=scene,
+        scene=found.scene,
         sensitivity=_sensitivity(posterior, size, options),
     )
 
@@ -307,90 +280,13 @@ def _check_options(options: EstimateOptions) -> None:
         raise UsageError("a noise field takes level and tilt with it; give --background free")
 
 
-def _size(
-    posterior: MapPosterior,
-    calibration: SizeCalibration | LogQuadratic | None,
-    priors: SizePriors,
-    *,
-    rng: np.random.Generator,
-) -> SizePosterior | None:
-    if calibration is None:
-        return None
-    if isinstance(calibration, LogQuadratic):
-        draws = ShapeDraws.of(posterior.amplitude, posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.angle_rad)
-        size = pooled_size([draws], calibration=calibration, priors=priors, rng=rng)
-        shape = posterior.amplitude.shape
-        return replace(size, d_x_mm=size.d_x_mm.reshape(shape), d_y_mm=size.d_y_mm.reshape(shape))
-    return push_sizes(
-        posterior.amplitude,
-        posterior.sigma_x_mm,
-        posterior.sigma_y_mm,
-        posterior.angle_rad,
-        calibration=calibration,
-        rng=rng,
-    )
-
-
-def _draw_under_field(
-    seen: FieldAnswer,
-    tactile_map: TactileMap,
-    options: EstimateOptions,
-    *,
-    rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None,
-) -> FieldAnswer:
-    from tactile_bayes.posterior.field_estimate import draw
-    from tactile_bayes.posterior.methods import MethodOptions
-
-    return draw(
-        seen,
-        tactile_map,
-        options.method,
-        rng=rng,
-        scene=scene_asked(options),
-        options=MethodOptions(
-            options.accuracy_sd, options.accuracy_mm, options.max_steps, options.store, options.draws
-        ),
-        progress=progress,
-    )
-
-
-def _medians(posterior: MapPosterior) -> tuple[float, float, float]:
-    """sigma_x_mm, sigma_y_mm and amplitude in the middle of the posterior."""
-    x, y, a = (np.median(v) for v in (posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.amplitude))
-    return float(x), float(y), float(a)
-
-
-def fitting_calibration(
-    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None
-) -> SizeCalibration | LogQuadratic | None:
-    """The calibration without the depth of fat where no body of its table looks like the map at that depth."""
-    if not isinstance(calibration, LogQuadratic):
-        return calibration
-    sigma_x, sigma_y, amplitude = _medians(posterior)
-    return calibration.fitting(amplitude, float(np.sqrt(sigma_x * sigma_y)))
-
-
-def range_faults(
-    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None, how: Literal["outside", "too_far"]
-) -> list[str]:
-    """In what a map lies outside the calibration's table, or too far outside it for a size, in words."""
-    sigma_x, sigma_y, amplitude = _medians(posterior)
-    if calibration is None:
-        return []
-    if isinstance(calibration, LogQuadratic):
-        return list(getattr(calibration, how)(amplitude, float(np.sqrt(sigma_x * sigma_y))))
-    found = [f"x: {text}" for text in getattr(calibration.x, how)(sigma_x, amplitude)]
-    return found + [f"y: {text}" for text in getattr(calibration.y, how)(sigma_y, amplitude)]
-
-
 def _diagnostics(
     tactile_map: TactileMap,
     fit: BumpFit,
     posterior: MapPosterior,
     calibration: SizeCalibration | LogQuadratic | None,
 ) -> dict[str, object]:
-    sigma_x, sigma_y, _ = _medians(posterior)
+    sigma_x, sigma_y, _ = medians(posterior)
     return {
         "cells": len(fit.cells),
         "covered_share": fit.covered_share,

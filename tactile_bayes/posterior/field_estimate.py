@@ -20,6 +20,8 @@ from tactile_bayes.posterior.field import cosines_for
 from tactile_bayes.posterior.field_posterior import FieldFit, field_window, shape_draws, start_vector
 from tactile_bayes.posterior.fit import BumpFit
 from tactile_bayes.posterior.methods import MethodOptions, draw_scene
+from tactile_bayes.posterior.normal import normal_quantile
+from tactile_bayes.posterior.paired import MOST_PAIRED, paired_points
 from tactile_bayes.posterior.pose_spread import pose_covariance
 from tactile_bayes.posterior.ridge import ridge_instead, ridge_text
 from tactile_bayes.posterior.scene import Scene
@@ -30,6 +32,8 @@ from tactile_bayes.presets import FIELD_COSINES
 from tactile_bayes.records import dataclass
 
 Progress = Callable[[int, int], None]
+LEAST_VARIANCE = 1e-12
+"""Directions in which errors of the frames' places spread less, as a share of the largest, are left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +183,7 @@ def _posterior(
 ) -> dict[str, FloatArray]:
     """Draws by name, with what errors of the frames' places add to them."""
     shape = draws.theta.shape[:2]
-    theta = draws.theta + _displaced(places, shape, rng)
+    theta = draws.theta + _displaced(fit, draws, places, rng).reshape(draws.theta.shape)
     sigma_x, sigma_y, angle = shape_draws(fit, theta)
     amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
     return {
@@ -194,11 +198,15 @@ def _posterior(
     }
 
 
-def _displaced(places: FloatArray, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
-    """(chain, draw, p) draws of a covariance."""
+def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(chain * draw, p) normal draws of a covariance, spread evenly over the draws in order of their mean width."""
     values, vectors = np.linalg.eigh(places)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(rng.standard_normal((*shape, len(values))) @ root.T)
+    kept = np.flatnonzero(values > LEAST_VARIANCE * values[-1])[-MOST_PAIRED:]
+    if not values[-1] > 0:
+        return np.zeros_like(draws.flat)
+    width = fit.scene.column(draws.flat, "u") + fit.scene.column(draws.flat, "v")
+    points = paired_points(width, draws.replicates, len(kept), rng)
+    return np.asarray(normal_quantile(points) @ (vectors[:, kept] * np.sqrt(values[kept])).T)
 
 
 def _places_share(fit: FieldFit, places: FloatArray) -> float | None:

@@ -6,8 +6,9 @@ import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.draws import ParameterDraws
+from tactile_bayes.posterior.draws import REPLICATES, ParameterDraws
 from tactile_bayes.posterior.laplace import LogDensity
+from tactile_bayes.posterior.normal import normal_quantile
 from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.quantity import weighted_quantiles_of
 from tactile_bayes.posterior.sobol import BITS, shifted_sobol
@@ -43,7 +44,7 @@ class ImportanceOptions:
     """
 
     accuracy_sd: float = 0.02
-    replicates: int = 4
+    replicates: int = REPLICATES
     first: int = 256
     most: int = 16384
     keep: int = 8192
@@ -102,7 +103,7 @@ def importance(
             )
         sampler.extend(sampler.points)
     keep = max(options.keep, 2 * sampler.number)
-    draws = sampler.theta[systematic(weights, keep, rng)]
+    chosen = systematic(weights, keep, rng)
     figures = {
         "pareto_k": float(shape),
         "end_error_sd": error,
@@ -112,7 +113,7 @@ def importance(
         "log_evidence_error": sampler.log_evidence_error(),
         "draws": float(keep),
     }
-    return ParameterDraws(draws[None], "importance", figures)
+    return ParameterDraws(sampler.theta[chosen][None], "importance", figures, labels=chosen // sampler.points)
 
 
 def _settled(
@@ -246,38 +247,3 @@ def systematic(
     edges = np.cumsum(weights) / weights.sum()
     index = np.searchsorted(edges, (np.arange(number) + rng.uniform()) / number)
     return np.asarray(rng.permutation(np.minimum(index, len(weights) - 1)))
-
-
-def normal_quantile(probability: FloatArray) -> FloatArray:
-    """Inverse of the normal distribution function to 1e-9 relative (Acklam's rational fits, one Halley step).
-
-    The library's own costs 0.3 s to import, as much as the whole estimate.
-    """
-    p = np.clip(probability, 1e-300, 1.0 - 1e-16)
-    tail = np.minimum(p, 1.0 - p)
-    q = np.sqrt(-2.0 * np.log(tail))
-    low = np.polyval(_C, q) / np.polyval(_D, q)
-    centred = p - 0.5
-    r = centred**2
-    middle = np.polyval(_A, r) * centred / np.polyval(_B, r)
-    return np.where(tail < 0.02425, np.where(p < 0.5, low, -low), middle)
-
-
-_A = (
-    -39.69683028665376,
-    220.9460984245205,
-    -275.9285104469687,
-    138.3577518672690,
-    -30.66479806614716,
-    2.506628277459239,
-)
-_B = (-54.47609879822406, 161.5858368580409, -155.6989798598866, 66.80131188771972, -13.28068155288572, 1.0)
-_C = (
-    -7.784894002430293e-3,
-    -0.3223964580411365,
-    -2.400758277161838,
-    -2.549732539343734,
-    4.374664141464968,
-    2.938163982698783,
-)
-_D = (7.784695709041462e-3, 0.3224671290700398, 2.445134137142996, 3.754408661907416, 1.0)

@@ -155,10 +155,9 @@ class LogQuadratic:
     def _powers(self) -> tuple[tuple[int, int], ...]:
         return powers(2 if self.fat_mm is None else FAT_ORDER)
 
-    def log_size(self, log_amplitude: FloatArray, log_width: FloatArray, draws: FloatArray | None = None) -> FloatArray:
-        """(...,) ln d without B and E, with the mean coefficients or with (..., n) draws of them."""
-        coefficients = self.mean if draws is None else draws
-        return np.asarray(np.sum(self.terms(log_amplitude, log_width) * coefficients[..., :-SPREADS], axis=-1))
+    def log_size(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(...,) ln d without B and E, with the mean coefficients."""
+        return np.asarray(self.terms(log_amplitude, log_width) @ self.mean[:-SPREADS])
 
     def width_slope(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) derivative of ln d by p: how much longer an axis is for a wider map."""
@@ -166,21 +165,38 @@ class LogQuadratic:
         lower = [(i, max(j - 1, 0)) for i, j in self._powers]
         return np.asarray(monomials((log_amplitude - self.centre[0], log_width - self.centre[1]), lower) @ b)
 
-    def body_sd(self, log_amplitude: FloatArray, draws: FloatArray | None = None) -> FloatArray:
-        """(...,) standard deviation of B."""
-        p = self.mean if draws is None else draws
-        return np.asarray(np.exp(p[..., -3] + p[..., -2] * (log_amplitude - self.centre[0])))
-
     def round_excess(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) q0, the half log axis ratio of a ball's map."""
         c = self.round_lumps.coefficients
         return np.asarray(c[0] + c[1] * (log_amplitude - self.centre[0]) + c[2] * (log_width - self.centre[1]))
 
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """(number, n) draws of the parameters."""
-        values, vectors = np.linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        return np.asarray(self.mean + rng.standard_normal((number, len(self.mean))) @ root.T)
+    def body_and_error(
+        self, terms: FloatArray, log_amplitude: FloatArray, score: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Standard deviation of B, and what the coefficients' error does to ln d given it.
+
+        Parameters
+        ----------
+        terms : (n, k) array
+            `terms` of the maps.
+        log_amplitude : (n,) array
+        score : (n,) array
+            Standard normal scores of the uncertain ln SD(B).
+
+        Returns
+        -------
+        body_sd, shift, variance : (n,) arrays
+            Given `body_sd`, ln d is off by a normal error with mean `shift` and this variance: all parameters are
+            jointly normal.
+        """
+        x = np.stack([np.ones_like(log_amplitude), log_amplitude - self.centre[0]], axis=-1)
+        spread = self.covariance[-3:-1, -3:-1]
+        sd = np.sqrt(np.maximum(np.sum(x @ spread * x, axis=-1), 0.0))
+        body_sd = np.exp(x @ self.mean[-3:-1] + sd * score)
+        together = np.sum(terms @ self.covariance[:-SPREADS, -3:-1] * x, axis=-1)
+        slope = np.divide(together, sd, out=np.zeros_like(sd), where=sd > 0)
+        whole = np.sum(terms @ self.covariance[:-SPREADS, :-SPREADS] * terms, axis=-1)
+        return body_sd, slope * score, np.maximum(whole - slope**2, 0.0)
 
     def leverage(self, amplitude: float, sigma_mm: float) -> float:
         """Leverage of a map over the largest in the table; infinite without a rise."""

@@ -16,13 +16,18 @@ import numpy as np
 from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.abstention import extrapolated
+from tactile_bayes.posterior.draws import REPLICATES, Labels, even_replicates
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.normal import normal_quantile
+from tactile_bayes.posterior.paired import evened, paired_points
 from tactile_bayes.posterior.roundness import Elongation, ShapePrior, elongation, turned
 from tactile_bayes.posterior.size import SizePosterior
 from tactile_bayes.records import dataclass
 
 OUTLYING = 3.0
-POOLED_DRAWS = 8000
+POOLED_DRAWS = 8192
+DIMENSIONS = 6
+"""Of the points: ln d given tau and the spread of B, these two, oval or round, and the two components of an oval."""
 MOST_INVALID = 0.05
 _GRID = np.geomspace(1e-3, 1.5, 240)
 
@@ -72,6 +77,8 @@ class ShapeDraws:
         From the axes that the maps of a mass share to this map's.
     profile
         `presets.HEAD_PROFILE` of the map; None where it has none.
+    labels
+        Of the draws' independent replicates, as `ParameterDraws.labels`.
     """
 
     log_amplitude: FloatArray
@@ -80,6 +87,17 @@ class ShapeDraws:
     r: FloatArray
     turn_rad: float = 0.0
     profile: tuple[float, ...] | None = None
+    labels: Labels | None = None
+
+    @property
+    def replicates(self) -> Labels:
+        """(n,) label of the independent replicate of each draw."""
+        return even_replicates(len(self.q)) if self.labels is None else self.labels
+
+    @property
+    def order(self) -> tuple[float, ...]:
+        """What maps are put in order by before they are pooled."""
+        return tuple(float(np.nansum(v)) for v in (self.log_width, self.log_amplitude, self.q, self.r))
 
     @classmethod
     def of(
@@ -91,6 +109,7 @@ class ShapeDraws:
         *,
         turn_rad: float = 0.0,
         profile: tuple[float, ...] | None = None,
+        labels: Labels | None = None,
     ) -> ShapeDraws:
         """From draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -98,7 +117,7 @@ class ShapeDraws:
         half = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel()
         angle = angle_rad.ravel()
         p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
-        return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad, profile)
+        return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad, profile, labels)
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -106,10 +125,10 @@ class ShapeDraws:
         amplitude, sigma_mm = (float(np.exp(np.nanmedian(v))) for v in (self.log_amplitude, self.log_width))
         return amplitude, sigma_mm
 
-    def rows(self, index: np.ndarray[tuple[int], np.dtype[np.intp]]) -> ShapeDraws:
-        """Some of the draws."""
+    def rows(self, index: Labels) -> ShapeDraws:
+        """Some of the draws, as if independent."""
         drawn = {name: getattr(self, name)[index] for name in ("log_amplitude", "log_width", "q", "r")}
-        return replace(self, **drawn)
+        return replace(self, **drawn, labels=None)
 
 
 def pooled_size(
@@ -134,37 +153,36 @@ def pooled_size(
     SizePosterior
         Draws of shape (n,). `figures` holds ``between_map_sd`` (median), ``oval_probability``,
         ``oval_half_log_ratio`` and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
+
+    Notes
+    -----
+    Given tau and the spread of B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau,
+    the spread of B and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
+    maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
     """
     calibration = calibration.at_fat([one.profile for one in maps])
-    n = len(maps[0].log_amplitude) if number is None else number
-    used = [m if number is None and len(maps) == 1 else m.rows(rng.integers(len(m.q), size=n)) for m in maps]
-    log_size = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
-    centre, noise = np.nanmean(log_size, axis=1), np.nanvar(log_size, axis=1)
-    tau = _draw_between(centre, noise, priors.between_maps, number=n, rng=rng)
+    used, replicates = _matched(maps, number, rng)
+    by_map = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
+    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
+    log_size = by_map if used is maps else [calibration.log_size(m.log_amplitude, m.log_width) for m in maps]
+    centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
+    tau = _between_at(points[:, 1], centre, noise, priors.between_maps)
     weight = 1.0 / (noise[:, None] + tau**2 + 1e-12)
     weight /= weight.sum(axis=0)
-    coefficients = calibration.draw(n, rng)
-    by_draw = np.stack([calibration.log_size(m.log_amplitude, m.log_width, coefficients) for m in used])
-    between = np.sum(weight * tau * rng.standard_normal(log_size.shape), axis=0)
-    middle_a = np.sum(weight * np.stack([m.log_amplitude for m in used]), axis=0)
-    middle_p = np.sum(weight * np.stack([m.log_width for m in used]), axis=0)
-    expected, left = _known_body(calibration, priors.known, calibration.terms(middle_a, middle_p))
-    body = left * calibration.body_sd(middle_a, coefficients) * rng.standard_normal(n)
-    oval, slope = _elongation(used, calibration, priors.shape)
-    half = oval.draw(n, rng)
-    log_d = np.sum(weight * by_draw, axis=0) + expected + between + body
-    valid = np.isfinite(log_d)
+    z, score = normal_quantile(points[:, [0, 2]].T)
+    known, variances = _left_open(used, calibration, priors, tau=tau, weight=weight, score=score)
+    map_part = np.sum(weight * by_map, axis=0)
+    oval, slope = _elongation(maps, calibration, priors.shape)
+    half = oval.at(points[:, 3:])
     longer = np.hypot(half[:, 0], half[:, 1])
-    along_x = np.where(half[:, 0] >= 0, longer, -longer)
-    share = _shares(
-        {
-            "map": float(np.nanvar(np.sum(weight * log_size, axis=0))),
-            "between_maps": float(np.var(between)),
-            "calibration": float(np.nanvar(np.sum(weight * (by_draw - log_size), axis=0))),
-            "body": float(np.nanvar(body)),
-            "shape": float(np.var(longer)),
-        }
-    )
+    # round and oval draws are evened apart: a round lump's two sizes stay equal
+    mean, sd = map_part + known + longer, np.sqrt(sum(variances.values()))
+    log_largest = evened(mean + sd * z, mean, sd, 2 * replicates + (longer > 0))
+    log_smallest, o = log_largest.copy(), longer > 0
+    shorter = 2.0 * longer[o]
+    log_smallest[o] = evened(log_largest[o] - shorter, mean[o] - shorter, sd[o], replicates[o])
+    wide = half[:, 0] >= 0
+    share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(one)) for name, one in variances.items()}}
     figures = {
         "between_map_sd": float(np.median(tau)),
         "oval_probability": oval.probability,
@@ -173,13 +191,67 @@ def pooled_size(
         **({f"weight_{i + 1}": float(w) for i, w in enumerate(weight.mean(axis=1))} if len(maps) > 1 else {}),
     }
     return SizePosterior(
-        np.where(valid, np.exp(log_d + along_x), np.nan),
-        np.where(valid, np.exp(log_d - along_x), np.nan),
-        share,
-        int((~valid).sum()),
+        np.exp(np.where(wide, log_largest, log_smallest)),
+        np.exp(np.where(wide, log_smallest, log_largest)),
+        _shares(share | {"shape": float(np.var(longer))}),
+        int((~np.isfinite(mean)).sum()),
+        replicates,
         figures,
         outlying_maps(centre, noise, priors.between_maps),
     )
+
+
+def _matched(
+    maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
+) -> tuple[Sequence[ShapeDraws], Labels]:
+    """As many draws of each map, replicates beside replicates, and their labels."""
+    if number is None and len(maps) == 1:
+        return maps, maps[0].replicates
+    replicates = even_replicates(len(maps[0].q) if number is None else number)
+    return [m.rows(_picked(m.replicates, replicates, rng)) for m in maps], replicates
+
+
+def _picked(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
+    """Places of draws whose labels are the wanted ones, each draw of a replicate as often as the others."""
+    index = np.empty(len(wanted), dtype=np.intp)
+    for label in range(REPLICATES):
+        members, places = np.flatnonzero(have == label), np.flatnonzero(wanted == label)
+        members = members if len(members) else np.arange(len(have))
+        index[places] = rng.permutation(np.resize(rng.permutation(members), len(places)))
+    return index
+
+
+def _left_open(
+    maps: Sequence[ShapeDraws],
+    calibration: LogQuadratic,
+    priors: SizePriors,
+    *,
+    tau: FloatArray,
+    weight: FloatArray,
+    score: FloatArray,
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """What the maps leave open of ln d, a normal a draw: its mean, and its variances by source.
+
+    Parameters
+    ----------
+    maps
+        k maps with n draws each.
+    tau : (n,) array
+    weight : (k, n) array
+        Of the maps, for each tau.
+    score : (n,) array
+        Normal scores of the uncertain spread of B.
+    """
+    log_a, log_width = (np.stack([getattr(m, name) for m in maps]) for name in ("log_amplitude", "log_width"))
+    middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
+    terms = np.sum(weight[..., None] * calibration.terms(log_a, log_width), axis=0)
+    body_sd, shift, error = calibration.body_and_error(terms, middle_a, score)
+    expected, left = _known_body(calibration, priors.known, middle_a, middle_width)
+    return expected + shift, {
+        "between_maps": np.sum(weight**2, axis=0) * tau**2,
+        "calibration": error,
+        "body": (left * body_sd) ** 2,
+    }
 
 
 def fat_left_out(why: str) -> str:
@@ -230,12 +302,14 @@ def pool_maps(
     found = [i for i, shape in enumerate(shapes) if shape is not None]
     if 2 * len(found) < len(shapes) or not found:
         return PooledEstimate("no_estimate", f"a lump was found on {len(found)} of {len(shapes)} maps")
-    used = [shape for shape in shapes if shape is not None]
+    # one order whatever the caller's, so that the order leaves no trace in the draws
+    in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
+    used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
     calibration = calibration.at_fat([one.profile for one in used])
     middles = [one.middle for one in used]
     for middle in middles:  # one map that does not go with the depth is enough: it is the same body
         calibration = calibration.fitting(*middle)
-    named = list(zip(found, middles, strict=True))
+    named = sorted(zip(found, middles, strict=True))
     far = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.too_far(*middle)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
@@ -248,7 +322,10 @@ def pool_maps(
     }
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
-    outlying = tuple(found[i] for i in size.outliers)
+    outlying = tuple(sorted(found[i] for i in size.outliers))
+    if len(used) > 1:
+        weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
+        size = replace(size, figures={**size.figures, **weights})
     return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration)
 
 
@@ -290,16 +367,19 @@ def _between_density(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) 
     return np.asarray(density / density.sum())
 
 
-def _draw_between(
-    centre: FloatArray, noise: FloatArray, prior: BetweenMaps, *, number: int, rng: np.random.Generator
-) -> FloatArray:
-    return np.asarray(rng.choice(_grid(prior), size=number, p=_between_density(centre, noise, prior)))
+def _between_at(points: FloatArray, centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> FloatArray:
+    """Draws of tau from its posterior, at uniform points."""
+    edges = np.cumsum(_between_density(centre, noise, prior))
+    grid = _grid(prior)
+    return np.asarray(grid[np.minimum(np.searchsorted(edges, points), len(grid) - 1)])
 
 
-def _known_body(calibration: LogQuadratic, known: Mapping[str, float], terms: FloatArray) -> tuple[FloatArray, float]:
+def _known_body(
+    calibration: LogQuadratic, known: Mapping[str, float], log_amplitude: FloatArray, log_width: FloatArray
+) -> tuple[FloatArray, float]:
     """Mean of B given what is known of the body, and the share of its standard deviation that is left."""
     if not known:
-        return np.zeros(terms.shape[:-1]), 1.0
+        return np.zeros(len(log_width)), 1.0
     hidden = calibration.hidden
     names = () if hidden is None else hidden.names
     for name in known:
@@ -308,7 +388,8 @@ def _known_body(calibration: LogQuadratic, known: Mapping[str, float], terms: Fl
                 f"the calibration knows nothing of {name}; it knows {', '.join(names) or 'nothing of a body'}"
             )
     assert hidden is not None
-    return hidden.expected_body(known, terms), float(np.sqrt(1.0 - hidden.share(*known)))
+    expected = hidden.expected_body(known, calibration.terms(log_amplitude, log_width))
+    return expected, float(np.sqrt(1.0 - hidden.share(*known)))
 
 
 def _elongation(maps: Sequence[ShapeDraws], calibration: LogQuadratic, prior: ShapePrior) -> tuple[Elongation, float]:

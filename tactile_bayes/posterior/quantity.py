@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.draws import Labels
 from tactile_bayes.records import dataclass
 
 INTERVAL_KIND = "eti"
@@ -33,12 +34,18 @@ class Quantity:
 
     def as_dict(self) -> dict[str, float | str]:
         """Plain data, rounded to nine significant digits."""
-        names = ("median", "mean", "sd", "low", "high")
+        names = ("median", "mean", "sd", "low", "high", "mc_error")
         numbers: dict[str, float | str] = {name: float(f"{getattr(self, name):.9g}") for name in names}
         return numbers | {"probability": self.probability, "kind": self.kind}
 
 
-def summarise(draws: FloatArray, *, probability: float, effective_draws: float) -> Quantity:
+def summarise(
+    draws: FloatArray,
+    *,
+    probability: float,
+    effective_draws: float | None = None,
+    replicates: Labels | None = None,
+) -> Quantity:
     """Summarise draws; NaN draws are left out.
 
     Parameters
@@ -47,22 +54,32 @@ def summarise(draws: FloatArray, *, probability: float, effective_draws: float) 
     probability
         Of the equal-tailed interval, in (0, 1).
     effective_draws
-        How many independent draws they are worth for a tail.
+        How many independent draws they are worth for a tail. Default: all of them.
+    replicates : (n,) array
+        Label of the independent replicate of each draw, in the order of ``draws.ravel()``: the Monte-Carlo error then
+        comes from the spread between replicates, and `effective_draws` is not used.
 
     Raises
     ------
     ValueError
         When no draw is finite.
     """
-    values = draws[np.isfinite(draws)]
+    flat = draws.ravel()
+    finite = np.isfinite(flat)
+    values = flat[finite]
     if not values.size:
         raise ValueError("no finite draws")
     tail = (1.0 - probability) / 2.0
-    # an end's standard error is half the way between order statistics a binomial SD below and above (Maritz-Jarrett in
-    # spirit)
-    step = np.sqrt(tail * (1.0 - tail) / max(effective_draws, 1.0))
+    ordered = np.sort(values)
+    low, median, high = quantiles_of(ordered, np.array([tail, 0.5, 1.0 - tail]))
+    if replicates is None:
+        step = float(np.sqrt(tail * (1.0 - tail) / max(effective_draws or values.size, 1.0)))
+    else:
+        step = _tail_error(values, replicates[finite], (low, high))
+    # an end's standard error is half the way between order statistics a standard error below and above (Maritz-Jarrett
+    # in spirit)
     about = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
-    low, median, high, *ends = quantiles_of(np.sort(values), np.array([tail, 0.5, 1.0 - tail, *about]))
+    ends = quantiles_of(ordered, about)
     return Quantity(
         median=float(median),
         mean=float(values.mean()),
@@ -72,6 +89,25 @@ def summarise(draws: FloatArray, *, probability: float, effective_draws: float) 
         probability=probability,
         mc_error=float(max(ends[1] - ends[0], ends[3] - ends[2]) / 2.0),
     )
+
+
+def _tail_error(values: FloatArray, replicates: Labels, ends: tuple[float, float]) -> float:
+    """Standard error of the probability beyond an interval's end, from the replicates' own; that of both ends alike.
+
+    Notes
+    -----
+    Of a ratio of sums over replicates (Cochran 1977, Sampling Techniques, ch. 6). Taking both ends together doubles the
+    few degrees of freedom. It is no less than what one draw moves.
+    """
+    count, n = np.bincount(replicates), len(values)
+    r = int(np.count_nonzero(count))
+    if r < 2:
+        return 0.5
+    squares = []
+    for beyond in (values < ends[0], values > ends[1]):
+        inside = np.bincount(replicates, weights=beyond)
+        squares.append(float(np.sum((inside - count * inside.sum() / n) ** 2)) * r / (r - 1))
+    return max(float(np.sqrt(np.mean(squares))), 1.0) / n
 
 
 def quantiles_of(ordered: FloatArray, probabilities: FloatArray) -> FloatArray:

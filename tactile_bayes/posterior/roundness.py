@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.normal import normal_quantile
 from tactile_bayes.records import dataclass
 
 
@@ -40,12 +41,11 @@ class Elongation:
     mean: FloatArray
     covariance: FloatArray
 
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """(number, 2) draws; (0, 0) where the lump is round."""
+    def at(self, points: FloatArray) -> FloatArray:
+        """(n, 2) draws from (n, 3) uniform points: the first says oval or round; (0, 0) where the lump is round."""
         values, vectors = np.linalg.eigh(self.covariance)
-        normal = rng.standard_normal((number, 2)) @ (vectors * np.sqrt(np.clip(values, 0.0, None))).T
-        oval = rng.uniform(size=number) < self.probability
-        return np.where(oval[:, None], self.mean + normal, 0.0)
+        normal = normal_quantile(points[:, 1:]) @ (vectors * np.sqrt(np.clip(values, 0.0, None))).T
+        return np.where(points[:, :1] < self.probability, self.mean + normal, 0.0)
 
     @property
     def magnitude(self) -> float:

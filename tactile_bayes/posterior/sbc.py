@@ -37,7 +37,8 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.estimate import EstimateOptions, MapPosterior, estimate_map
+from tactile_bayes.posterior.drawn import MapPosterior
+from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
 from tactile_bayes.posterior.field import LENGTHS_MM, SHARES
 from tactile_bayes.posterior.fit import WIDEST_IN_RADII, FitOptions
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
@@ -203,7 +204,9 @@ def _ranks_in(
     ranks = tuple(int(np.sum(drawn[name] < true[name])) for name in PARAMETERS)
     if calibration is None:
         return ranks
-    return (*ranks, int(np.sum(_sizes(drawn, calibration, rng) < _sizes(true, calibration, rng)[0])))
+    # sizes of all draws are spread evenly; some of them chosen by chance are as good as independent
+    sizes = _sizes({name: getattr(posterior, name).ravel() for name in PARAMETERS}, calibration, rng)[chosen]
+    return (*ranks, int(np.sum(sizes < _sizes(true, calibration, rng)[0])))
 
 
 def _sizes(bumps: Mapping[str, FloatArray], calibration: LogQuadratic, rng: np.random.Generator) -> FloatArray:

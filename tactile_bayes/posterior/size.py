@@ -8,6 +8,10 @@ from dataclasses import field
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.draws import Labels, even_replicates
+from tactile_bayes.posterior.normal import normal_quantile
+from tactile_bayes.posterior.paired import paired_points
+from tactile_bayes.posterior.quantity import Quantity, summarise
 from tactile_bayes.posterior.size_calibration import AxisCalibration, SizeCalibration
 from tactile_bayes.records import dataclass
 
@@ -25,6 +29,8 @@ class SizePosterior:
         scatter; the three sum to 100.
     invalid
         Draws without a size: amplitude or diameter not positive.
+    replicates : (chain * draw,) array
+        Label of the independent replicate of each draw: their spread is the Monte-Carlo error.
     figures
         What else the calibration found: the probability of a lump that is not round, the spread between maps...
     outliers
@@ -35,6 +41,7 @@ class SizePosterior:
     d_y_mm: FloatArray
     variance_share: dict[str, float]
     invalid: int
+    replicates: Labels
     figures: Mapping[str, float] = field(default_factory=dict)
     outliers: tuple[int, ...] = ()
 
@@ -47,6 +54,10 @@ class SizePosterior:
     def min_size_mm(self) -> FloatArray:
         """(chain, draw) smaller diameter of each draw."""
         return np.minimum(self.d_x_mm, self.d_y_mm)
+
+    def summarise(self, name: str, *, probability: float) -> Quantity:
+        """The sizes of one name, ``"max_size_mm"``, ``"d_x_mm"``..., with the Monte-Carlo error of their interval."""
+        return summarise(getattr(self, name), probability=probability, replicates=self.replicates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +76,7 @@ def push_sizes(
     *,
     calibration: SizeCalibration,
     rng: np.random.Generator,
+    replicates: Labels | None = None,
 ) -> SizePosterior:
     """Each map draw through Eq 6 with a draw of its coefficients and a draw of its residual scatter.
 
@@ -73,7 +85,9 @@ def push_sizes(
     amplitude, sigma_x_mm, sigma_y_mm, angle_rad : (chain, draw) arrays
         Joint draws: amplitude and width go together (a stronger bump is a narrower one), which must not be lost.
     rng
-        Pairs map draws with calibration draws and draws the scatter.
+        Of the points that pair map draws with calibration draws and scatter, see `paired_points`.
+    replicates : (chain * draw,) array
+        Label of the independent replicate of each draw. Default: the draws are independent.
 
     Notes
     -----
@@ -82,11 +96,13 @@ def push_sizes(
     """
     shape = amplitude.shape
     inputs = _Inputs(amplitude.ravel(), sigma_x_mm.ravel(), sigma_y_mm.ravel(), angle_rad.ravel())
-    n = inputs.amplitude.size
-    coefficients_x = calibration.x.draws[rng.integers(len(calibration.x.draws), size=n)]
-    coefficients_y = calibration.y.draws[rng.integers(len(calibration.y.draws), size=n)]
+    replicates = even_replicates(amplitude.size) if replicates is None else replicates
+    key = np.maximum(*_sizes(inputs, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0)))
+    points = paired_points(key, replicates, 4, rng)
+    coefficients_x = _coefficients_at(points[:, 0], calibration.x, inputs.sigma_x_mm, inputs.amplitude)
+    coefficients_y = _coefficients_at(points[:, 1], calibration.y, inputs.sigma_y_mm, inputs.amplitude)
     d_x, d_y = _sizes(inputs, calibration, coefficients_x, coefficients_y)
-    z = rng.standard_normal((2, n))
+    z = normal_quantile(points[:, 2:].T)
     rho = calibration.residual_correlation
     z[1] = rho * z[0] + np.sqrt(1.0 - rho**2) * z[1]
     scattered_x = d_x * np.exp(calibration.x.scatter(inputs.amplitude, draws=coefficients_x) * z[0])
@@ -98,7 +114,17 @@ def push_sizes(
         np.where(valid, scattered_y, np.nan).reshape(shape),
         share,
         int((~valid).sum()),
+        replicates,
     )
+
+
+def _coefficients_at(
+    points: FloatArray, axis: AxisCalibration, sigma_mm: FloatArray, amplitude: FloatArray
+) -> FloatArray:
+    """(n, 6) rows of the calibration's draws at uniform points, in order of the size that they give a middling draw."""
+    middle = np.full(len(axis.draws), np.nanmedian(sigma_mm)), np.full(len(axis.draws), np.nanmedian(amplitude))
+    in_order = axis.draws[np.argsort(axis.size_mm(*middle, draws=axis.draws), kind="stable")]
+    return np.asarray(in_order[(points * len(in_order)).astype(np.intp)])
 
 
 def _sizes(

@@ -35,10 +35,14 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
         draws |= {"centre_patient_mm.x": in_patient[..., 0], "centre_patient_mm.y": in_patient[..., 1]}
     if estimate.diagnostics.get("rotated"):
         draws["angle_deg"] = np.degrees(posterior.angle_rad)
+    labels, worth = estimate.draws.labels, estimate.draws.effective_draws
+    found = {
+        name: summarise(d, probability=probability, effective_draws=worth, replicates=labels)
+        for name, d in draws.items()
+    }
     if estimate.size is not None:
-        draws |= {name: getattr(estimate.size, name) for name in SIZES}
-    worth = estimate.draws.effective_draws
-    return {name: summarise(d, probability=probability, effective_draws=worth) for name, d in draws.items()}
+        found |= {name: estimate.size.summarise(name, probability=probability) for name in SIZES}
+    return found
 
 
 def estimate_document(

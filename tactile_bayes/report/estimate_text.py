@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.bump import BumpPrior
@@ -11,10 +10,10 @@ from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.quantity import Quantity
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import estimate_quantities
+from tactile_bayes.report.estimate_document import SIZES, estimate_quantities
 from tactile_bayes.report.rise_text import rise_lines
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
-from tactile_bayes.report.size_text import range_cautions, shape_text, variance_text
+from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text, variance_text
 
 ROWS = (
     ("max_size_mm", "largest size", "mm"),
@@ -35,11 +34,9 @@ NEAR_LEVEL = 0.02
 MOST_PASSED_OVER = 4
 
 
-def decimals(mc_error: float, *, most: int = 3) -> int:
-    """Decimal places that the Monte-Carlo error of an interval's end supports."""
-    if not mc_error > 0:
-        return most
-    return min(most, max(0, -math.floor(math.log10(2.0 * mc_error))))
+def size_decimals(sizes: Iterable[Quantity]) -> int:
+    """Decimal places of all sizes of a report, as the least certain one supports."""
+    return min((decimals(one.mc_error, most=SIZE_DECIMALS) for one in sizes), default=SIZE_DECIMALS)
 
 
 def estimate_text(
@@ -62,7 +59,7 @@ def estimate_text(
     lines = [*_cautions(estimate), _table(quantities, probability), ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
-    lines += [*_findings(estimate), *_scene(estimate), *_warnings(estimate), *_left_out(estimate)]
+    lines += [*_findings(estimate, quantities), *_scene(estimate), *_warnings(estimate), *_left_out(estimate)]
     lines += [] if prior is None else [prior_line(prior, field=estimate.diagnostics.get("noise") == "field")]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
@@ -79,16 +76,17 @@ def _advice(estimate: Estimate) -> list[str]:
 def _table(quantities: Mapping[str, Quantity], probability: float) -> str:
     head = f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
     rows = [head]
+    of_sizes = size_decimals([quantities[name] for name in SIZES if name in quantities])
     for name, label, unit in ROWS:
         if name in quantities:
             q = quantities[name]
-            places = decimals(q.mc_error)
+            places = of_sizes if name in SIZES else decimals(q.mc_error)
             interval = f"{q.low:.{places}f} to {q.high:.{places}f} {unit}".rstrip()
             rows.append(f"{label:28}{q.median:>9.{places}f}   {interval}")
     return "\n".join(rows)
 
 
-def _findings(estimate: Estimate) -> list[str]:
+def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
     lines = []
     if estimate.detection is not None:
         lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
@@ -104,20 +102,26 @@ def _findings(estimate: Estimate) -> list[str]:
     if isinstance(share := estimate.diagnostics.get("places_share"), float):
         lines.append(f"Of the variance of the widths {100 * share:.0f} % is errors of the frames' places.")
     lines += [f"Passed over: {text}." for text in _texts(estimate.diagnostics.get("passed_over"))]
-    return [*lines, method_line(estimate.draws)] if estimate.draws is not None else lines
+    return [*lines, method_line(estimate.draws, quantities)] if estimate.draws is not None else lines
 
 
-def method_line(draws: ParameterDraws) -> str:
-    """The method, how well the interval's ends are known, and what says so."""
+def method_line(draws: ParameterDraws, quantities: Mapping[str, Quantity]) -> str:
+    """The method, the Monte-Carlo error of the intervals' ends as they are printed, and the method's diagnostics."""
+    parts = [_ends("sizes", ("max_size_mm", "min_size_mm"), quantities)] if "max_size_mm" in quantities else []
+    parts.append(_ends("widths", ("sigma_x_mm", "sigma_y_mm"), quantities))
+    ends = "interval ends of the " + ", of the ".join(parts)
     found = draws.diagnostics
-    millimetres = f" ({found['end_error_mm']:.2g} mm of the widths)" if "end_error_mm" in found else ""
-    ends = f"interval ends to {found['end_error_sd']:.3f} SD{millimetres}, " if "end_error_sd" in found else ""
     if draws.method == "ensemble":
         ess = min(found["ess_bulk"], found["ess_tail"])
-        return f"Method ensemble: {ends}R-hat {found['rhat']:.3f}, {ess:.0f} effective draws."
+        return f"Method ensemble: {ends}; R-hat {found['rhat']:.3f}, {ess:.0f} effective draws."
     if draws.method == "importance":
-        return f"Method importance: {ends}Pareto shape {found['pareto_k']:.2f}."
-    return f"Method {draws.method}: {len(draws.flat)} independent draws."
+        return f"Method importance: {ends}; Pareto shape {found['pareto_k']:.2f}."
+    return f"Method {draws.method}: {ends}; {len(draws.flat)} independent draws."
+
+
+def _ends(what: str, names: tuple[str, ...], quantities: Mapping[str, Quantity]) -> str:
+    worst = max((quantities[name] for name in names), key=lambda one: one.mc_error)
+    return ends_text(what, worst.mc_error, worst.sd)
 
 
 def _scene(estimate: Estimate) -> list[str]:

@@ -10,12 +10,12 @@ import numpy as np
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.log_quadratic import LogQuadratic
 from tactile_bayes.posterior.pooling import PooledEstimate, fat_left_out
-from tactile_bayes.posterior.quantity import summarise
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
-from tactile_bayes.report.size_text import range_cautions, shape_text, variance_text
+from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text, variance_text
 
 SCHEMA = "tactile-bayes/pooled/1"
+SIZES = ("max_size_mm", "min_size_mm")
 
 
 def pooled_document(
@@ -35,13 +35,9 @@ def pooled_document(
         Of the maps, with what `estimate` says of each.
     """
     size, used = pooled.size, pooled.calibration or calibration
-    sizes: dict[str, Any] = {"max_size_mm": None, "min_size_mm": None}
+    sizes: dict[str, Any] = dict.fromkeys(SIZES)
     if size is not None:
-        draws = {"max_size_mm": size.max_size_mm, "min_size_mm": size.min_size_mm}
-        sizes = {
-            name: summarise(values, probability=probability, effective_draws=values.size).as_dict()
-            for name, values in draws.items()
-        }
+        sizes = {name: size.summarise(name, probability=probability).as_dict() for name in SIZES}
     return {
         "schema": SCHEMA,
         "status": pooled.status,
@@ -79,13 +75,16 @@ def pooled_text(document: Mapping[str, Any]) -> str:
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
     largest = document["max_size_mm"]
     lines += ["", f"{'':28}{'median':>9}   {100 * largest['probability']:g} % interval (equal-tailed)"]
-    for name, label in (("max_size_mm", "largest size"), ("min_size_mm", "smallest size")):
+    worst = max((document[name] for name in SIZES), key=lambda q: q["mc_error"])
+    places = decimals(worst["mc_error"], most=SIZE_DECIMALS)
+    for name, label in zip(SIZES, ("largest size", "smallest size"), strict=True):
         q = document[name]
-        lines.append(f"{label:28}{q['median']:>9.1f}   {q['low']:.1f} to {q['high']:.1f} mm")
+        lines.append(f"{label:28}{q['median']:>9.{places}f}   {q['low']:.{places}f} to {q['high']:.{places}f} mm")
     figures = document["figures"]
     lines += ["", variance_text(document["variance_share"])]
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} % (median).")
     lines.append(shape_text(figures))
+    lines.append(f"Interval ends of the {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
     lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
     if document["left_out"]:
         lines.append(f"Left out: {'; '.join(document['left_out'])}.")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+SIZE_DECIMALS = 1
+"""At most, whatever the Monte-Carlo error: sizes are compared with excisions, which are measured in mm."""
 SOURCES = {
     "map": "the map",
     "between_maps": "spread between maps of a mass",
@@ -18,6 +20,19 @@ SOURCES = {
 def range_cautions(outside: Sequence[str]) -> list[str]:
     """The first lines of a report of a size outside its calibration's range."""
     return [f"CAUTION: outside the calibration's range: {text}." for text in outside]
+
+
+def decimals(mc_error: float, *, most: int = 3) -> int:
+    """Decimal places that the Monte-Carlo error of an interval's end supports."""
+    if not mc_error > 0:
+        return most
+    return min(most, max(0, -math.floor(math.log10(2.0 * mc_error))))
+
+
+def ends_text(name: str, mc_error: float, sd: float) -> str:
+    """Monte-Carlo error of the ends of intervals, in SDs and mm."""
+    share = f"{mc_error / sd:.3f} SD, " if sd > 0 else ""
+    return f"{name} to {share}{mc_error:.2g} mm"
 
 
 def variance_text(share: Mapping[str, float]) -> str:

@@ -1,0 +1,220 @@
+"""Draws of one map and its size, drawn again more finely until the size's interval is as exact as asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.abstention import Abstention, shape_fault
+from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.draws import ParameterDraws
+from tactile_bayes.posterior.fit import BumpFit
+from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
+from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.search import scene_asked
+from tactile_bayes.posterior.size import SizePosterior, push_sizes
+from tactile_bayes.posterior.size_calibration import SizeCalibration
+from tactile_bayes.presets import INTERVAL
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.estimate import EstimateOptions
+    from tactile_bayes.posterior.field_estimate import FieldAnswer
+    from tactile_bayes.posterior.scene_choice import SceneChoice
+
+DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
+"""Of interval ends of sizes, where none is given; the methods have the same for the widths."""
+MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPosterior:
+    """Joint draws of what Eq 7 describes, each (chain, draw)."""
+
+    amplitude: FloatArray
+    sigma_x_mm: FloatArray
+    sigma_y_mm: FloatArray
+    x_mm: FloatArray
+    y_mm: FloatArray
+    angle_rad: FloatArray
+    background: FloatArray
+    noise_sd: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none."""
+
+    detection: Detection
+    fit: BumpFit
+    draws: ParameterDraws
+    posterior: MapPosterior
+    figures: Mapping[str, object]
+    scene: SceneChoice | None
+    size: SizePosterior | None
+    fault: Abstention | None
+    calibration: SizeCalibration | LogQuadratic | None
+    too_far: tuple[str, ...] = ()
+
+
+def draw_sized(
+    tactile_map: TactileMap,
+    fit: BumpFit,
+    seen: Detection | FieldAnswer,
+    calibration: SizeCalibration | LogQuadratic | None,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] | None,
+) -> Drawn:
+    """Draws whose size intervals are as exact as asked for: drawn again, finer, where they are not.
+
+    The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
+    more finely the last draws stand, with their error.
+    """
+    found = _drawn(tactile_map, fit, seen, calibration, options, rng=rng, progress=progress)
+    for _ in range(MOST_REFINEMENTS):
+        finer = _finer(found, options)
+        if finer is None:
+            break
+        options = replace(options, accuracy_sd=finer)
+        try:
+            found = _drawn(tactile_map, fit, seen, calibration, options, rng=rng, progress=progress)
+        except NotConvergedError:
+            break
+    return found
+
+
+def _finer(found: Drawn, options: EstimateOptions) -> float | None:
+    """The accuracy in SDs to draw with for a size as exact as asked for; None where it is, or none is asked for."""
+    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(found.draws.method)
+    if found.size is None or wanted is None:
+        return None
+    ends = [found.size.summarise(name, probability=INTERVAL) for name in ("max_size_mm", "min_size_mm")]
+    short = min(wanted * one.sd / one.mc_error for one in ends)
+    if options.accuracy_mm is not None:
+        short = min(short, *(options.accuracy_mm / one.mc_error for one in ends))
+    return None if short >= 1.0 else max(SAFETY * short * wanted, LEAST_ACCURACY_SD)
+
+
+def _drawn(
+    tactile_map: TactileMap,
+    fit: BumpFit,
+    seen: Detection | FieldAnswer,
+    calibration: SizeCalibration | LogQuadratic | None,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] | None,
+) -> Drawn:
+    scene: SceneChoice | None = None
+    if isinstance(seen, Detection):
+        detection = seen
+        fit, odds = chosen_rotation(tactile_map, fit, options=options.fit, prior=options.prior)
+        draws, by_name = draw_independent(fit, options, rng=rng, progress=progress)
+        figures = judged_noise(fit, odds)
+    else:
+        answer = _draw_under_field(seen, tactile_map, options, rng=rng, progress=progress)
+        assert answer.draws is not None
+        detection, draws, scene = answer.detection, answer.draws, answer.choice
+        by_name, figures = dict(answer.posterior), dict(answer.diagnostics)
+    posterior = MapPosterior(**by_name)
+    fault = shape_fault(
+        posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
+    )
+    calibration = fitting_calibration(posterior, calibration)
+    far = tuple(range_faults(posterior, calibration, "too_far"))
+    size = None if fault or far else _size(posterior, draws, calibration, options.size_priors, rng=rng)
+    return Drawn(detection, fit, draws, posterior, figures, scene, size, fault, calibration, far)
+
+
+def _size(
+    posterior: MapPosterior,
+    draws: ParameterDraws,
+    calibration: SizeCalibration | LogQuadratic | None,
+    priors: SizePriors,
+    *,
+    rng: np.random.Generator,
+) -> SizePosterior | None:
+    if calibration is None:
+        return None
+    if isinstance(calibration, LogQuadratic):
+        shape_draws = ShapeDraws.of(
+            posterior.amplitude,
+            posterior.sigma_x_mm,
+            posterior.sigma_y_mm,
+            posterior.angle_rad,
+            labels=draws.replicates,
+        )
+        size = pooled_size([shape_draws], calibration=calibration, priors=priors, rng=rng)
+        shape = posterior.amplitude.shape
+        return replace(size, d_x_mm=size.d_x_mm.reshape(shape), d_y_mm=size.d_y_mm.reshape(shape))
+    return push_sizes(
+        posterior.amplitude,
+        posterior.sigma_x_mm,
+        posterior.sigma_y_mm,
+        posterior.angle_rad,
+        calibration=calibration,
+        rng=rng,
+        replicates=draws.replicates,
+    )
+
+
+def _draw_under_field(
+    seen: FieldAnswer,
+    tactile_map: TactileMap,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] | None,
+) -> FieldAnswer:
+    from tactile_bayes.posterior.field_estimate import draw
+    from tactile_bayes.posterior.methods import MethodOptions
+
+    return draw(
+        seen,
+        tactile_map,
+        options.method,
+        rng=rng,
+        scene=scene_asked(options),
+        options=MethodOptions(
+            options.accuracy_sd, options.accuracy_mm, options.max_steps, options.store, options.draws
+        ),
+        progress=progress,
+    )
+
+
+def medians(posterior: MapPosterior) -> tuple[float, float, float]:
+    """sigma_x_mm, sigma_y_mm and amplitude in the middle of the posterior."""
+    x, y, a = (np.median(v) for v in (posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.amplitude))
+    return float(x), float(y), float(a)
+
+
+def fitting_calibration(
+    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None
+) -> SizeCalibration | LogQuadratic | None:
+    """The calibration without the depth of fat where no body of its table looks like the map at that depth."""
+    if not isinstance(calibration, LogQuadratic):
+        return calibration
+    sigma_x, sigma_y, amplitude = medians(posterior)
+    return calibration.fitting(amplitude, float(np.sqrt(sigma_x * sigma_y)))
+
+
+def range_faults(
+    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None, how: Literal["outside", "too_far"]
+) -> list[str]:
+    """In what a map lies outside the calibration's table, or too far outside it for a size, in words."""
+    sigma_x, sigma_y, amplitude = medians(posterior)
+    if calibration is None:
+        return []
+    if isinstance(calibration, LogQuadratic):
+        return list(getattr(calibration, how)(amplitude, float(np.sqrt(sigma_x * sigma_y))))
+    found = [f"x: {text}" for text in getattr(calibration.x, how)(sigma_x, amplitude)]
+    return found + [f"y: {text}" for text in getattr(calibration.y, how)(sigma_y, amplitude)]
