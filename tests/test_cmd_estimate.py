@@ -77,7 +77,8 @@ def test_text_tells_the_size_its_interval_and_what_was_left_out(ensemble_run: Co
         "largest size",
         "Probability of a lump: 1.000.",
         "Variance of the largest size:",
-        "Method ensemble: R-hat 1.0",
+        "Method ensemble: interval ends of the sizes to",
+        "; R-hat 1.0",
         "Left out: ",
         "Research use only",
     ):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.hardware.live import LiveMap, LiveState
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.estimate import MapPosterior
+    from tactile_bayes.posterior.drawn import MapPosterior
     from tactile_bayes.posterior.log_quadratic import LogQuadratic
     from tactile_bayes.posterior.size_calibration import SizeCalibration
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
