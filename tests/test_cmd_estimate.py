@@ -248,7 +248,7 @@ def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
         (["a.nc", "b.nc", "-o", "p.nc"], 2, "one map at a time"),
         (["a.nc", "b.nc", "a.nc"], 2, "a.nc is given twice"),
         (["a.nc", "-o", "a.nc", "--force"], 2, "is an input"),
-        (["a.nc", "-o", "x.png", "--figure", "x.png"], 2, "one name"),
+        (["a.nc", "-o", "x.png", "--figure", "x.png"], 2, "two outputs of this command"),
         (["none.nc", "--figure", "f.jpg"], 2, "f.jpg has the suffix '.jpg'; a figure is written as one of .png, .pdf"),
         (["none.nc", "--map-figure", "f"], 2, "has the suffix 'none'"),
         (["a.nc", "-o", "no/p.nc"], 2, "not a directory"),
