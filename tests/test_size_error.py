@@ -158,7 +158,7 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
         size = pooled_size([shape(2.7, noise=0.02, seed=9)], calibration=calibration(), priors=SizePriors(),
                            rng=rng, number=number)  # fmt: skip
         draws = ParameterDraws(np.zeros((1, number, 1)), "importance")
-        return drawn.Drawn(None, None, draws, None, {}, None, size, None)
+        return drawn.Drawn(None, None, draws, None, {}, None, size, None, None)
 
     monkeypatch.setattr(drawn, "_drawn", once)
     from tactile_bayes.posterior.estimate import EstimateOptions
