@@ -18,7 +18,8 @@ from tactile_bayes.posterior.search import search
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
-    from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, MapPosterior
+    from tactile_bayes.posterior.drawn import MapPosterior
+    from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
     from tactile_bayes.posterior.field_estimate import FieldAnswer
 
 BESIDE_IN_WIDTHS = 2.5
