@@ -159,7 +159,7 @@ def ribs(fitter: Fitter) -> FloatArray:
 
 
 def _apart(plain: FieldFit, ridges: FloatArray) -> FloatArray:
-    """Those of some ridges that lie beside a bump, not under it."""
+    """Those of some ridges that a scene may hold with a bump, see `Scene.rib_apart`."""
     scene = replace(plain.scene, extra="rib")
     theta = np.column_stack([np.tile(plain.mode, (len(ridges), 1)), ridges])
     return np.asarray(ridges[scene.rib_apart(theta, plain.target.window.middle)])

@@ -21,8 +21,8 @@ Extra = Literal["", "second lump", "rib"]
 REACH_IN_RADII = 1.5
 """How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
 APART = 2.0
-"""A second structure lies at least this many widths from the bump: closer, two Gaussians have one top, and a wide ridge
-under a lump is the level's own curve."""
+"""A second lump lies at least this many widths from the first: closer, two Gaussians have one top. A rib may run under
+the bump if it is no more than this many times as wide: a wider one is the level's own curve."""
 STEP = {
     "u": 0.06,
     "v": 0.06,
@@ -167,11 +167,12 @@ class Scene:
         return total - np.log(np.pi * reach**2), allowed
 
     def rib_apart(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
-        """(m,) whether a rib's middle line lies `APART` widths or more from the bump's centre."""
+        """(m,) whether a rib lies `APART` widths from the bump's centre, or is at most `APART` times as wide."""
         angle, (p, _, _) = self.column(theta, "angle"), self.widths(theta)
         x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
         away = np.abs(self.column(theta, "offset") - x * np.cos(angle) - y * np.sin(angle))
-        return np.asarray(away >= APART * np.exp(np.maximum(p, self.column(theta, "w2"))))
+        w = self.column(theta, "w2")
+        return np.asarray((away >= APART * np.exp(np.maximum(p, w))) | (w - p <= np.log(APART)))
 
 
 def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:
