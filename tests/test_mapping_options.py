@@ -60,9 +60,9 @@ def test_the_plane_near_the_mass_follows_the_skin_there():
         build_map(bent, plane_radius_mm=0.001)
 
 
-@pytest.mark.parametrize("radius", [0.0, -3.0, float("nan"), "wide"])
+@pytest.mark.parametrize("radius", [0.0, -3.0, float("nan"), float("inf"), "wide"])
 def test_a_radius_that_is_none_is_refused(radius):
-    with pytest.raises(BadDataError, match=r"plane_radius_mm is .*; give a distance above 0 mm, or auto"):
+    with pytest.raises(BadDataError, match=r"plane_radius_mm is .*; give a distance above 0 mm, auto or all"):
         build_map(curved_strokes(), plane_radius_mm=radius)
 
 

@@ -130,11 +130,11 @@ def test_a_harder_lump_shows_higher(rows: list[StudyRow]) -> None:
 
 def test_the_table_says_what_was_found(rows: list[StudyRow]) -> None:
     head, first, *_ = table_text(rows).splitlines()
-    names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,fit_rms,detectable,thickness_mm,head_radius_mm"
-    assert head == names
+    found = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,fit_rms,detectable,thickness_mm,head_radius_mm"
+    assert head == f"{found},normalise,background,fit_radius_mm,noise"
     cells = first.split(",")
     assert cells[:4] == ["centred", "10", "1", "2"]
-    assert cells[-3:] == ["true", "70", "35"]
+    assert cells[7:] == ["true", "70", "35", "mean", "fixed", "48", "independent"]
     assert float(cells[4]) == pytest.approx(rows[0].amplitude, rel=1e-5)
 
 
