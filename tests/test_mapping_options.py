@@ -126,9 +126,11 @@ def test_advice_names_the_width_and_what_finer_cells_would_cost():
     advice = advise_cell(build_map(scan, normalise="gain", cell_mm=2.0))
     assert advice is not None
     assert advice.sigma_mm == pytest.approx(4.0, rel=0.15)
-    assert advice.coarsest_mm == pytest.approx(0.75 * advice.sigma_mm)
+    assert advice.coarsest_mm == pytest.approx(0.5 * advice.sigma_mm)
     assert "1 mm would take 4 times the cells" in advice.text()
-    assert "too coarse; use --cell-mm" in replace(advice, cell_mm=6.0).text()
+    coarse = replace(advice, cell_mm=6.0).text()
+    assert "too coarse; use --cell-mm" in coarse
+    assert float(coarse.rsplit(" ", 1)[1]) <= advice.coarsest_mm  # the advised cell is not too coarse itself
     assert advise_cell(build_map(curved_strokes(field=scans.uniform))) is None
 
 

@@ -1,7 +1,8 @@
-"""Which cell and window the data ask for, and what finer ones would cost and gain."""
+"""Largest cell that measures the map's highest bump well, and what finer cells would cost."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.strokes import smooth
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.presets import CELL_PER_SIGMA
 
 _FWHM = 2.3548  # of a Gaussian, in sigmas
+# Cells of up to this many sigmas moved no width by more than one posterior SD (record 0074).
+_CELL_PER_SIGMA = 0.5
 _SMOOTHED_CELLS = 2.0  # variance that `smooth` adds, in cells squared
 # A peak lower than this many times the spread of the smoothed map (by its quartiles) is no bump to take a width from.
 _LEAST_RISE = 4.0
@@ -26,7 +28,7 @@ class CellAdvice:
     sigma_mm
         Width of the narrower side of the map's highest bump, from its half height.
     coarsest_mm
-        Largest cell that resolves it.
+        Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm.
     cell_mm
         The map's own.
     readings
@@ -39,17 +41,12 @@ class CellAdvice:
     readings: float
 
     def text(self) -> str:
-        """One line: whether the cell will do, and what half of it would cost and gain."""
+        """One line: which cells measure the bump, and what half of the present ones would cost."""
         half = self.cell_mm / 2
-        head = f"bump of sigma {self.sigma_mm:.1f} mm: cells up to {self.coarsest_mm:.1f} mm will do"
+        head = f"bump of sigma {self.sigma_mm:.1f} mm: measured well by cells of up to {self.coarsest_mm:.1f} mm"
         if self.cell_mm > self.coarsest_mm:
-            return f"{head}, these are too coarse; use --cell-mm {self.coarsest_mm:.1g}"
-        cost = f"{half:g} mm would take 4 times the cells with {self.readings / 4:.0f} readings each"
-        return f"{head}; {cost}, and change its sigma by under {max(100 * self.error(self.cell_mm), 0.1):.1f} %"
-
-    def error(self, cell_mm: float) -> float:
-        """Largest error of sigma, as a share, that a model integrated over the cells leaves (h^6 / 12096 sigma^6)."""
-        return (cell_mm / self.sigma_mm) ** 6 / 12096
+            return f"{head}, these are too coarse; use --cell-mm {math.floor(10 * self.coarsest_mm) / 10:g}"
+        return f"{head}; {half:g} mm would take 4 times the cells with {self.readings / 4:.0f} readings each"
 
 
 def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
@@ -57,8 +54,9 @@ def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
 
     Notes
     -----
-    The rule is h <= 0.75 sigma_min: nearest cells and a model integrated over the cell then leave no error that
-    shows (0.06 % at 1 mm, 0.5 % at 3 mm, measured for sigma of 4 mm).
+    The rule is h <= 0.5 sigma_min, by what the widths of simulated bodies change with the cell (record 0074). For a
+    Gaussian bump the fit, which integrates its model over the cells, is exact to 0.1 % at 0.75 sigma; but lumps are not
+    quite Gaussian, and errors of the map change with the cell as well.
     """
     mean = _smoothed(tactile_map)
     known = np.isfinite(mean)
@@ -76,7 +74,7 @@ def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
     variances = [(extent * cell / _FWHM) ** 2 - _SMOOTHED_CELLS * cell**2 - cell**2 / 12 for extent in extents]
     sigma = float(np.sqrt(max(min(variances), (cell / 2) ** 2)))
     count = tactile_map.count[tactile_map.covered]
-    return CellAdvice(sigma, CELL_PER_SIGMA * sigma, cell, float(np.median(count)))
+    return CellAdvice(sigma, _CELL_PER_SIGMA * sigma, cell, float(np.median(count)))
 
 
 def _smoothed(tactile_map: TactileMap) -> FloatArray:
