@@ -158,6 +158,14 @@ def test_maps_of_a_mass_share_one_depth(learned) -> None:
     assert np.median(np.log(pooled.size.max_size_mm)) == pytest.approx(expected, abs=0.06)
 
 
+def test_maps_whose_fat_is_of_different_depth_are_doubted_to_be_of_one_body(learned) -> None:
+    noisy = replace(learned.fat_cubic, depth=replace(learned.fat_cubic.depth, log_sd=0.04))
+    assert noisy.depths_apart([one_profile(2.6), None, one_profile(2.7)]) is None  # 0.10 within 3 x sqrt(2) x 0.04
+    assert noisy.depths_apart([one_profile(2.6), None, one_profile(2.8)]) == pytest.approx(np.exp([2.6, 2.8]), rel=0.02)
+    assert noisy.depths_apart([one_profile(2.6)]) is None
+    assert noisy.depths_apart([None, None]) is None
+
+
 def test_a_table_without_profiles_or_with_few_bodies_has_no_cubic() -> None:
     full = table()
     assert learn_fat_cubic(replace(full, profile=None, log_fat=None)) is None

@@ -124,6 +124,19 @@ class FatCubic:
             if values.shape != shape or not np.isfinite(values).all():
                 raise BadDataError(f"fat_cubic.{name} is no finite {shape}", way_out="learn the calibration anew")
 
+    def depths_apart(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float, float] | None:
+        """Least and largest depth of fat in mm by the profiles of maps, where they can hardly be of one body.
+
+        None where they agree to three SDs of a difference between two exams, or where fewer than two tell a depth.
+        """
+        known = np.array([one for one in profiles if one is not None], dtype=np.float64).reshape(
+            -1, len(self.depth.centre)
+        )
+        log_depth = self.depth.log_depth(known[self.depth.unlike(known) <= MOST_LEVERAGE])
+        if len(log_depth) < 2 or np.ptp(log_depth) <= 3.0 * np.sqrt(2.0) * self.depth.log_sd:
+            return None
+        return float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))
+
     def log_depth(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float | None, str]:
         """ln F of a mass from the profiles of its maps, and why there is none.
 

@@ -277,6 +277,8 @@ class PooledEstimate:
         How maps lie outside the calibration's table, in words.
     calibration
         The one used: for the depth of fat that the maps tell, where they do.
+    fat_apart_mm
+        Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise.
     """
 
     status: str
@@ -286,6 +288,7 @@ class PooledEstimate:
     outlying: tuple[int, ...] = ()
     outside: tuple[str, ...] = ()
     calibration: LogQuadratic | None = None
+    fat_apart_mm: tuple[float, float] | None = None
 
 
 def pool_maps(
@@ -305,7 +308,9 @@ def pool_maps(
     # one order whatever the caller's, so that the order leaves no trace in the draws
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
     used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
-    calibration = calibration.at_fat([one.profile for one in used])
+    profiles = [one.profile for one in used]
+    fat_apart_mm = None if calibration.fat_cubic is None else calibration.fat_cubic.depths_apart(profiles)
+    calibration = calibration.at_fat(profiles)
     middles = [one.middle for one in used]
     for middle in middles:  # one map that does not go with the depth is enough: it is the same body
         calibration = calibration.fitting(*middle)
@@ -326,7 +331,7 @@ def pool_maps(
     if len(used) > 1:
         weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
         size = replace(size, figures={**size.figures, **weights})
-    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration)
+    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration, fat_apart_mm)
 
 
 def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> tuple[int, ...]:

@@ -48,6 +48,7 @@ def pooled_document(
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
         "left_out": [fat_left_out(used.fat_note)] if used.fat_note else [],
         "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
+        "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
         "outside_calibration": list(pooled.outside),
         "research_use": RESEARCH_USE,
@@ -69,7 +70,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
 
 def pooled_text(document: Mapping[str, Any]) -> str:
     """The report of a mass for people."""
-    lines = [*range_cautions(document["outside_calibration"]), *map(_map_line, document["maps"])]
+    lines = [*_bodies(document), *range_cautions(document["outside_calibration"]), *map(_map_line, document["maps"])]
     lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
@@ -91,6 +92,16 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     if document["reason"]:
         lines.append(f"{document['reason']}.")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _bodies(document: Mapping[str, Any]) -> list[str]:
+    """A first line where the maps can hardly be of one body."""
+    if not document["fat_apart_mm"]:
+        return []
+    least, largest = document["fat_apart_mm"]
+    depths = f"the fat under the head is {least:.1f} mm deep on one map and {largest:.1f} mm on another"
+    used = f" All are sized at {document['fat_mm']:.1f} mm." if document["fat_mm"] else ""
+    return [f"CAUTION: {depths}: are they of one mass?{used}"]
 
 
 def _map_line(one: Mapping[str, Any]) -> str:
