@@ -18,6 +18,10 @@ PRESSURE_WINDOW_KPA: Final = (5.0, 14.0)
 
 # The head as simulated: an arc with rounded shoulders (shared design notes; the paper: "nearly a circular cylinder").
 HEAD_RADIUS_MM: Final = 35.0
+# Where the shoulders of the head's section lie: cut into the sensing width, or around it (docs/decisions/0075).
+SHOULDERS_INSIDE: Final = "shoulders-inside"
+SHOULDERS_OUTSIDE: Final = "shoulders-outside"
+HEADS: Final = (SHOULDERS_INSIDE, SHOULDERS_OUTSIDE)
 
 CELL_MM: Final = 1.0
 # A cell wider than this share of the narrower sigma is called coarse in the report.

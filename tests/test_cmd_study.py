@@ -106,7 +106,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
     done = run_cli("study", "--grid", "grid.csv", "-o", "study.csv", "--fineness", 1, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     resumed = (tmp_path / "study.csv").read_text().splitlines()
-    assert resumed[1] == "centred,10,0.8,100,0.123,4.5,0.01,true,,,,,,"  # what the store had was not computed again
+    assert resumed[1] == "centred,10,0.8,100,0.123,4.5,0.01,true,,,,,,,"  # what the store had was not computed again
     assert resumed[2:] == (folder / "study.csv").read_text().splitlines()[2:]
     assert not store.exists()
 

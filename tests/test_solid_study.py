@@ -119,7 +119,7 @@ def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
 def test_the_table_has_a_width_for_each_axis_of_the_head() -> None:
     head, *_, last = table_text(rows()).splitlines()
     names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,sigma_y_mm,fit_rms,detectable"
-    names += ",thickness_mm,head_radius_mm,normalise,background,fit_radius_mm,noise,flat_field"
+    names += ",thickness_mm,head_radius_mm,head,normalise,background,fit_radius_mm,noise,flat_field"
     assert head == names
     cells = dict(zip(names.split(","), last.split(","), strict=True))
     assert cells["seat"] == "1.2"
@@ -323,7 +323,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
     done = run_cli(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     resumed = (tmp_path / "study.csv").read_text().splitlines()
-    assert resumed[1] == "centred,10,1,100,0.123,4.5,3.5,0.01,true,,,,,,,"
+    assert resumed[1] == "centred,10,1,100,0.123,4.5,3.5,0.01,true,,,,,,,,"
     assert resumed[2] == (folder / "study.csv").read_text().splitlines()[1]
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from tactile_bayes.cli import cli
 from tactile_bayes.commands.study import fit_line, table_text
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.forward.study import (
     DETECTABLE,
@@ -22,6 +27,7 @@ from tactile_bayes.forward.study import (
 )
 from tactile_bayes.forward.tactile_line import TactileLine
 from tactile_bayes.posterior.least_squares import fit_least_squares
+from tactile_bayes.presets import HEADS
 
 X = 0.5 * (np.arange(240) - 119.5)
 
@@ -131,10 +137,10 @@ def test_a_harder_lump_shows_higher(rows: list[StudyRow]) -> None:
 def test_the_table_says_what_was_found(rows: list[StudyRow]) -> None:
     head, first, *_ = table_text(rows).splitlines()
     found = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,fit_rms,detectable,thickness_mm,head_radius_mm"
-    assert head == f"{found},normalise,background,fit_radius_mm,noise"
+    assert head == f"{found},head,normalise,background,fit_radius_mm,noise"
     cells = first.split(",")
     assert cells[:4] == ["centred", "10", "1", "2"]
-    assert cells[7:] == ["true", "70", "35", "mean", "fixed", "48", "independent"]
+    assert cells[7:] == ["true", "70", "35", "shoulders-inside", "mean", "fixed", "48", "independent"]
     assert float(cells[4]) == pytest.approx(rows[0].amplitude, rel=1e-5)
 
 
@@ -156,3 +162,21 @@ def test_the_coefficients_of_the_papers_study(seat: float) -> None:
     assert found.m == pytest.approx(m, rel=0.02)
     assert found.e == pytest.approx(e, rel=0.025)
     assert found.f == pytest.approx(f, abs=0.02)
+
+
+def test_shoulders_around_the_sensing_width_show_deep_lumps_higher() -> None:
+    """Record 0075: they decide how many of the paper's cases cannot be seen."""
+    deep = Geometry(0.0, 15.0, 1.5, (100.0,))
+    settings = [StudySettings(Head(shoulders=where)) for where in HEADS]
+    (inside,), (outside,) = (run_geometry(deep, settings=replace(one, fineness=1), fit=fit_line) for one in settings)
+    assert (inside.head, outside.head) == HEADS
+    assert outside.amplitude / inside.amplitude == pytest.approx(1.33, abs=0.05)
+    with pytest.raises(BadDataError, match="shoulders"):
+        Head(shoulders="round")
+
+
+@pytest.mark.parametrize("words", [("study", "-o", "s.csv"), ("tables",), ("simulate", "s.toml", "-o", "s.mcap")])
+def test_a_head_that_is_none_is_a_usage_error(words: tuple[str, ...]) -> None:
+    ended = CliRunner().invoke(cli, [*words, "--head", "round"])
+    assert ended.exit_code == 2
+    assert "shoulders-inside" in ended.output

@@ -329,7 +329,7 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
         raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
     if depth is None:
         return SizeTable(d_mm, amplitude, sigma_x, sigma_y)
-    same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm")]
+    same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]
     group = list(zip(*same, strict=True))
     change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
     change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)

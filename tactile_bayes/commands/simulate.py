@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.head_option import head_option
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
@@ -26,8 +27,14 @@ if TYPE_CHECKING:
     type=click.Choice(["empirical-gaussian", "empirical", "plane-strain", "solid"]),
     help="Model of the tissue; by default the one the scene is written for.",
 )
+@head_option(
+    "Default: as the scene's [head] gives them for solid, shoulders-inside for plane-strain and empirical. "
+    "empirical-gaussian has none."
+)
 @click.option("--force", is_flag=True, help="Overwrite the output.")
-def command(*, scene: Path, output: Path, seed: int | None, fidelity: str | None, force: bool) -> None:
+def command(
+    *, scene: Path, output: Path, seed: int | None, fidelity: str | None, head: str | None, force: bool
+) -> None:
     """Make a scan with known truth from SCENE, a TOML file.
 
     Lumps given as bumps (amplitude, sigma) take the empirical-gaussian model; lumps of tissue (d_mm, depth_ratio,
@@ -42,12 +49,14 @@ def command(*, scene: Path, output: Path, seed: int | None, fidelity: str | None
     from tactile_bayes.presets import RESEARCH_USE
 
     refuse_existing(output, force=force)
-    for line in _run(scene, output, seed=seed, fidelity=fidelity, force=force):
+    for line in _run(scene, output, seed=seed, fidelity=fidelity, head=head, force=force):
         click.echo(line)
     click.echo(RESEARCH_USE)
 
 
-def _run(scene_path: Path, output: Path, *, seed: int | None, fidelity: str | None, force: bool) -> list[str]:
+def _run(
+    scene_path: Path, output: Path, *, seed: int | None, fidelity: str | None, head: str | None, force: bool
+) -> list[str]:
     import numpy as np
 
     from tactile_bayes.commands.import_ import describe_scan
@@ -60,7 +69,7 @@ def _run(scene_path: Path, output: Path, *, seed: int | None, fidelity: str | No
     scene = read_scene(scene_path)
     used = scene.seed if seed is None else seed
     with progress_bar("frames") as progress:
-        simulated = simulate(scene, rng=np.random.default_rng(used), fidelity=fidelity, progress=progress)
+        simulated = simulate(scene, rng=np.random.default_rng(used), fidelity=fidelity, head=head, progress=progress)
     provenance = Provenance(
         "simulate", {"model": simulated.truth["model"]}, inputs=hash_inputs(scene=scene_path), seed=used
     )
@@ -71,6 +80,7 @@ def _run(scene_path: Path, output: Path, *, seed: int | None, fidelity: str | No
         f"{output}: scan, seed {used}",
         *describe_scan(simulated.scan),
         f"model {_model(simulated.truth)}",
+        *([f"head: {simulated.truth['head']}"] if "head" in simulated.truth else []),
         *found,
     ]
 

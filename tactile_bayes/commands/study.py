@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.head_option import head_option
 from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 
@@ -54,8 +55,9 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
     type=float,
     default=3.0,
     show_default=True,
-    help="Radius of the head's shoulders; solid: of the rim around its taxels.",
+    help="Radius of the head's shoulders.",
 )
+@head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
 @click.option("--mean-kpa", type=_ABOVE_0, default=9.5, show_default=True, help="Mean pressure on the head.")
 @click.option("--fat-kpa", type=_ABOVE_0, default=5.0, show_default=True, help="Young's modulus of fat.")
 @click.option("--poisson", type=float, default=0.495, show_default=True, help="Poisson's ratio of the tissues.")
@@ -142,6 +144,7 @@ def study_settings(
     model: str = "plane-strain",
     background: str | None = None,
     flat_field: bool | None = None,
+    head: str | None = None,
 ) -> StudySettings | SolidSettings:
     """The study's settings from the options of the command line.
 
@@ -153,9 +156,10 @@ def study_settings(
     from tactile_bayes.errors import UsageError
     from tactile_bayes.forward.contact import Head
     from tactile_bayes.forward.study import StudySettings
+    from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 
-    # both models are asked for the same section: the solid one rounds it off outside the taxels
-    section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
+    default = SHOULDERS_INSIDE if model == "plane-strain" else SHOULDERS_OUTSIDE
+    section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or default)
     if model == "plane-strain":
         if background == "free" or flat_field:
             asked = "--background free" if background == "free" else "--flat-field"
@@ -164,7 +168,7 @@ def study_settings(
     from tactile_bayes.forward.scene import Head as Array
     from tactile_bayes.forward.solid_study import SolidSettings
 
-    array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm)
+    array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm).with_shoulders(section.shoulders)
     return SolidSettings(
         array,
         mean_kpa,
@@ -328,7 +332,7 @@ def table_text(rows: list[StudyRow]) -> str:
     if any(row.sigma_y_mm is not None for row in rows):
         names.append("sigma_y_mm")
     names += ["fit_rms", "detectable", "thickness_mm", "head_radius_mm"]
-    names += [name for name in RECIPE if any(getattr(row, name) is not None for row in rows)]
+    names += [name for name in ("head", *RECIPE) if any(getattr(row, name) is not None for row in rows)]
     lines = [",".join(names)]
     lines += [",".join(_cell(getattr(row, name)) for name in names) for row in rows]
     return "\n".join(lines) + "\n"
@@ -348,6 +352,9 @@ def summary(rows: list[StudyRow]) -> str:
 
     shown = sum(row.detectable for row in rows)
     lines = [f"{len(rows)} cases, {len(rows) - shown} not detectable (amplitude below {DETECTABLE:g}, or not resolved)"]
+    heads = dict.fromkeys(row.head for row in rows if row.head is not None)
+    if heads:
+        lines.append(f"head: {', '.join(heads)}")
     axes = (
         {"x": ", across the head", "y": ", along it"} if any(row.sigma_y_mm is not None for row in rows) else {"x": ""}
     )

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.head_option import head_option
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -20,9 +22,10 @@ if TYPE_CHECKING:
     metavar="centred|resting|0..2",
     help="How far the lump stands out of the gland.",
 )
+@head_option("Default: shoulders-inside.")
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def command(seat: str, workers: int, as_json: bool) -> None:
+def command(*, seat: str, head: str | None, workers: int, as_json: bool) -> None:
     """Compute Tables 1 and 2 of the paper again, beside the printed figures.
 
     The empirical model (Eqs 1 to 4) is fitted to frames of the elastic plane-strain model and compared with it: on the
@@ -33,17 +36,19 @@ def command(seat: str, workers: int, as_json: bool) -> None:
     import json
 
     from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 
-    found, phantoms = run_tables(parse_seat(seat), workers=workers)
+    head = head or SHOULDERS_INSIDE
+    found, phantoms = run_tables(parse_seat(seat), head=head, workers=workers)
     if as_json:
-        click.echo(json.dumps(tables_document(found, phantoms, seat=parse_seat(seat)), indent=2))
+        click.echo(json.dumps(tables_document(found, phantoms, seat=parse_seat(seat), head=head), indent=2))
         return
     click.echo(tables_text(found, phantoms))
+    click.echo(f"head: {head}")
     click.echo(RESEARCH_USE)
 
 
-def run_tables(seat: float, *, workers: int) -> tuple[list[Agreement], list[Agreement]]:
+def run_tables(seat: float, *, head: str, workers: int) -> tuple[list[Agreement], list[Agreement]]:
     """Agreement of both models over the cases of the tables, and over the phantoms."""
     from functools import partial
 
@@ -52,11 +57,12 @@ def run_tables(seat: float, *, workers: int) -> tuple[list[Agreement], list[Agre
     from tactile_bayes.commands.study import fit_line
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.executors import open_executor
+    from tactile_bayes.forward.contact import Head
     from tactile_bayes.forward.study import StudySettings
     from tactile_bayes.forward.tables import compare, phantom_scenes, table_scenes
 
     scenes = table_scenes(seat) + phantom_scenes(seat)
-    work = partial(compare, settings=StudySettings(), fit=fit_line)
+    work = partial(compare, settings=StudySettings(Head(shoulders=head)), fit=fit_line)
     with open_executor(workers=workers) as executor, progress_bar("lumps") as progress:
         outcomes = run_batch(work, scenes, key=lambda scene: scene.name, executor=executor, progress=progress)
     for outcome in outcomes:
@@ -123,7 +129,9 @@ def _table(
     return [*lines, f"mean {mean:.1f}", ""]
 
 
-def tables_document(found: Sequence[Agreement], phantoms: Sequence[Agreement], *, seat: float) -> dict[str, object]:
+def tables_document(
+    found: Sequence[Agreement], phantoms: Sequence[Agreement], *, seat: float, head: str
+) -> dict[str, object]:
     """The same as plain data, shares instead of percent."""
     from dataclasses import asdict
 
@@ -134,6 +142,7 @@ def tables_document(found: Sequence[Agreement], phantoms: Sequence[Agreement], *
         "definition": DEFINITION,
         "other_definitions": list(OTHER_DEFINITIONS),
         "seat": seat,
+        "head": head,
         "printed_percent": {
             "frames": {f"{h:g}": list(row) for h, row in PRINTED_FRAMES.items()},
             "maps": {f"{h:g}": list(row) for h, row in PRINTED_MAPS.items()},

@@ -5,7 +5,8 @@ pressures are the one solution of
 
 .. math:: p \ge 0, \quad w = Cp + g - \delta \ge 0, \quad p \cdot w = 0, \quad \textstyle\sum p\,\Delta x = F,
 
-a small convex quadratic programme (Johnson 1985, section 5.8).
+a small convex quadratic programme (Johnson 1985, section 5.8). Where shoulders lie around the sensing cells, F is the
+force on the sensing cells alone (decision record 0025).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS
+from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDERS_INSIDE
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
@@ -31,20 +32,25 @@ class Head:
     Parameters
     ----------
     width_mm
-        From side to side.
+        Of the sensing part.
     radius_mm
         Of the arc; infinity for a flat head.
     shoulder_mm
         Radius of the round between arc and side, tangent to both; 0 for a sharp edge.
+    shoulders
+        ``"shoulders-inside"``: the rounds are cut into the sensing width, which is the whole face.
+        ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing.
 
     Notes
     -----
     The paper has "nearly a section of a circular cylinder" of 24 mm (section 2.1); radius and shoulders are assumed.
+    Where the shoulders lie decides how many faint lumps show: decision record 0075.
     """
 
     width_mm: float = HEAD_ROWS * HEAD_PITCH_MM
     radius_mm: float = HEAD_RADIUS_MM
     shoulder_mm: float = SHOULDER_MM
+    shoulders: str = SHOULDERS_INSIDE
 
     def __post_init__(self) -> None:
         if not 0 < self.width_mm < np.inf:
@@ -54,21 +60,41 @@ class Head:
                 f"radius_mm of the head is {self.radius_mm:g}",
                 way_out=f"it must be above {self.half_width_mm:g} mm, half the head's width",
             )
-        if not 0 <= self.shoulder_mm <= self.half_width_mm:
+        self._check_shoulders()
+
+    def _check_shoulders(self) -> None:
+        if self.shoulders not in HEADS:
+            raise BadDataError(
+                f"shoulders of the head is {self.shoulders!r}", way_out=f"it must be {' or '.join(HEADS)}"
+            )
+        inside = self.shoulders == SHOULDERS_INSIDE
+        if inside and not 0 <= self.shoulder_mm <= self.half_width_mm:
             raise BadDataError(
                 f"shoulder_mm of the head is {self.shoulder_mm:g}",
                 way_out=f"it must be between 0 and {self.half_width_mm:g} mm, half the head's width",
             )
+        if not 0 <= self.shoulder_mm < self.radius_mm:
+            raise BadDataError(
+                f"shoulder_mm of the head is {self.shoulder_mm:g}",
+                way_out=f"it must be between 0 and below radius_mm, {self.radius_mm:g} mm",
+            )
 
     @property
     def half_width_mm(self) -> float:
-        """w of Eq 1."""
+        """Half of the sensing width: w of Eq 1."""
         return 0.5 * self.width_mm
 
+    @property
+    def half_face_mm(self) -> float:
+        """Half the width of the rigid face: of the sensing width, and of the shoulders where they lie outside it."""
+        if self.shoulders == SHOULDERS_INSIDE:
+            return self.half_width_mm
+        return self.half_width_mm + self.shoulder_mm * (1 - self.half_width_mm / self.radius_mm)
+
     def profile_mm(self, s_mm: FloatArray) -> FloatArray:
-        """Height of the head's face above its lowest point, at distances `s_mm` from its centre within the width."""
+        """Height of the head's face above its lowest point, at distances `s_mm` from its centre within the face."""
         s = np.abs(np.asarray(s_mm, dtype=np.float64))
-        r, inner = self.shoulder_mm, self.half_width_mm - self.shoulder_mm
+        r, inner = self.shoulder_mm, self.half_face_mm - self.shoulder_mm
         if np.isinf(self.radius_mm):
             return np.where(s <= inner, 0.0, r - _circle(r, s - inner))
         big = self.radius_mm
@@ -77,15 +103,24 @@ class Head:
         return np.where(s <= tangent, big - _circle(big, s), big - centre - _circle(r, s - inner))
 
     def cell_profile_mm(self, cell_mm: float) -> FloatArray:
-        """(n,) profile averaged over the cells of width `cell_mm` under the head, from left to right."""
+        """(n,) profile averaged over the cells of width `cell_mm` of the face, from left to right.
+
+        Cells around the sensing width belong to the face when their centres lie on a shoulder.
+        """
+        points, weights = np.polynomial.legendre.leggauss(6)
+        count = len(self.sensing_cells(cell_mm))
+        centres = cell_mm * (np.arange(count) - 0.5 * (count - 1))
+        return np.asarray(self.profile_mm(centres[:, None] + 0.5 * cell_mm * points) @ (0.5 * weights))
+
+    def sensing_cells(self, cell_mm: float) -> BoolArray:
+        """(n,) for the cells of the face from left to right: whether a cell senses, or only presses."""
         count = round(self.width_mm / cell_mm)
         if count < 2 or abs(count * cell_mm - self.width_mm) > 1e-9 * self.width_mm:
             raise BadDataError(
                 f"cell_mm is {cell_mm:g}", way_out=f"it must divide the head's width of {self.width_mm:g} mm"
             )
-        points, weights = np.polynomial.legendre.leggauss(6)
-        centres = cell_mm * (np.arange(count) - 0.5 * (count - 1))
-        return np.asarray(self.profile_mm(centres[:, None] + 0.5 * cell_mm * points) @ (0.5 * weights))
+        around = max(0, int(np.ceil((self.half_face_mm - self.half_width_mm) / cell_mm - 0.5 - 1e-9)))
+        return np.pad(np.ones(count, dtype=bool), around)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +144,12 @@ class Contact:
 
 
 def solve_contact(
-    compliance: FloatArray, profile_mm: FloatArray, *, total_kpa: float | FloatArray, touching: BoolArray | None = None
+    compliance: FloatArray,
+    profile_mm: FloatArray,
+    *,
+    total_kpa: float | FloatArray,
+    touching: BoolArray | None = None,
+    counted: BoolArray | None = None,
 ) -> Contact:
     """Press a rigid profile on a surface, at many positions at once.
 
@@ -120,17 +160,25 @@ def solve_contact(
     profile_mm : (n,) array
         Head's face above its lowest point.
     total_kpa
-        Sum of the cells' pressures: force per unit length over the width of a cell. Above 0; one, or (m,) of them.
+        Sum of the counted cells' pressures: force per unit length over the width of a cell. Above 0; one, or (m,).
     touching : (n,) or (m, n) bool array, optional
         A first guess of the cells in contact.
+    counted : (n,) bool array, optional
+        Cells whose pressures add up to `total_kpa`, the sensing ones; by default all.
+
+    Raises
+    ------
+    NotConvergedError
+        When a contact is not found.
 
     Notes
     -----
     Cells that would pull are let go and cells that would overlap are taken in, all at once, until none changes (the
     primal-dual active set method; Hintermueller, Ito & Kunisch 2003). A position at which that does not end is solved
-    cell by cell, which always ends.
+    cell by cell, which always ends where all cells are counted.
     """
     m, n = compliance.shape[:2]
+    share = np.ones(n) if counted is None else counted.astype(np.float64)
     total = np.broadcast_to(np.asarray(total_kpa, dtype=np.float64), (m,))
     if not (np.isfinite(total).all() and (total > 0).all()):
         raise BadDataError(f"the head's force is {total.min():g}", way_out="it must be above 0")
@@ -140,14 +188,14 @@ def solve_contact(
     rounds = 0
     while len(open_) and rounds < _MOST_ROUNDS:
         rounds += 1
-        p, w, d = _given_contact(compliance[open_], profile_mm, active[open_], total[open_])
+        p, w, d = _given_contact(compliance[open_], profile_mm, active[open_], total[open_], share)
         new = (active[open_] & (p > 0)) | (~active[open_] & (w < -_tolerance(profile_mm, d)))
         pressure[open_], gap[open_], depth[open_] = p, w, d
         changed = (new != active[open_]).any(axis=1)
         active[open_] = new
         open_ = open_[changed]
     for i in open_:
-        pressure[i], gap[i], depth[i] = _cell_by_cell(compliance[i], profile_mm, float(total[i]))
+        pressure[i], gap[i], depth[i] = _cell_by_cell(compliance[i], profile_mm, float(total[i]), share)
     return Contact(np.maximum(pressure, 0.0), np.maximum(gap, 0.0), depth, rounds)
 
 
@@ -157,7 +205,7 @@ def _tolerance(profile_mm: FloatArray, depth_mm: FloatArray) -> FloatArray:
 
 
 def _given_contact(
-    compliance: FloatArray, profile: FloatArray, active: BoolArray, total: float | FloatArray
+    compliance: FloatArray, profile: FloatArray, active: BoolArray, total: float | FloatArray, share: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pressures (0 off `active`), gaps (0 on it) and depths when the touching cells are known."""
     n = len(profile)
@@ -167,18 +215,20 @@ def _given_contact(
     sides = np.stack([np.where(active, -profile, 0.0), active.astype(np.float64)], axis=-1)
     solved = np.linalg.solve(system, sides)
     rest, unit = solved[..., 0], solved[..., 1]
-    depth = (total - rest.sum(axis=1)) / np.maximum(unit.sum(axis=1), 1e-300)
+    depth = (total - (rest * share).sum(axis=1)) / np.maximum((unit * share).sum(axis=1), 1e-300)
     pressure = np.where(active, rest + depth[:, None] * unit, 0.0)
     gap = np.einsum("mij,mj->mi", compliance, pressure) + profile - depth[:, None]
     return pressure, np.where(active, 0.0, gap), depth
 
 
-def _cell_by_cell(compliance: FloatArray, profile: FloatArray, total: float) -> tuple[FloatArray, FloatArray, float]:
+def _cell_by_cell(
+    compliance: FloatArray, profile: FloatArray, total: float, share: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
     """The same by moving one cell at a time along a path on which the energy only falls (Lawson & Hanson 1974)."""
     n = len(profile)
-    active, pressure = np.ones(n, dtype=bool), np.full(n, total / n)
+    active, pressure = np.ones(n, dtype=bool), np.full(n, total / share.sum())
     for _ in range(20 * n):
-        p, w, d = (part[0] for part in _given_contact(compliance[None], profile, active[None], total))
+        p, w, d = (part[0] for part in _given_contact(compliance[None], profile, active[None], total, share))
         if (p[active] > 0).all():
             pressure = p
             worst = int(np.argmin(w))

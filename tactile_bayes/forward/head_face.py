@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import SHOULDERS_OUTSIDE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,20 +60,20 @@ def head_face(taxel_mm: FloatArray, *, pitch_mm: float, radius_mm: float, rim_mm
 
     Notes
     -----
-    Across the head the rim is tangent to the arc: about a point at :math:`(R - s)(\sin\vartheta, \cos\vartheta)` from
-    the arc's centre, with :math:`R \sin\vartheta` half the array's width. Along the head it is tangent to a line.
+    Across the head the face is the section `contact.Head` with its shoulders outside: the rim is tangent to the arc at
+    the array's edge. Along the head the rim is tangent to a line.
     Squares whose centres lie on the rim are added.
     """
     rows, columns = taxel_mm.shape[:2]
     if not 0 <= rim_mm < radius_mm:
         raise BadDataError(f"rim_mm is {rim_mm:g}", way_out=f"it must lie in 0 to below radius_mm, {radius_mm:g} mm")
     half_x, half_y = rows * pitch_mm / 2, columns * pitch_mm / 2
-    sine = half_x / radius_mm
-    more_x = _squares(half_x, (radius_mm - rim_mm) * sine + rim_mm, pitch_mm)
+    section = Head(2 * half_x, radius_mm, rim_mm, SHOULDERS_OUTSIDE)
+    more_x = _squares(half_x, section.half_face_mm, pitch_mm)
     more_y = _squares(half_y, half_y + rim_mm, pitch_mm)
     x = (np.arange(rows + 2 * more_x) - (rows + 2 * more_x - 1) / 2) * pitch_mm
     y = (np.arange(columns + 2 * more_y) - (columns + 2 * more_y - 1) / 2) * pitch_mm
-    across = _rim_across(np.abs(x), half_x, radius_mm, rim_mm)
+    across = -section.profile_mm(x)
     along = np.sqrt(np.maximum(rim_mm**2 - np.clip(np.abs(y) - half_y, 0.0, None) ** 2, 0.0)) - rim_mm
     surface = np.stack(np.broadcast_arrays(x[:, None], y[None, :], across[:, None] + along[None, :]), axis=-1).copy()
     sensing = np.zeros(surface.shape[:2], dtype=bool)
@@ -83,13 +85,3 @@ def head_face(taxel_mm: FloatArray, *, pitch_mm: float, radius_mm: float, rim_mm
 def _squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
     """How many squares beyond `half_mm` have their centres short of `reach_mm`."""
     return max(0, int(np.ceil((reach_mm - half_mm) / pitch_mm - 0.5 - 1e-9)))
-
-
-def _rim_across(x_mm: FloatArray, half_mm: float, radius_mm: float, rim_mm: float) -> FloatArray:
-    """Height of the face across the head: the arc, then the rim."""
-    sine = half_mm / radius_mm
-    cosine = np.sqrt(1.0 - sine**2)
-    arc = np.sqrt(radius_mm**2 - np.minimum(x_mm, half_mm) ** 2) - radius_mm
-    into = x_mm - (radius_mm - rim_mm) * sine
-    rim = (radius_mm - rim_mm) * cosine - radius_mm + np.sqrt(np.maximum(rim_mm**2 - into**2, 0.0))
-    return np.asarray(np.where(x_mm <= half_mm, arc, rim))

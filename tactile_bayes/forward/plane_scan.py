@@ -24,6 +24,7 @@ from tactile_bayes.forward.solid_scan import refuse_bumps, tissue_truth
 from tactile_bayes.forward.solid_scene import SceneBody, SolidLump, fat_thickness
 from tactile_bayes.forward.tactile_line import press, press_layers
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import SHOULDERS_INSIDE
 
 Progress = Callable[[int, int], None]
 Sections = Callable[[FloatArray, FloatArray], FloatArray]
@@ -37,7 +38,12 @@ _SHAPE = "a cylinder along y: each frame's profile across the head is repeated a
 
 
 def simulate_plane(
-    scene: Scene, *, rng: np.random.Generator, fidelity: str, progress: Progress | None = None
+    scene: Scene,
+    *,
+    rng: np.random.Generator,
+    fidelity: str,
+    shoulders: str = SHOULDERS_INSIDE,
+    progress: Progress | None = None,
 ) -> SimulatedScan:
     """Make a scan of a scene that gives tissue, in two dimensions.
 
@@ -50,6 +56,8 @@ def simulate_plane(
     fidelity
         ``"plane-strain"``: the head's contact is solved at each place and force. ``"empirical"``: Eqs 1 to 4 as
         printed, fitted to two frames of the plane-strain model at the nominal pressure, and scaled with the pressure.
+    shoulders
+        One of `presets.HEADS`: where the head's shoulders lie.
     progress
         Called with frames done and frames in all.
 
@@ -58,11 +66,11 @@ def simulate_plane(
     BadDataError
         When the scene is not one of two dimensions, or the head leaves the skin that was solved for.
     """
-    section = plane_section(scene, fidelity)
+    section = plane_section(scene, fidelity, shoulders=shoulders)
     sections = section.empirical if fidelity == "empirical" else section.solved
     time = frame_times(scene)
     pressure = plane_frames(scene, time, sections, lump_x_mm=section.x_mm, progress=progress)
-    truth = {"model": fidelity, "shape": _SHAPE, **tissue_truth(scene)}
+    truth = {"model": fidelity, "shape": _SHAPE, "head": shoulders, **tissue_truth(scene)}
     return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], truth=truth, rng=rng)
 
 
@@ -73,7 +81,7 @@ class PlaneSection:
     Parameters
     ----------
     head
-        Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0, within the array.
+        Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0.
     layers
         The body without the lump.
     lump
@@ -146,8 +154,13 @@ class PlaneSection:
         return _taxels(found.pressure_kpa)
 
 
-def plane_section(scene: Scene, fidelity: str) -> PlaneSection:
+def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
     """The section that a scene means.
+
+    Parameters
+    ----------
+    shoulders
+        One of `presets.HEADS`: where the head's shoulders lie.
 
     Raises
     ------
@@ -165,18 +178,21 @@ def plane_section(scene: Scene, fidelity: str) -> PlaneSection:
     layers = Layers(fat, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
     lump = _cylinder(scene.solid_lumps[0], body, fat, fidelity) if scene.solid_lumps else None
     x_mm = scene.solid_lumps[0].x_mm if scene.solid_lumps else 0.0
-    rim = scene.head.shoulder_mm if scene.head.shoulder_mm > 0 else scene.head.rim_mm
     width = scene.head.rows * scene.head.pitch_mm
-    if rim > width / 2:
-        raise BadDataError(f"head.rim_mm is {rim:g}", way_out=f"in two dimensions it must be at most {width / 2:g} mm")
+    if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
+        raise BadDataError(
+            f"head.rim_mm is {scene.head.rim_mm:g}",
+            way_out=f"cut into the array of two dimensions it must be at most {width / 2:g} mm",
+        )
+    head, cell_mm = scene.head.section(shoulders), scene.head.pitch_mm / _CELLS_A_TAXEL
     return PlaneSection(
-        Head(width, scene.head.radius_mm, rim),
+        head,
         layers,
         lump,
         x_mm,
         scene.background.mean_kpa,
-        scene.head.pitch_mm / _CELLS_A_TAXEL,
-        _reach(scene, x_mm, width / 2, layers.thickness_mm),
+        cell_mm,
+        _reach(scene, x_mm, 0.5 * cell_mm * len(head.sensing_cells(cell_mm)), layers.thickness_mm),
     )
 
 

@@ -7,14 +7,22 @@ follows from them as for a real scan. `data_schema/scene.schema.json` holds the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.contact import Head as Section
 from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump, check_solid
 from tactile_bayes.geometry import FloatArray, rigid, rotation_from_quaternion
-from tactile_bayes.presets import HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS
+from tactile_bayes.presets import (
+    HEAD_COLUMNS,
+    HEAD_PITCH_MM,
+    HEAD_RADIUS_MM,
+    HEAD_ROWS,
+    SHOULDERS_INSIDE,
+    SHOULDERS_OUTSIDE,
+)
 
 Point = tuple[float, float, float]
 Taxel = tuple[int, int]
@@ -95,10 +103,10 @@ class Strokes:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """A section of a circular cylinder, its edges rounded off over `shoulder_mm`.
+    """A section of a circular cylinder, its edges rounded off.
 
-    `rim_mm` is the radius of the rounded edge *around* the taxels, which presses but feels nothing; only the solid
-    model knows it.
+    `shoulder_mm` is the radius of shoulders cut into the array. Where it is 0, `rim_mm` is the radius of the rounded
+    edge *around* the taxels, which presses but senses nothing; in two dimensions it is cut into the array unless asked.
     """
 
     rows: int = HEAD_ROWS
@@ -110,7 +118,7 @@ class Head:
 
     def surface_mm(self) -> FloatArray:
         """(rows, columns, 3) taxel centres in `scanhead`: origin at the apex, z into the tissue, so z <= 0."""
-        x = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch_mm
+        x = np.asarray((np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch_mm, dtype=np.float64)
         y = (np.arange(self.columns) - (self.columns - 1) / 2) * self.pitch_mm
         z = np.sqrt(self.radius_mm**2 - x**2) - self.radius_mm
         if self.shoulder_mm > 0:
@@ -118,6 +126,28 @@ class Head:
             z = z + np.sqrt(self.shoulder_mm**2 - into**2) - self.shoulder_mm
         xx, yy = np.meshgrid(x, y, indexing="ij")
         return np.stack([xx, yy, np.broadcast_to(z[:, None], xx.shape)], axis=-1)
+
+    @property
+    def shoulders(self) -> str:
+        """Which of `presets.HEADS` this is in three dimensions."""
+        return SHOULDERS_INSIDE if self.shoulder_mm > 0 else SHOULDERS_OUTSIDE
+
+    def with_shoulders(self, shoulders: str) -> Head:
+        """The same head, its shoulders of the same radius where `shoulders`, one of `presets.HEADS`, says."""
+        edge = self.section(shoulders).shoulder_mm
+        inside = shoulders == SHOULDERS_INSIDE
+        return replace(self, shoulder_mm=edge if inside else 0.0, rim_mm=0.0 if inside else edge)
+
+    def section(self, shoulders: str) -> Section:
+        """The section across the head, with shoulders of this head's radius where `shoulders` says.
+
+        Raises
+        ------
+        BadDataError
+            When `shoulders` is not one of `presets.HEADS`, or the radius does not fit there.
+        """
+        edge = self.shoulder_mm if self.shoulder_mm > 0 else self.rim_mm
+        return Section(self.rows * self.pitch_mm, self.radius_mm, edge, shoulders)
 
 
 @dataclass(frozen=True, slots=True)

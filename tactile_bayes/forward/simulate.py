@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Final
 
 import numpy as np
@@ -12,6 +12,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.instrument import SimulatedScan, head_positions, level_kpa, record
 from tactile_bayes.forward.scene import Scene, normalised_pressure
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import SHOULDERS_INSIDE
 
 FIDELITIES: Final = ("empirical-gaussian", "empirical", "plane-strain", "solid")
 """A bump's own formula; and for lumps of tissue Eqs 1 to 4, a body in two dimensions, and one in three."""
@@ -22,6 +23,7 @@ def simulate(
     *,
     rng: np.random.Generator,
     fidelity: str | None = None,
+    head: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedScan:
     """Make a scan from a scene.
@@ -34,6 +36,9 @@ def simulate(
         Split into independent streams, so that a longer scan of the same seed keeps its gains and calibration.
     fidelity
         One of `FIDELITIES`; None takes the one the scene is written for (`Scene.fidelity`).
+    head
+        One of `presets.HEADS`: where the shoulders of the scene's head lie. None: as the scene gives them in three
+        dimensions, and inside the array in two.
     progress
         Called with frames done and frames in all; the bumps alone are too quick to call it.
 
@@ -41,10 +46,22 @@ def simulate(
     -------
     SimulatedScan
         Frames at ``k / frame_rate_hz``; poses at ``k / pose_rate_hz``, stamped late by the latency.
+
+    Raises
+    ------
+    BadDataError
+        When the model cannot make this scene, or has no head whose shoulders could lie elsewhere.
     """
     chosen = scene.fidelity if fidelity is None else fidelity
     if chosen not in FIDELITIES:
         raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
+    if head is not None:
+        if chosen == "empirical-gaussian":
+            raise BadDataError(
+                "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
+                way_out="leave --head out, or choose another --fidelity",
+            )
+        scene = replace(scene, head=scene.head.with_shoulders(head))
     if chosen == "solid":
         from tactile_bayes.forward.solid_scan import simulate_solid
 
@@ -52,7 +69,7 @@ def simulate(
     if chosen in ("plane-strain", "empirical"):
         from tactile_bayes.forward.plane_scan import simulate_plane
 
-        return simulate_plane(scene, rng=rng, fidelity=chosen, progress=progress)
+        return simulate_plane(scene, rng=rng, fidelity=chosen, shoulders=head or SHOULDERS_INSIDE, progress=progress)
     if scene.solid_lumps or scene.ribs:
         named = "lump[0] gives depth_ratio and no amplitude" if scene.solid_lumps else "rib[0] is of tissue"
         raise BadDataError(

@@ -47,7 +47,7 @@ def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress
         scene,
         felt=lambda at: pressure[np.searchsorted(time, at)],
         depth=lambda at: np.interp(at, time, depth),
-        truth={"model": "solid", **tissue_truth(scene)},
+        truth={"model": "solid", "head": scene.head.shoulders, **tissue_truth(scene)},
         rng=rng,
     )
 

@@ -250,6 +250,7 @@ def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: Rast
                 found.sigma_y_mm,
                 body.layers.thickness_mm,
                 settings.head.radius_mm,
+                settings.head.shoulders,
                 normalise="mean",
                 background=settings.background,
                 fit_radius_mm=settings.fit_radius_mm,

@@ -64,7 +64,8 @@ class StudySettings:
 
     def surface(self, body: Body) -> SurfaceCompliance:
         """The body condensed onto the surface that the head travels over."""
-        reach = max(abs(self.positions_mm[0]), abs(self.positions_mm[1])) + self.head.half_width_mm
+        half_face_mm = 0.5 * self.cell_mm * len(self.head.sensing_cells(self.cell_mm))
+        reach = max(abs(self.positions_mm[0]), abs(self.positions_mm[1])) + half_face_mm
         return condense(body, reach_mm=reach, cell_mm=self.cell_mm, fineness=self.fineness)
 
     def frames(self, surface: SurfaceCompliance, stiffness_ratio: float | None) -> LineFrames:
@@ -124,10 +125,11 @@ Fit = Callable[[TactileLine, float], LineFit]
 class StudyRow:
     """One case and the Gaussian its map shows; the fields are the columns of a size table.
 
-    A map in two dimensions has no `sigma_y_mm`. `thickness_mm` (depth of the chest wall) and `head_radius_mm` (of its
-    arc) are what the case was computed with. The rest is the recipe of the map: how its frames were normalised, whether
-    its level was ``"fixed"`` at 1 or ``"free"``, the radius of the fit, the errors it was fitted under, and whether the
-    head's own response was divided out (None in two dimensions, which have none).
+    A map in two dimensions has no `sigma_y_mm`. `thickness_mm` (depth of the chest wall), `head_radius_mm` (of its arc)
+    and `head` (where its shoulders lie, one of `presets.HEADS`) are what the case was computed with. The rest is the
+    recipe of the map: how its frames were normalised, whether its level was ``"fixed"`` at 1 or ``"free"``, the radius
+    of the fit, the errors it was fitted under, and whether the head's own response was divided out (None in two
+    dimensions, which have none).
     """
 
     seat: str
@@ -141,6 +143,7 @@ class StudyRow:
     sigma_y_mm: float | None = None
     thickness_mm: float | None = None
     head_radius_mm: float | None = None
+    head: str | None = None
     normalise: str | None = None
     background: str | None = None
     fit_radius_mm: float | None = None
@@ -203,6 +206,7 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
                 bool(found.amplitude >= DETECTABLE and found.resolved),
                 thickness_mm=body.layers.thickness_mm,
                 head_radius_mm=settings.head.radius_mm,
+                head=settings.head.shoulders,
                 normalise="mean",
                 background="fixed",
                 fit_radius_mm=settings.fit_radius_mm,

@@ -15,7 +15,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import Layers
 from tactile_bayes.forward.condense import CELL_MM, SurfaceCompliance
-from tactile_bayes.forward.contact import Head, solve_contact
+from tactile_bayes.forward.contact import Contact, Head, solve_contact
 from tactile_bayes.forward.plane_layers import surface_compliance
 from tactile_bayes.geometry import FloatArray
 
@@ -111,7 +111,12 @@ def press(
     stiffness_ratio
         E2/E1 of the lump; None for the body without a lump.
     mean_kpa
-        Force over the head's area: one for all, or (m,) of them.
+        Mean pressure over the sensing width: one for all, or (m,) of them.
+
+    Returns
+    -------
+    LineFrames
+        Of the sensing cells; shoulders outside them press and are not in the frames.
 
     Raises
     ------
@@ -119,8 +124,8 @@ def press(
         When the head would leave the surface.
     """
     cell = surface.cell_mm
-    profile = head.cell_profile_mm(cell)
-    first = (np.asarray(x_c_mm) - head.half_width_mm - surface.edges_mm[0]) / cell
+    profile, senses = head.cell_profile_mm(cell), head.sensing_cells(cell)
+    first = (np.asarray(x_c_mm) - 0.5 * cell * len(profile) - surface.edges_mm[0]) / cell
     if first.min() < -1e-9 or first.max() > len(surface.row) - len(profile) + 1e-9:
         raise BadDataError(
             f"the head at {np.abs(x_c_mm).max():g} mm leaves the surface, which ends at {surface.edges_mm[-1]:g} mm",
@@ -128,29 +133,36 @@ def press(
         )
     matrix = surface.without_lump() if stiffness_ratio is None else surface.with_lump(stiffness_ratio)
     level = np.broadcast_to(np.asarray(mean_kpa, dtype=np.float64), (len(first),))
-    usual = press_layers(surface.body.layers, head=head, mean_kpa=float(np.median(level)), cell_mm=cell)
+    usual = _layers_contact(surface.body.layers, head=head, mean_kpa=np.median(level, keepdims=True), cell_mm=cell)
     touching = usual.pressure_kpa[0] > 0
-    pressure = np.empty((len(first), len(profile)))
+    count = int(senses.sum())
+    pressure = np.empty((len(first), count))
     for chunk in np.array_split(np.arange(len(first)), int(np.ceil(len(first) / 64))):
         windows = _windows(matrix, first[chunk], len(profile))
         pressure[chunk] = solve_contact(
-            windows, profile, total_kpa=level[chunk] * len(profile), touching=touching
-        ).pressure_kpa
-    return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(len(profile), cell), pressure)
+            windows, profile, total_kpa=level[chunk] * count, touching=touching, counted=senses
+        ).pressure_kpa[:, senses]
+    return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(count, cell), pressure)
 
 
 def press_layers(
     layers: Layers, *, head: Head = _NOMINAL_HEAD, mean_kpa: float | FloatArray = MEAN_KPA, cell_mm: float = CELL_MM
 ) -> LineFrames:
     """The frame of a body without a lump, the same wherever the head stands (at 0 here): P1, for each mean given."""
-    profile = head.cell_profile_mm(cell_mm)
+    level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
+    senses = head.sensing_cells(cell_mm)
+    pressure = _layers_contact(layers, head=head, mean_kpa=level, cell_mm=cell_mm).pressure_kpa[:, senses]
+    return LineFrames(np.zeros(len(level)), _cell_centres(int(senses.sum()), cell_mm), pressure)
+
+
+def _layers_contact(layers: Layers, *, head: Head, mean_kpa: FloatArray, cell_mm: float) -> Contact:
+    """The whole face on a body without a lump, for (m,) mean pressures over the sensing width."""
+    profile, senses = head.cell_profile_mm(cell_mm), head.sensing_cells(cell_mm)
     index = np.arange(len(profile))
     row = surface_compliance(np.asarray(cell_mm * index), cell_mm=cell_mm, layers=layers)
     matrix = row[np.abs(index[:, None] - index[None, :])]
-    level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
-    windows = np.broadcast_to(matrix, (len(level), *matrix.shape))
-    found = solve_contact(windows, profile, total_kpa=level * len(profile))
-    return LineFrames(np.zeros(len(level)), _cell_centres(len(profile), cell_mm), found.pressure_kpa)
+    windows = np.broadcast_to(matrix, (len(mean_kpa), *matrix.shape))
+    return solve_contact(windows, profile, total_kpa=mean_kpa * senses.sum(), counted=senses)
 
 
 def _cell_centres(count: int, cell_mm: float) -> FloatArray:

@@ -13,7 +13,6 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import THICKNESS_MM, Body
-from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.empirical import fit_empirical
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.solid_scene import SceneBody, fat_thickness
@@ -21,7 +20,7 @@ from tactile_bayes.forward.solid_study import RasterFitter, SolidSettings, raste
 from tactile_bayes.forward.study import HARD_RATIO, Fit, Geometry, StudyRow, StudySettings, run_geometry
 from tactile_bayes.forward.tactile_line import build_line, head_positions, press, press_layers
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import HEAD_PITCH_MM
+from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE
 
 EMPIRICAL, PLANE, SOLID = "empirical", "plane-strain", "solid"
 # Fineness of the mesh and cell of the contact in mm, the finest last.
@@ -134,8 +133,7 @@ def case_of(scene: Scene) -> LumpCase:
         raise BadDataError(f"lump[0].height_mm is {lump.vertical_mm:g}", way_out="leave it out: both models are round")
     seat = (fat_thickness(body, [lump]) - lump.depth_mm) / (lump.d_mm / 2)
     tissue = (scene.background.mean_kpa, body.nu, body.fat_kpa, body.gland_ratio, body.thickness_mm)
-    rim = scene.head.shoulder_mm if scene.head.shoulder_mm > 0 else scene.head.rim_mm
-    section = Head(scene.head.rows * scene.head.pitch_mm, scene.head.radius_mm, rim)
+    section = scene.head.section(SHOULDERS_INSIDE)
     case = LumpCase(
         lump.d_mm,
         lump.depth_ratio,

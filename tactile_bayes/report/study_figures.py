@@ -194,7 +194,7 @@ def _draw_maps(axes: Axes, curves: Curves) -> None:
 def _caption(name: str, settings: StudySettings, seat: float) -> str:
     head = settings.head
     return (
-        f"{name}: lumps {seat_name(seat)}, head R {head.radius_mm:g} mm with {head.shoulder_mm:g} mm shoulders, "
+        f"{name}: lumps {seat_name(seat)}, head R {head.radius_mm:g} mm with {head.shoulder_mm:g} mm {head.shoulders}, "
         f"mean {settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said.  {RESEARCH_USE}"
     )
 

@@ -1,0 +1,20 @@
+"""`--head`: where the shoulders of a simulated head lie."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from tactile_bayes.presets import HEADS
+
+
+def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The option, with a sentence about what is taken without it."""
+    return click.option(
+        "--head",
+        type=click.Choice(HEADS),
+        help="Where the head's rounded shoulders lie: cut into the sensing width, or around it, where they press and "
+        f"sense nothing. {default}",
+    )
