@@ -93,6 +93,9 @@ def _check_numbers(arrays: Arrays) -> None:
             raise BadDataError(
                 f"{name} holds {number} values that are not finite{where}", way_out="repair or leave them out"
             )
+        largest = float(np.abs(array, dtype=np.float64).max(initial=0.0))
+        if largest > _LARGEST:
+            raise BadDataError(f"{name} holds {largest:.3g}", way_out="give mm, kPa and s; the file may be damaged")
 
 
 def _check_units(arrays: Arrays) -> None:
