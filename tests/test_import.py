@@ -88,6 +88,7 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("zero quaternion", spoil("quaternion_wxyz", 3, 0.0), "norm 0 at index 3"),
     ("time back", spoil("pose_time_s", 4, 0.0), "pose_time_s runs backwards at index 4"),
     ("gain NaN", spoil("gain_kpa_per_count", (2, 3), np.nan), r"gain_kpa_per_count.*\(2, 3\)"),
+    ("position 1e300", spoil("position_mm", (5, 1), 1e300), r"position_mm holds 1e\+300; give mm, kPa and s"),
     ("pitch NaN", put("pitch_mm", lambda _: np.nan), "pitch_mm holds 1 values that are not finite"),
     ("object", put("offset_kpa", lambda o: o.astype(object)), "offset_kpa holds Python objects"),
     ("not rigid", put("array_from_tracker", lambda t: 1.1 * t), "array_from_tracker is not a rigid"),

@@ -32,6 +32,8 @@ _SHAPES: Final[Mapping[str, tuple[str | int, ...]]] = {
     "landmarks_mm": (2, 3),
     "saturation_count": (),
 }
+# No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
+_LARGEST: Final = 1e12
 
 
 def read_arrays(path: Path) -> Scan:

@@ -15,7 +15,7 @@ _ALIGNMENT: Final = 8
 def check_heaps(data: bytes, *, way_out: str) -> None:
     """Refuse a file with a global heap whose free space has the size 0.
 
-    The HDF5 library (2.0 as well as 1.14) walks from object to object by their sizes and would stay at that one.
+    The HDF5 library (seen with 2.0) walks from object to object by their sizes and would stay at that one.
 
     Raises
     ------
