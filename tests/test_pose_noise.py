@@ -214,7 +214,7 @@ def test_the_report_says_what_they_make_of_the_widths_or_that_they_are_left_out(
     without = replace(tactile_map, quality=untold)
     text = estimate_text(estimated(without), without, probability=0.95)
     assert "Left out: errors of the frames' places and their blur" in text
-    assert "of the widths" not in text
+    assert "variance of the widths" not in text
 
 
 def test_a_map_that_does_not_tell_adds_nothing() -> None:
