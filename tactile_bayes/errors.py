@@ -29,6 +29,15 @@ class UsageError(TactileBayesError):
     exit_code = EXIT_USAGE
 
 
+_MOST_SHOWN = 1000  # characters of what a file holds that an error repeats
+
+
+def _shortened(text: str) -> str:
+    if len(text) <= _MOST_SHOWN:
+        return text
+    return f"{text[: _MOST_SHOWN // 2]} ... ({len(text)} characters) ... {text[-_MOST_SHOWN // 4 :]}"
+
+
 class BadDataError(TactileBayesError, ValueError):
     """A file, array or table does not hold what it must.
 
@@ -51,7 +60,8 @@ class BadDataError(TactileBayesError, ValueError):
         self.path = path
 
     def __str__(self) -> str:
-        head = f"{self.path}: {self.what}" if self.path else self.what
+        what = _shortened(self.what)
+        head = f"{self.path}: {what}" if self.path else what
         text = f"{head}; {self.way_out}" if self.way_out else head
         return "\\n".join(text.splitlines())  # names and values from a file may hold newlines
 

@@ -21,6 +21,7 @@ from tactile_bayes.files.column_map import read_mapping
 from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.grid_import import read_grid
 from tactile_bayes.files.identify import describe
+from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.prior_toml import read_prior
 from tactile_bayes.files.protocol import read_protocol
@@ -285,3 +286,11 @@ def test_a_report_is_described_without_obeying_it(tmp_path: Path, run_cli) -> No
     assert refused.returncode == 3
     assert r"bad\x07.toml" in refused.stderr
     assert "\x07" not in done.stdout + refused.stderr
+
+
+def test_an_error_repeats_little_of_what_a_file_says(tmp_path: Path) -> None:
+    path = tmp_path / "landmarks.json"
+    path.write_text(json.dumps({"schema": "tactile-bayes/landmarks/" + "9" * 5000}))
+    with pytest.raises(BadDataError, match=r"has schema 'tactile-bayes/landmarks/9+ \.\.\. ") as refusal:
+        read_landmarks(path)
+    assert len(str(refusal.value)) < 1000 + len(str(path))
