@@ -191,7 +191,7 @@ def _posterior() -> bytes:
 
 def _checkpoint(folder: Path) -> bytes:
     from tactile_bayes.files.checkpoint_npz import CheckpointFile
-    from tactile_bayes.posterior.chain_state import ChainState
+    from tactile_bayes.inference.chain_state import ChainState
 
     rng = np.random.default_rng(3)
     state = ChainState(

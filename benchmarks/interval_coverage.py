@@ -45,7 +45,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions, default_errors, fit_bump
+from tactile_bayes.posterior.white.fit import FitOptions, default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
 
 NOMINAL = 0.9
@@ -336,9 +336,9 @@ def report_sizes(rows: list[Row]) -> None:
 def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.fat_depth import head_profile
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
-    from tactile_bayes.posterior.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
+    from tactile_bayes.size.fat_depth import head_profile
+    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
 
     path = size_calibration_path(DEFAULT)
     assert path is not None

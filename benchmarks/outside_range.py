@@ -38,12 +38,12 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import EstimateOptions, calibration_for, estimate_map
-from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.learn_size import SizeTable, learn_size_calibration
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
-from tactile_bayes.posterior.size import push_sizes
-from tactile_bayes.posterior.size_calibration import Recipe, SizeCalibration
+from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.size.eq6 import Recipe, SizeCalibration
+from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.posterior import push_sizes
 
 SEED = 20261123
 FRAME_RATE_HZ = 40.0

@@ -28,7 +28,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes, Taxels, Tracker
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
+from tactile_bayes.forward.tissue import SceneBody, SolidLump
 
 MASSES, EMPTY, EXAMS, SEED = 22, 2, 3, 20261121
 

@@ -37,12 +37,12 @@ def simulated_fit() -> Any:
     """The mode of a bump of 6 by 4.5 mm with white errors of 0.01 and a field of 0.01 and 4 mm, seed 1."""
     from tactile_bayes.forward.gaussian import cell_mean_gaussian
     from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-    from tactile_bayes.posterior.bump import BumpPrior
-    from tactile_bayes.posterior.cells import window_cells
-    from tactile_bayes.posterior.collapsed import independent_variance
-    from tactile_bayes.posterior.field_posterior import fit_scene
-    from tactile_bayes.posterior.scene import Scene
-    from tactile_bayes.posterior.window import Window
+    from tactile_bayes.posterior.correlated.fit import fit_scene
+    from tactile_bayes.posterior.correlated.marginal import independent_variance
+    from tactile_bayes.posterior.correlated.scene import Scene
+    from tactile_bayes.posterior.correlated.window import Window
+    from tactile_bayes.posterior.lump.bump import BumpPrior
+    from tactile_bayes.posterior.lump.cells import window_cells
 
     rng = np.random.default_rng(1)
     axis = np.arange(-HALF_MM, HALF_MM + 1.0)
@@ -64,21 +64,21 @@ def simulated_fit() -> Any:
 
 def importance(fit: Any) -> Draw:
     """The program's default method, to the wanted accuracy."""
-    from tactile_bayes.posterior.methods import Sampled, importance_draws
+    from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
 
     return lambda rng: importance_draws(Sampled.of(fit), rng=rng, accuracy_sd=WANTED_SD).flat
 
 
 def laplace(fit: Any) -> Draw:
     """The program's Gaussians."""
-    from tactile_bayes.posterior.field_posterior import laplace_mixture
+    from tactile_bayes.posterior.correlated.fit import laplace_mixture
 
     return lambda rng: laplace_mixture(fit, rng=rng).flat
 
 
 def ensemble(fit: Any) -> Draw:
     """The program's MCMC with its own stopping rule."""
-    from tactile_bayes.posterior.methods import Sampled, ensemble_draws
+    from tactile_bayes.posterior.correlated.draw import Sampled, ensemble_draws
 
     return lambda rng: ensemble_draws(Sampled.of(fit), rng=rng).flat
 
@@ -252,8 +252,8 @@ def one(name: str, *, runs: int) -> dict[str, float]:
 
 
 def _reference(fit: Any) -> tuple[np.ndarray, np.ndarray]:
-    from tactile_bayes.posterior.importance import ImportanceOptions
-    from tactile_bayes.posterior.importance import importance as sample
+    from tactile_bayes.inference.importance import ImportanceOptions
+    from tactile_bayes.inference.importance import importance as sample
 
     options = ImportanceOptions(accuracy_sd=1.0, first=16384)
     mean, covariance = fit.mixture.moments()

@@ -10,7 +10,7 @@ from posterior_maps import bump_map
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import write_size_calibration
-from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
 
 MADE = Provenance("test", {})
 

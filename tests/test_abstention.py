@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_bayes.abstention import CODES
 from tactile_bayes.errors import NotConvergedError, UsageError
-from tactile_bayes.posterior import methods
-from tactile_bayes.posterior.abstention import CODES, extend_advice, fault_code, missing_strokes, shape_fault
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.abstention import extend_advice, fault_code, missing_strokes, shape_fault
+from tactile_bayes.posterior.correlated import draw as methods
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import Candidate, FitOptions, fit_bump
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.white.fit import Candidate, FitOptions, fit_bump
 from tactile_bayes.report.estimate_text import estimate_text
 from tests.posterior_maps import bump_map, bump_values, grid_map
 

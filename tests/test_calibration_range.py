@@ -18,9 +18,9 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pool_maps
 from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps
 
 SHIPPED = size_calibration_path("solid")
 EVEN = (0.0, 0.0, 0.0)

@@ -13,7 +13,7 @@ import pytest
 
 from tactile_bayes.commands.demo import _how_to_type
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.forward.solid_scene import SolidLump
+from tactile_bayes.forward.tissue import SolidLump
 
 Run = Callable[..., "CompletedProcess[str]"]
 TRUE_MM = 15.0

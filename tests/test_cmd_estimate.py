@@ -15,7 +15,7 @@ from in_process import run_here
 from posterior_files import write_calibration, write_maps
 
 from tactile_bayes.files.schema import check_document, load_schema
-from tactile_bayes.posterior.size_calibration import Recipe
+from tactile_bayes.size.eq6 import Recipe
 
 Run = Callable[..., "CompletedProcess[str]"]
 FAST = ("--method", "laplace")

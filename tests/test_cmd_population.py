@@ -13,8 +13,8 @@ from tactile_bayes.commands import population
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.population import BodyPrior, centred, draw_mass
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.measure import MassRow, measure_mass
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.studies.population import MassRow, measure_mass
 
 
 def row(body: int, exam: int, *, seed: int = 0) -> MassRow:

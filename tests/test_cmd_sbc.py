@@ -9,7 +9,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes.commands import sbc as command
-from tactile_bayes.posterior.sbc import PARAMETERS, MapRanks, Truth
+from tactile_bayes.studies.sbc import PARAMETERS, MapRanks, Truth
 
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
 

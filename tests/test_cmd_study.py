@@ -179,7 +179,7 @@ def test_four_figures_are_drawn(folder: Path, run_cli: Run) -> None:
 
 
 def test_a_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
-    from tactile_bayes.forward.study import StudyRow
+    from tactile_bayes.forward.plane.study import StudyRow
     from tactile_bayes.report.study_figures import figure_8
 
     rows = [

@@ -11,8 +11,8 @@ import pytest
 
 from tactile_bayes.commands.tables import tables_text
 from tactile_bayes.errors import EXIT_BAD_DATA
-from tactile_bayes.forward.study import LineFit
-from tactile_bayes.forward.tables import OTHER_DEFINITIONS, Agreement, phantom_scenes, table_scenes
+from tactile_bayes.forward.plane.study import LineFit
+from tactile_bayes.forward.plane.tables import OTHER_DEFINITIONS, Agreement, phantom_scenes, table_scenes
 
 Run = Callable[..., "CompletedProcess[str]"]
 

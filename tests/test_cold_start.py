@@ -105,7 +105,7 @@ def test_the_laplace_estimate_imports_only_what_it_uses(run_python, estimate_inp
     map_path, calibration = estimate_inputs
     options = ("--size-calibration", calibration, "--method", "laplace", "--json")
     modules = imported_by(run_python("-c", RUN, "estimate", map_path, *options))
-    assert "tactile_bayes.posterior.laplace" in modules
+    assert "tactile_bayes.inference.laplace" in modules
     assert not modules & set(NOT_FOR_LAPLACE)
 
 

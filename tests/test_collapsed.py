@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
-from tactile_bayes.posterior import collapsed
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.cells import FitCells, window_cells
-from tactile_bayes.posterior.collapsed import CollapsedTarget, independent_variance
-from tactile_bayes.posterior.field import cosine_profiles, gram_of_cosines, spectrum
-from tactile_bayes.posterior.field_posterior import FieldFit, fit_scene, shape_draws
-from tactile_bayes.posterior.linear import _one
-from tactile_bayes.posterior.methods import draw_scene
-from tactile_bayes.posterior.scene import Scene
-from tactile_bayes.posterior.window import Window
+from tactile_bayes.posterior.correlated import marginal as collapsed
+from tactile_bayes.posterior.correlated.draw import draw_scene
+from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene, shape_draws
+from tactile_bayes.posterior.correlated.linear import _one
+from tactile_bayes.posterior.correlated.marginal import CollapsedTarget, independent_variance
+from tactile_bayes.posterior.correlated.noise import cosine_profiles, gram_of_cosines, spectrum
+from tactile_bayes.posterior.correlated.scene import Scene
+from tactile_bayes.posterior.correlated.window import Window
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump.cells import FitCells, window_cells
 from tests.posterior_maps import TRUTH, bump_map, correlated_field
 
 RADIUS = 20.0

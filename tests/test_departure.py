@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from posterior_maps import correlated_field, grid_map
 
-from tactile_bayes.posterior.departure import _departure, ask_departure
+from tactile_bayes.posterior.correlated.fit import FieldFit
+from tactile_bayes.posterior.correlated.peakedness import _departure, ask_departure
+from tactile_bayes.posterior.correlated.selection import Structure
+from tactile_bayes.posterior.correlated.tangent import tangent_columns
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.field_posterior import FieldFit
-from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.scene_choice import Structure
-from tactile_bayes.posterior.tangent import tangent_columns
+from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.report.scene_text import scene_lines
 
 AXIS = np.arange(-26.0, 27.0)

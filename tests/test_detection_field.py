@@ -10,7 +10,7 @@ import pytest
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.white.fit import FitOptions
 from tests.mapping_scans import shared_scan
 from tests.posterior_maps import bump_map, correlated_field, grid_map
 

@@ -17,8 +17,9 @@ from tactile_bayes.forward.empirical import (
     kappa,
     lump_pressure,
 )
-from tactile_bayes.forward.study import StudySettings
-from tactile_bayes.forward.tables import (
+from tactile_bayes.forward.plane.line import build_line, head_positions
+from tactile_bayes.forward.plane.study import StudySettings
+from tactile_bayes.forward.plane.tables import (
     PHANTOMS,
     PRINTED_FRAMES,
     PRINTED_MAPS,
@@ -29,7 +30,6 @@ from tactile_bayes.forward.tables import (
     scene_curves,
     table_scenes,
 )
-from tactile_bayes.forward.tactile_line import build_line, head_positions
 
 S = 0.25 * (np.arange(96) - 47.5)
 MODEL = EmpiricalModel(

@@ -16,12 +16,12 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.stats import t as student
 
-from tactile_bayes.posterior.draws import END_ERROR
-from tactile_bayes.posterior.field_posterior import FieldFit
-from tactile_bayes.posterior.importance import importance
-from tactile_bayes.posterior.laplace import mode_and_covariance
-from tactile_bayes.posterior.methods import Sampled, importance_draws
-from tactile_bayes.posterior.scene import Scene
+from tactile_bayes.inference.draws import END_ERROR
+from tactile_bayes.inference.importance import importance
+from tactile_bayes.inference.laplace import mode_and_covariance
+from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
+from tactile_bayes.posterior.correlated.fit import FieldFit
+from tactile_bayes.posterior.correlated.scene import Scene
 from tests.test_collapsed import cells_of, fitted, noise
 from tests.test_methods import LINEAR
 from tests.test_scene_methods import half_covered, strong, weak

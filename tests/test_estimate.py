@@ -10,12 +10,12 @@ from posterior_maps import TRUTH, bump_map, correlated_field, grid_map
 
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.report.estimate_document import estimate_document
 from tactile_bayes.report.estimate_text import estimate_text
+from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
 
 SIZE = 51
 NOISE = 0.02

@@ -9,8 +9,8 @@ import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
 from tests.posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_map
 
 FIELD = EstimateOptions(method="importance", fit=FitOptions(background="free", noise="field"))

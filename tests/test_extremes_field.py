@@ -12,7 +12,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.scan import Scan
 from tests.mapping_scans import shared_scan

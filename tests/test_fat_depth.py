@@ -13,15 +13,15 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_quadratic_json import write_log_quadratic
-from tactile_bayes.posterior.body_regression import PopulationTable
-from tactile_bayes.posterior.fat_depth import POWERS, cubic_terms, head_profile
-from tactile_bayes.posterior.learn_fat_cubic import learn_fat_cubic
-from tactile_bayes.posterior.learn_log_quadratic import learn_log_quadratic
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.monomials import monomials, powers
-from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pool_maps
-from tactile_bayes.posterior.size_calibration import Recipe
 from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.fat_depth import POWERS, cubic_terms, head_profile
+from tactile_bayes.size.learn.fat_depth import learn_fat_cubic
+from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+from tactile_bayes.size.learn.regression import PopulationTable
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.polynomials import monomials, powers
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps
 
 RECIPE = Recipe("mean", "free", 20.0, False, "field")
 BODY_SD, EXAM_SD = 0.04, 0.01

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tactile_bayes.posterior.correlated.noise import cosines_for
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.field import cosines_for
-from tactile_bayes.posterior.fit import FitOptions
+from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 from tests.posterior_maps import bump_map, correlated_field
 

@@ -17,7 +17,7 @@ from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
+from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.frame_marks import NO_LIMIT, frame_marks, marks_limit
@@ -25,11 +25,11 @@ from tactile_bayes.mapping.head_profile import LEAST_FRAMES, MOST_FRAMES, Profil
 from tactile_bayes.mapping.poses import poses_at
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
-from tactile_bayes.posterior.fat_depth import head_profile
-from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
+from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import Scan
+from tactile_bayes.size.fat_depth import head_profile
+from tactile_bayes.size.log_quadratic import LogQuadratic
 
 TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
 """By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""

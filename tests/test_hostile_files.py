@@ -31,7 +31,7 @@ from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_posterior import read_stated_size
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.posterior.chain_state import ChainState
+from tactile_bayes.inference.chain_state import ChainState
 
 PACKAGE = Path(__file__).resolve().parents[1] / "tactile_bayes"
 SCAN = PACKAGE / "demo" / "scan.mcap"

@@ -18,7 +18,7 @@ from tactile_bayes.files.arrays_npz import read_arrays
 from tactile_bayes.files.grid_import import read_grid
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.posterior.cells import window_cells
+from tactile_bayes.posterior.lump.cells import window_cells
 
 Arrays = dict[str, Any]
 

@@ -8,15 +8,15 @@ from scipy.special import ndtri
 from scipy.stats import genpareto, qmc
 
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.posterior.importance import (
+from tactile_bayes.inference.importance import (
     ImportanceOptions,
     importance,
     systematic,
     weighted_quantile,
 )
-from tactile_bayes.posterior.normal import normal_quantile
-from tactile_bayes.posterior.pareto import TRUSTED_SHAPE, fit_generalised_pareto, smooth_weights
-from tactile_bayes.posterior.sobol import BITS, MOST_DIMENSIONS, shifted_sobol, sobol_integers
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.pareto import TRUSTED_SHAPE, fit_generalised_pareto, smooth_weights
+from tactile_bayes.inference.sobol import BITS, MOST_DIMENSIONS, shifted_sobol, sobol_integers
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.1], [0.6, 2.0, -0.3], [0.1, -0.3, 0.5]])

@@ -11,14 +11,14 @@ from scipy.special import j0
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import Layers
-from tactile_bayes.forward.layered import (
+from tactile_bayes.forward.plane.layers import surface_transfer
+from tactile_bayes.forward.solid.layers import (
     LayeredBody,
     layering_compliance,
     square_compliance,
     surface_flexibility,
     taxel_compliance,
 )
-from tactile_bayes.forward.plane_layers import surface_transfer
 
 NU = 0.495
 BREAST = LayeredBody((5.0, 50.0), (15.0, 55.0), NU)

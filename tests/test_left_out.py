@@ -14,10 +14,10 @@ from in_process import run_here
 import tactile_bayes
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.posterior import left_out
-from tactile_bayes.posterior.learn_size import AxisRows, SizeTable, StudyCases, axis_at_mode
-from tactile_bayes.posterior.left_out import geometry_numbers, left_out_of_study
-from tactile_bayes.posterior.size_calibration import AxisCalibration
+from tactile_bayes.size.eq6 import AxisCalibration
+from tactile_bayes.size.learn import cross_validation as left_out
+from tactile_bayes.size.learn.cross_validation import geometry_numbers, left_out_of_study
+from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
 D, H, K = (5.0, 10.0, 15.0, 20.0, 25.0), (0.6, 0.8, 1.0, 1.2, 1.5), (2.0, 8.0, 100.0)

@@ -17,7 +17,7 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions, default_errors, fit_bump
+from tactile_bayes.posterior.white.fit import FitOptions, default_errors, fit_bump
 
 UNIT = 37.0
 SLOPE = 0.002 * (np.arange(41) - 20.0)

@@ -13,10 +13,10 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_quadratic_json import write_log_quadratic
-from tactile_bayes.posterior.body_regression import BodyRegression, PopulationTable, held, left_out_errors
-from tactile_bayes.posterior.learn_log_quadratic import learn_log_quadratic
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.size_calibration import Recipe
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable, held, left_out_errors
+from tactile_bayes.size.log_quadratic import LogQuadratic
 
 TRUE = np.array([2.3, 0.28, 1.0, 0.0, -0.03, 0.18])
 BODY_SD, EXAM_SD, MAP_SD, SEAT_SLOPE = 0.05, 0.02, 0.03, -0.2

@@ -10,15 +10,16 @@ from posterior_maps import TRUTH, bump_map, correlated_field
 from scipy.stats import kstest, t
 
 from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.inference.derivatives import finite_differences, stencil
+from tactile_bayes.inference.draws import ParameterDraws, student_draws
+from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
+from tactile_bayes.inference.laplace import find_mode, laplace, mode_and_covariance
+from tactile_bayes.inference.optimise import optimise
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.draws import ParameterDraws, student_draws
-from tactile_bayes.posterior.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.laplace import find_mode, laplace, mode_and_covariance
-from tactile_bayes.posterior.noise import ErrorModel
-from tactile_bayes.posterior.optimise import optimise
-from tactile_bayes.posterior.target import Target, flat_prior, numerical_gradient_and_hessian
+from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.white.residuals import ErrorModel
+from tactile_bayes.posterior.white.target import Target, flat_prior
 from tactile_bayes.presets import METHODS
 
 ROWS, DIMENSION = 30, 3
@@ -129,7 +130,8 @@ def test_differences_are_derivatives() -> None:
         return x**2 * y - 3 * x * y + 2 * y**2
 
     at = np.array([1.5, -0.5])
-    gradient, hessian = numerical_gradient_and_hessian(cubic, at, step=np.array([1e-3, 2e-3]))
+    step = np.array([1e-3, 2e-3])
+    gradient, hessian = finite_differences(cubic(stencil(at, step=step)), step=step)
     np.testing.assert_allclose(gradient, [2 * 1.5 * -0.5 + 1.5, 1.5**2 - 4.5 - 2], atol=1e-6)
     np.testing.assert_allclose(hessian, [[-1.0, 0.0], [0.0, 4.0]], atol=1e-6)
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from nist import DATASETS, Certified, read
 
-from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.ensemble import ensemble
-from tactile_bayes.posterior.laplace import laplace, mode_and_covariance
-from tactile_bayes.posterior.noise import ErrorModel
-from tactile_bayes.posterior.optimise import optimise
-from tactile_bayes.posterior.target import Target, flat_prior
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.inference.ensemble import ensemble
+from tactile_bayes.inference.laplace import laplace, mode_and_covariance
+from tactile_bayes.inference.optimise import optimise
+from tactile_bayes.posterior.white.residuals import ErrorModel
+from tactile_bayes.posterior.white.target import Target, flat_prior
 
 DOF = 242.0
 T_FACTOR = np.sqrt(DOF / (DOF - 2))

@@ -13,8 +13,8 @@ from posterior_maps import bump_values, correlated_field, grid_map
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.fit import FitOptions
 from tactile_bayes.posterior.other_rises import Rise, other_rises
+from tactile_bayes.posterior.white.fit import FitOptions
 
 HALF_MM = 35.0
 SMALL = (15.0, 2.0)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.posterior.body_terms import HiddenTerms, RoundLumps
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import (
+from tactile_bayes.size.elongation import ShapePrior, elongation, turned
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import (
     BetweenMaps,
     ShapeDraws,
     SizePriors,
@@ -16,8 +18,6 @@ from tactile_bayes.posterior.pooling import (
     pool_maps,
     pooled_size,
 )
-from tactile_bayes.posterior.roundness import ShapePrior, elongation, turned
-from tactile_bayes.posterior.size_calibration import Recipe
 
 BODY_SD = 0.08
 

@@ -20,14 +20,14 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.pose_noise import MOST_MM, _departures, _interpolation
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.cells import PoseNoise, window_cells
-from tactile_bayes.posterior.collapsed import independent_variance
+from tactile_bayes.posterior.correlated.fit import FieldFit
+from tactile_bayes.posterior.correlated.marginal import independent_variance
+from tactile_bayes.posterior.correlated.pose_error import pose_covariance
+from tactile_bayes.posterior.correlated.tangent import tangent_columns
+from tactile_bayes.posterior.correlated.window import Window
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.field_posterior import FieldFit
-from tactile_bayes.posterior.fit import FitOptions
-from tactile_bayes.posterior.pose_spread import pose_covariance
-from tactile_bayes.posterior.tangent import tangent_columns
-from tactile_bayes.posterior.window import Window
+from tactile_bayes.posterior.lump.cells import PoseNoise, window_cells
+from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.presets import POSE_NOISE
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.report.map_text import map_text

@@ -12,9 +12,9 @@ from posterior_maps import TRUTH, bump_map, bump_values, grid_map
 from scipy.special import erf
 
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior import fit as fit_module
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.fit import BumpFit, FitOptions, find_bump, fit_bump, rotation_odds
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.white import fit as fit_module
+from tactile_bayes.posterior.white.fit import BumpFit, FitOptions, find_bump, fit_bump, rotation_odds
 
 OFF = FitOptions(rotation="off")
 ON = FitOptions(rotation="on")

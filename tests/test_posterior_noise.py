@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map, correlated_field, grid_map
 
-from tactile_bayes.posterior.cells import window_cells
-from tactile_bayes.posterior.fit import BumpFit, FitOptions, fit_bump
-from tactile_bayes.posterior.noise import count_weights, fitted_tilt, level_offset, residual_autocorrelation
+from tactile_bayes.posterior.lump.cells import window_cells
+from tactile_bayes.posterior.white.fit import BumpFit, FitOptions, fit_bump
+from tactile_bayes.posterior.white.residuals import count_weights, fitted_tilt, level_offset, residual_autocorrelation
 
 NOISE = 0.02
 SIZE = 51

@@ -10,7 +10,7 @@ import pytest
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.prior_toml import read_prior
 from tactile_bayes.files.schema import load_schema
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.sensitivity import prior_sensitivity
 from tactile_bayes.report.scene_text import prior_line, sensitivity_line
 

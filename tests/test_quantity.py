@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from tactile_bayes.posterior.quantity import quantiles_of, summarise
+from tactile_bayes.inference.summary import quantiles_of, summarise
 from tactile_bayes.report.size_text import decimals
 
 N = 40_000

@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.commands.sbc import _shipped
-from tactile_bayes.posterior import sbc
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.drawn import MapPosterior
-from tactile_bayes.posterior.field import LENGTHS_MM
-from tactile_bayes.posterior.rank_tests import (
+from tactile_bayes.inference.rank_tests import (
     BAND,
     RankTest,
     chi2_p,
@@ -22,8 +18,12 @@ from tactile_bayes.posterior.rank_tests import (
     rank_test,
     uniform_strays,
 )
-from tactile_bayes.posterior.sbc import DRAWS, ELSEWHERE, MapRanks, Truth, other_rises
+from tactile_bayes.posterior.correlated.noise import LENGTHS_MM
+from tactile_bayes.posterior.drawn import MapPosterior
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.report.sbc_text import verdict
+from tactile_bayes.studies import sbc
+from tactile_bayes.studies.sbc import DRAWS, ELSEWHERE, MapRanks, Truth, other_rises
 
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
 

@@ -11,13 +11,13 @@ import pytest
 
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.files.checkpoint_npz import CheckpointFile
-from tactile_bayes.posterior import methods
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.field_posterior import FieldFit, fit_scene
-from tactile_bayes.posterior.importance import ImportanceOptions, importance
-from tactile_bayes.posterior.methods import MethodOptions, Sampled, disagreement, draw_scene, importance_draws
-from tactile_bayes.posterior.scene import Scene
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.inference.importance import ImportanceOptions, importance
+from tactile_bayes.posterior.correlated import draw as methods
+from tactile_bayes.posterior.correlated.draw import MethodOptions, Sampled, disagreement, draw_scene, importance_draws
+from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene
+from tactile_bayes.posterior.correlated.scene import Scene
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tests.test_collapsed import cells_of, fitted, noise
 from tests.test_scene_choice import bump, choose, errors, rib, second
 

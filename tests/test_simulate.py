@@ -21,7 +21,7 @@ from tactile_bayes.forward import scene as scene_types
 from tactile_bayes.forward.instrument import head_positions, level_kpa
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, SceneLandmarks, Strokes, Taxels, Tracker
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump
+from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 from tactile_bayes.geometry import apply, inverse, rotation_from_quaternion
 from tactile_bayes.scan import Scan
 

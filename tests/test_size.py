@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.posterior.size import SizePosterior, push_sizes
-from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.posterior import SizePosterior, push_sizes
 
 N = 40_000
 DOMAIN = {"amplitude": (0.05, 0.8), "sigma_mm": (2.0, 9.0), "d_mm": (5.0, 25.0)}

@@ -13,9 +13,9 @@ import pytest
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration, write_size_calibration
-from tactile_bayes.posterior.learn_size import SizeTable, learn_size_calibration, width_changes
-from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
 from tactile_bayes.report.calibration_text import calibration_text
+from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration, width_changes
 
 TRUTH = {"m": 1.6, "b": 1.5, "e": 0.6, "f": -0.35}
 SCATTER, CHANGE_SCATTER = 0.05, 0.05

@@ -15,14 +15,14 @@ from scipy.special import ndtr
 from test_pooling import BODY_SD, calibration, shape
 
 from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.inference.draws import ParameterDraws, even_replicates
+from tactile_bayes.inference.normal import normal_cdf
+from tactile_bayes.inference.paired import evened, paired_points
+from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.posterior import drawn
-from tactile_bayes.posterior.draws import ParameterDraws, even_replicates
-from tactile_bayes.posterior.normal import normal_cdf
-from tactile_bayes.posterior.paired import evened, paired_points
-from tactile_bayes.posterior.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
-from tactile_bayes.posterior.quantity import Quantity, summarise
-from tactile_bayes.posterior.size import push_sizes
-from tactile_bayes.posterior.size_calibration import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.posterior import push_sizes
 
 SEEDS = 24
 PROBABILITY = 0.95

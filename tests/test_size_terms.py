@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from in_process import run_here
 
-from tactile_bayes.posterior.learn_size import SizeTable, StudyCases
-from tactile_bayes.posterior.size_terms import SizeTerm, size_terms
+from tactile_bayes.size.learn.body_effects import SizeTerm, size_terms
+from tactile_bayes.size.learn.eq6 import SizeTable, StudyCases
 
 TRUTH = {"seat": -0.2, "stiffness_ratio": -0.15, "thickness_mm": 0.1, "head_radius_mm": -0.3}
 

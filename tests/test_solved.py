@@ -9,12 +9,12 @@ import pytest
 from posterior_maps import bump_map
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
-from tactile_bayes.posterior.bump import Bump, BumpPrior
-from tactile_bayes.posterior.cells import window_cells
-from tactile_bayes.posterior.field_posterior import FieldFit
-from tactile_bayes.posterior.fit import FitOptions, find_bump
-from tactile_bayes.posterior.methods import draw_scene
-from tactile_bayes.posterior.solved import Solution, Solved
+from tactile_bayes.inference.cache import Solution, Solved
+from tactile_bayes.posterior.correlated.draw import draw_scene
+from tactile_bayes.posterior.correlated.fit import FieldFit
+from tactile_bayes.posterior.lump.bump import Bump, BumpPrior
+from tactile_bayes.posterior.lump.cells import window_cells
+from tactile_bayes.posterior.white.fit import FitOptions, find_bump
 from tests.test_collapsed import cells_of, fitted, noise
 
 

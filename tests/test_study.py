@@ -13,7 +13,8 @@ from tactile_bayes.commands.study import fit_line, table_text
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
-from tactile_bayes.forward.study import (
+from tactile_bayes.forward.plane.line import TactileLine
+from tactile_bayes.forward.plane.study import (
     DETECTABLE,
     Geometry,
     StudyRow,
@@ -25,8 +26,7 @@ from tactile_bayes.forward.study import (
     seat_name,
     width_changes,
 )
-from tactile_bayes.forward.tactile_line import TactileLine
-from tactile_bayes.posterior.least_squares import fit_least_squares
+from tactile_bayes.inference.least_squares import fit_least_squares
 from tactile_bayes.presets import HEADS
 
 X = 0.5 * (np.arange(240) - 119.5)

@@ -15,10 +15,10 @@ import pytest
 
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior import tradeoff
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.tradeoff import Measured, Tradeoff, measure
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.report.tradeoff_estimate import advice, draw_tradeoff, tradeoff_document, tradeoff_text
+from tactile_bayes.studies import estimate_tradeoff as tradeoff
+from tactile_bayes.studies.estimate_tradeoff import Measured, Tradeoff, measure
 from tests.posterior_maps import bump_map, correlated_field, grid_map
 
 Run = Callable[..., "CompletedProcess[str]"]

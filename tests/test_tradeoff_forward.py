@@ -14,14 +14,18 @@ import numpy as np
 import pytest
 
 from tactile_bayes.commands.study import fit_line
-from tactile_bayes.commands.study_raster import fit_raster
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.forward.plane.study import Geometry, StudyRow, StudySettings, run_geometry
 from tactile_bayes.forward.scene import Head, Lump, Scene
-from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump
-from tactile_bayes.forward.study import Geometry, StudyRow, StudySettings, run_geometry
-from tactile_bayes.forward.tradeoff import (
+from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
+from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document, tradeoff_text
+from tactile_bayes.size.elongation import ShapePrior
+from tactile_bayes.size.eq6 import SizeCalibration
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.studies.forward_tradeoff import (
     EMPIRICAL,
     PLANE,
     SOLID,
@@ -32,12 +36,8 @@ from tactile_bayes.forward.tradeoff import (
     measure,
     settings_of,
 )
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
-from tactile_bayes.posterior.roundness import ShapePrior
-from tactile_bayes.posterior.size_calibration import SizeCalibration
-from tactile_bayes.report.size_rules import SizeRule, calibrated_rule, learned_rule
-from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document, tradeoff_text
+from tactile_bayes.studies.raster import fit_raster
+from tactile_bayes.studies.size_rules import SizeRule, calibrated_rule, learned_rule
 
 Run = Callable[..., "CompletedProcess[str]"]
 CASE = case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)))

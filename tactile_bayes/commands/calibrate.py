@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.tables import Table
-    from tactile_bayes.posterior.learn_size import SizeTable, StudyCases
-    from tactile_bayes.posterior.size_calibration import LeftOutErrors, Recipe
+    from tactile_bayes.size.eq6 import LeftOutErrors, Recipe
+    from tactile_bayes.size.learn.eq6 import SizeTable, StudyCases
 
 _FILE = FilePath()
 
@@ -113,9 +113,9 @@ def size(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.posterior.learn_size import learn_size_calibration
-    from tactile_bayes.posterior.size_terms import size_terms
     from tactile_bayes.report.calibration_text import calibration_text
+    from tactile_bayes.size.learn.body_effects import size_terms
+    from tactile_bayes.size.learn.eq6 import learn_size_calibration
 
     refuse_existing(output, force=force)
     if form == "log-quadratic":
@@ -162,7 +162,7 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
         When a level is to be fixed on maps that have none.
     """
     from tactile_bayes.errors import UsageError
-    from tactile_bayes.posterior.size_calibration import Recipe
+    from tactile_bayes.size.eq6 import Recipe
 
     said = {name: _alike(table, name) for name in (*declared, "flat_field")}
     for name, value in declared.items():
@@ -213,7 +213,7 @@ def _refuse_declared(ctx: click.Context) -> None:
 def _left_out(lumps: SizeTable, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
     """Errors on geometries left out, or why Eq 6 has none."""
     from tactile_bayes.errors import NotConvergedError
-    from tactile_bayes.posterior.left_out import left_out_of_study
+    from tactile_bayes.size.learn.cross_validation import left_out_of_study
 
     try:
         return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio), ""
@@ -227,10 +227,10 @@ def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
     from tactile_bayes.files.size_quadratic_json import write_log_quadratic
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
-    from tactile_bayes.posterior.learn_log_quadratic import learn_log_quadratic
-    from tactile_bayes.posterior.measure import measuring_options, population_table
-    from tactile_bayes.posterior.size_calibration import Recipe
     from tactile_bayes.report.quadratic_text import log_quadratic_text
+    from tactile_bayes.size.eq6 import Recipe
+    from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+    from tactile_bayes.studies.population import measuring_options, population_table
 
     rows = read_table(table, "population.table.json")
     fit = measuring_options().fit
@@ -303,7 +303,7 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
     import numpy as np
 
     from tactile_bayes.errors import BadDataError
-    from tactile_bayes.posterior.learn_size import SizeTable, width_changes
+    from tactile_bayes.size.learn.eq6 import SizeTable, width_changes
 
     # a study says which of its lumps show; the others' fits are fits to a trough
     shown = [
@@ -340,7 +340,7 @@ def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
     """Which case each row is; None where a row does not say how stiff its lump is."""
     import numpy as np
 
-    from tactile_bayes.posterior.learn_size import StudyCases
+    from tactile_bayes.size.learn.eq6 import StudyCases
 
     if None in columns["stiffness_ratio"]:
         return None

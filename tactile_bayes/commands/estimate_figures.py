@@ -55,7 +55,7 @@ def draw_size(
     force: bool,
 ) -> None:
     """The posterior of the largest (``max``) and the smallest (``min``) size with their intervals."""
-    from tactile_bayes.posterior.quantity import summarise
+    from tactile_bayes.inference.summary import summarise
     from tactile_bayes.report.size_figure import SizeInterval, size_figure
 
     quantities = {

@@ -12,8 +12,8 @@ from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, Usag
 
 if TYPE_CHECKING:
     from tactile_bayes.commands.estimate_run import Answer, Settings
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
-    from tactile_bayes.posterior.pooling import PooledEstimate
+    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.pooling import PooledEstimate
 
 
 def estimate_pool(
@@ -34,8 +34,8 @@ def estimate_pool(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.schema import check_document, dump_json
     from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.posterior.pooling import pool_maps
     from tactile_bayes.report.pooled import pooled_document, pooled_text
+    from tactile_bayes.size.pooling import pool_maps
 
     failed = [answer for answer in answers if answer.document is None]
     for answer in failed:
@@ -75,7 +75,7 @@ def estimate_pool(
 
 def _too_far(answers: list[Answer]) -> PooledEstimate | None:
     """No size where a map shows a lump too far outside the calibration's range; None where none does."""
-    from tactile_bayes.posterior.pooling import PooledEstimate
+    from tactile_bayes.size.pooling import PooledEstimate
 
     for i, answer in enumerate(answers):
         if answer.document is not None and answer.document["reason_code"] == "extrapolated":
@@ -98,7 +98,7 @@ def _shipped_for(answers: list[Answer]) -> str:
 
 def _log_quadratic(path: Path | None) -> LogQuadratic:
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.size.log_quadratic import LogQuadratic
 
     if path is None:
         raise UsageError("--pool needs a size calibration; leave out --size-calibration none")

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
-    from tactile_bayes.posterior.fit import FitOptions
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
-    from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors
-    from tactile_bayes.posterior.size_calibration import SizeCalibration
+    from tactile_bayes.posterior.white.fit import FitOptions
+    from tactile_bayes.size.eq6 import SizeCalibration
+    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.pooling import ShapeDraws, SizePriors
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +141,8 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
 def _calibration_words(name: str, calibration: SizeCalibration | LogQuadratic) -> str:
     """Which calibration gave the size, and what it cannot know."""
     from tactile_bayes.files.shipped import SHIPPED
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
     from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
+    from tactile_bayes.size.log_quadratic import LogQuadratic
 
     words = f"Sizes by the {'shipped calibration ' if name in SHIPPED else 'calibration '}{name}"
     if isinstance(calibration, LogQuadratic):
@@ -210,7 +210,7 @@ def _options(
     """
     from tactile_bayes.files.prior_toml import read_prior
     from tactile_bayes.posterior.estimate import EstimateOptions
-    from tactile_bayes.posterior.fit import FitOptions, default_errors
+    from tactile_bayes.posterior.white.fit import FitOptions, default_errors
 
     background, noise = default_errors(tactile_map)
     if settings.background or settings.method == "optimise":
@@ -237,7 +237,7 @@ def _options(
 
 def size_priors(settings: Settings) -> SizePriors:
     """The spread between maps, known or to be learned."""
-    from tactile_bayes.posterior.pooling import BetweenMaps, SizePriors
+    from tactile_bayes.size.pooling import BetweenMaps, SizePriors
 
     for name, value in settings.known:
         if value < 0 or (value == 0 and name != "seat"):
@@ -275,8 +275,8 @@ def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     """What pooling needs of a map, with the direction of its axes in the patient where landmarks tell."""
     import math
 
-    from tactile_bayes.posterior.fat_depth import head_profile
-    from tactile_bayes.posterior.pooling import ShapeDraws
+    from tactile_bayes.size.fat_depth import head_profile
+    from tactile_bayes.size.pooling import ShapeDraws
 
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
     if posterior is None or estimate.draws is None:

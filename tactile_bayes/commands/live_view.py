@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from tactile_bayes.hardware.live import LiveMap, LiveState
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.drawn import MapPosterior
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
-    from tactile_bayes.posterior.size_calibration import SizeCalibration
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
+    from tactile_bayes.size.eq6 import SizeCalibration
+    from tactile_bayes.size.log_quadratic import LogQuadratic
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2
@@ -204,9 +204,9 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
     import numpy as np
 
     from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.posterior.cells import candidate_centres
     from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
-    from tactile_bayes.posterior.fit import FitOptions
+    from tactile_bayes.posterior.lump.cells import candidate_centres
+    from tactile_bayes.posterior.white.fit import FitOptions
     from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
 
     try:

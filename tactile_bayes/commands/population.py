@@ -11,7 +11,7 @@ from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
 if TYPE_CHECKING:
-    from tactile_bayes.posterior.measure import MassRow
+    from tactile_bayes.studies.population import MassRow
 
 _FILE = FilePath()
 
@@ -117,7 +117,7 @@ def rows_of_mass(
     from tactile_bayes.forward.population import BodyPrior, draw_mass
     from tactile_bayes.forward.population import centred as on_the_boundary
     from tactile_bayes.forward.simulate import simulate
-    from tactile_bayes.posterior.measure import measure_mass
+    from tactile_bayes.studies.population import measure_mass
 
     bodies = on_the_boundary(BodyPrior()) if index >= first_centred else BodyPrior()
     scenes = draw_mass(index, scans=scans, seed=seed, bodies=bodies)
@@ -136,7 +136,7 @@ def _encode(rows: list[MassRow]) -> list[dict[str, Any]]:
 
 
 def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
-    from tactile_bayes.posterior.measure import MassRow
+    from tactile_bayes.studies.population import MassRow
 
     return [MassRow(**row) for row in rows]
 
@@ -145,7 +145,7 @@ def table_text(rows: list[MassRow]) -> str:
     """The rows under the header that `data_schema/population.table.json` describes."""
     from dataclasses import astuple, fields
 
-    from tactile_bayes.posterior.measure import MassRow
+    from tactile_bayes.studies.population import MassRow
 
     lines = [",".join(field.name for field in fields(MassRow))]
     return "\n".join(lines + [",".join(map(_cell, astuple(row))) for row in rows]) + "\n"

@@ -17,8 +17,8 @@ from tactile_bayes.presets import MOST_FIELD_COSINES
 
 if TYPE_CHECKING:
     from tactile_bayes.batch import BatchStore, Outcome
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
-    from tactile_bayes.posterior.sbc import MapRanks
+    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.studies.sbc import MapRanks
 
 _FILE = FilePath()
 
@@ -117,7 +117,7 @@ def _run(
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.shipped import DEFAULT
-    from tactile_bayes.posterior.sbc import settings
+    from tactile_bayes.studies.sbc import settings
 
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
@@ -138,7 +138,7 @@ def _run(
 
 def ranks_of_map(index: int, *, method: str, seed: int, cosines: int | None) -> MapRanks:
     """The ranks of one map, in whichever process."""
-    from tactile_bayes.posterior import sbc
+    from tactile_bayes.studies import sbc
 
     return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped(), cosines=cosines)
 
@@ -147,7 +147,7 @@ def ranks_of_map(index: int, *, method: str, seed: int, cosines: int | None) -> 
 def _shipped() -> LogQuadratic:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.size.log_quadratic import LogQuadratic
 
     path = size_calibration_path(DEFAULT)
     calibration = None if path is None else read_size_calibration(path)
@@ -190,7 +190,7 @@ def _encode(one: MapRanks) -> dict[str, Any]:
 
 
 def _decode(value: dict[str, Any]) -> MapRanks:
-    from tactile_bayes.posterior.sbc import MapRanks, Truth
+    from tactile_bayes.studies.sbc import MapRanks, Truth
 
     ranks = None if value["ranks"] is None else tuple(value["ranks"])
     return MapRanks(value["index"], Truth(**value["truth"]), ranks, value["outcome"], value["probability"])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from tactile_bayes.forward.scene import Lump
-    from tactile_bayes.forward.solid_scene import Rib, SolidLump
+    from tactile_bayes.forward.tissue import Rib, SolidLump
 
 
 @click.command("simulate")

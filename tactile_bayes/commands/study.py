@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from tactile_bayes.batch import BatchStore, Outcome
-    from tactile_bayes.forward.solid_study import SolidSettings
-    from tactile_bayes.forward.study import Geometry, LineFit, StudyRow, StudySettings
-    from tactile_bayes.forward.tactile_line import TactileLine
+    from tactile_bayes.forward.plane.line import TactileLine
+    from tactile_bayes.forward.plane.study import Geometry, LineFit, StudyRow, StudySettings
+    from tactile_bayes.forward.solid.study import SolidSettings
     from tactile_bayes.geometry import FloatArray
 
 _FILE = FilePath()
@@ -107,7 +107,7 @@ def command(
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.forward.study import paper_grid
+    from tactile_bayes.forward.plane.study import paper_grid
     from tactile_bayes.presets import RESEARCH_USE
 
     chosen = parse_seat(seat)
@@ -155,7 +155,7 @@ def study_settings(
     """
     from tactile_bayes.errors import UsageError
     from tactile_bayes.forward.contact import Head
-    from tactile_bayes.forward.study import StudySettings
+    from tactile_bayes.forward.plane.study import StudySettings
     from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 
     default = SHOULDERS_INSIDE if model == "plane-strain" else SHOULDERS_OUTSIDE
@@ -166,7 +166,7 @@ def study_settings(
             raise UsageError(f"{asked} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
         return StudySettings(section, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
     from tactile_bayes.forward.scene import Head as Array
-    from tactile_bayes.forward.solid_study import SolidSettings
+    from tactile_bayes.forward.solid.study import SolidSettings
 
     array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm).with_shoulders(section.shoulders)
     return SolidSettings(
@@ -187,7 +187,7 @@ def read_grid(path: Path, *, seat: float) -> list[Geometry]:
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.forward.study import group_cases
+    from tactile_bayes.forward.plane.study import group_cases
 
     table = read_table(path, _GRID_SCHEMA)
     seats = [seat if text is None else parse_seat(text) for text in table.columns["seat"]]
@@ -231,12 +231,12 @@ def _rows_of(settings: StudySettings | SolidSettings) -> Callable[[Geometry], li
     """What makes the rows of a geometry, importable by name in another process."""
     from functools import partial
 
-    from tactile_bayes.forward.study import StudySettings, run_geometry
+    from tactile_bayes.forward.plane.study import StudySettings, run_geometry
 
     if isinstance(settings, StudySettings):
         return partial(run_geometry, settings=settings, fit=fit_line)
-    from tactile_bayes.commands.study_raster import fit_raster
-    from tactile_bayes.forward.solid_study import run_solid_geometry
+    from tactile_bayes.forward.solid.study import run_solid_geometry
+    from tactile_bayes.studies.raster import fit_raster
 
     return partial(run_solid_geometry, settings=settings, fit=fit_raster)
 
@@ -293,7 +293,7 @@ def _encode(rows: list[StudyRow]) -> list[dict[str, Any]]:
 
 
 def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:
-    from tactile_bayes.forward.study import StudyRow
+    from tactile_bayes.forward.plane.study import StudyRow
 
     return [StudyRow(**row) for row in rows]
 
@@ -310,8 +310,8 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
 
     from tactile_bayes.forward.empirical import fit_shape
     from tactile_bayes.forward.gaussian import cell_mean_gaussian
-    from tactile_bayes.forward.study import LineFit
-    from tactile_bayes.posterior.fit import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
+    from tactile_bayes.forward.plane.study import LineFit
+    from tactile_bayes.posterior.white.fit import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 
     inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
     x, excess = line.x_mm[inside], line.mean[inside] - 1.0
@@ -348,7 +348,7 @@ def _cell(value: Any) -> str:
 
 def summary(rows: list[StudyRow]) -> str:
     """How many cases show, and Eq 6 in two stages for each seat and each axis of the head."""
-    from tactile_bayes.forward.study import DETECTABLE, learn_as_printed
+    from tactile_bayes.forward.plane.study import DETECTABLE, learn_as_printed
 
     shown = sum(row.detectable for row in rows)
     lines = [f"{len(rows)} cases, {len(rows) - shown} not detectable (amplitude below {DETECTABLE:g}, or not resolved)"]
@@ -392,14 +392,14 @@ def draw_figures(
     rows: list[StudyRow], settings: StudySettings | SolidSettings, folder: Path, *, seat: float, force: bool
 ) -> None:
     """Figures 5 to 8 of the paper."""
-    from tactile_bayes.forward.study import StudySettings
+    from tactile_bayes.forward.plane.study import StudySettings
 
     if isinstance(settings, StudySettings):
         from tactile_bayes.report.study_figures import study_figures
 
         study_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_line, force=force)
         return
-    from tactile_bayes.commands.study_raster import fit_raster, raster_map
     from tactile_bayes.report.solid_figures import solid_figures
+    from tactile_bayes.studies.raster import fit_raster, raster_map
 
     solid_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_raster, build=raster_map, force=force)

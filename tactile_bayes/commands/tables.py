@@ -11,7 +11,7 @@ from tactile_bayes.commands.head_option import head_option
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from tactile_bayes.forward.tables import Agreement
+    from tactile_bayes.forward.plane.tables import Agreement
 
 
 @click.command("tables")
@@ -58,8 +58,8 @@ def run_tables(seat: float, *, head: str, workers: int) -> tuple[list[Agreement]
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.executors import open_executor
     from tactile_bayes.forward.contact import Head
-    from tactile_bayes.forward.study import StudySettings
-    from tactile_bayes.forward.tables import compare, phantom_scenes, table_scenes
+    from tactile_bayes.forward.plane.study import StudySettings
+    from tactile_bayes.forward.plane.tables import compare, phantom_scenes, table_scenes
 
     scenes = table_scenes(seat) + phantom_scenes(seat)
     work = partial(compare, settings=StudySettings(Head(shoulders=head)), fit=fit_line)
@@ -75,7 +75,7 @@ def run_tables(seat: float, *, head: str, workers: int) -> tuple[list[Agreement]
 
 def tables_text(found: Sequence[Agreement], phantoms: Sequence[Agreement]) -> str:
     """Both tables, the widths and amplitudes, and the phantoms."""
-    from tactile_bayes.forward.tables import DEFINITION, PRINTED_FRAMES, PRINTED_MAPS
+    from tactile_bayes.forward.plane.tables import DEFINITION, PRINTED_FRAMES, PRINTED_MAPS
 
     lines = [DEFINITION, ""]
     lines += _table("Table 1: frame centred on the lump, MSD %", found, "centred_frame", PRINTED_FRAMES)
@@ -96,7 +96,7 @@ def tables_text(found: Sequence[Agreement], phantoms: Sequence[Agreement]) -> st
 
 def _others(found: Sequence[Agreement]) -> list[str]:
     """What other definitions would give: means over the cases with the least and the largest."""
-    from tactile_bayes.forward.tables import OTHER_DEFINITIONS
+    from tactile_bayes.forward.plane.tables import OTHER_DEFINITIONS
 
     lines = [
         "Other definitions, %: mean over the cases (least to largest); printed 4.0 to 4.3 and 2.2 to 2.7",
@@ -115,7 +115,7 @@ def _table(
     title: str, found: Sequence[Agreement], name: str, printed: Mapping[float, Sequence[float]] | None
 ) -> list[str]:
     """One table with diameters across; the printed figures in brackets."""
-    from tactile_bayes.forward.tables import TABLE_DIAMETERS_MM
+    from tactile_bayes.forward.plane.tables import TABLE_DIAMETERS_MM
 
     lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>14}" for d in TABLE_DIAMETERS_MM)]
     for depth in dict.fromkeys(one.scene.depth_ratio for one in found):
@@ -135,7 +135,7 @@ def tables_document(
     """The same as plain data, shares instead of percent."""
     from dataclasses import asdict
 
-    from tactile_bayes.forward.tables import DEFINITION, OTHER_DEFINITIONS, PRINTED_FRAMES, PRINTED_MAPS
+    from tactile_bayes.forward.plane.tables import DEFINITION, OTHER_DEFINITIONS, PRINTED_FRAMES, PRINTED_MAPS
 
     return {
         "schema": "tactile-bayes/tables/1",

@@ -66,8 +66,8 @@ def command(
     from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.prior_toml import read_prior
     from tactile_bayes.files.schema import dump_json
-    from tactile_bayes.posterior.tradeoff import measure
     from tactile_bayes.report.tradeoff_estimate import draw_tradeoff, tradeoff_document, tradeoff_text
+    from tactile_bayes.studies.estimate_tradeoff import measure
 
     if figure is not None:
         refuse_existing(figure, force=force)

@@ -13,9 +13,9 @@ from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
-    from tactile_bayes.forward.tradeoff import LumpCase, Measured
-    from tactile_bayes.report.size_rules import SizeRule
     from tactile_bayes.report.tradeoff_text import TradeoffReport
+    from tactile_bayes.studies.forward_tradeoff import LumpCase, Measured
+    from tactile_bayes.studies.size_rules import SizeRule
 
 _FILE = FilePath()
 LEARNED = "learned"
@@ -88,8 +88,8 @@ def _case(path: Path | None) -> LumpCase:
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.scene_toml import read_scene
     from tactile_bayes.forward.scene import Scene
-    from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
-    from tactile_bayes.forward.tradeoff import case_of
+    from tactile_bayes.forward.tissue import SceneBody, SolidLump
+    from tactile_bayes.studies.forward_tradeoff import case_of
 
     if path is None:
         return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)))
@@ -105,9 +105,9 @@ def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, r
 
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.study import fit_line
-    from tactile_bayes.commands.study_raster import fit_raster
-    from tactile_bayes.forward.tradeoff import PLANE, SOLID, measure, settings_of
     from tactile_bayes.report.tradeoff_text import TradeoffReport
+    from tactile_bayes.studies.forward_tradeoff import PLANE, SOLID, measure, settings_of
+    from tactile_bayes.studies.raster import fit_raster
 
     # a raster's frames are divided by their means
     own = {PLANE: "plane-strain", SOLID: "solid-mean"}
@@ -128,12 +128,12 @@ def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
     """How the widths of a model's maps become sizes: by a calibration's name or path, or learned."""
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.study import fit_line
-    from tactile_bayes.commands.study_raster import fit_raster
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.forward.tradeoff import teach
-    from tactile_bayes.report.size_rules import calibrated_rule, learned_rule
+    from tactile_bayes.studies.forward_tradeoff import teach
+    from tactile_bayes.studies.raster import fit_raster
+    from tactile_bayes.studies.size_rules import calibrated_rule, learned_rule
 
     if name == LEARNED:
         with progress_bar(f"lumps for Eq 6, {model}") as progress:

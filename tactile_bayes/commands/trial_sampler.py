@@ -10,8 +10,8 @@ from tactile_bayes.errors import NotConvergedError
 
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.posterior.draws import ParameterDraws
-    from tactile_bayes.posterior.laplace import LogDensity
+    from tactile_bayes.inference.draws import ParameterDraws
+    from tactile_bayes.inference.laplace import LogDensity
 
 # Monte-Carlo error of interval ends, in posterior SDs.
 _ACCURACY_SD = 0.03
@@ -34,9 +34,9 @@ def draw(
     NotConvergedError
         When MCMC, too, does not reach its criteria.
     """
-    from tactile_bayes.posterior.ensemble import ensemble
-    from tactile_bayes.posterior.importance import importance, importance_options
-    from tactile_bayes.posterior.laplace import mode_and_covariance
+    from tactile_bayes.inference.ensemble import ensemble
+    from tactile_bayes.inference.importance import importance, importance_options
+    from tactile_bayes.inference.laplace import mode_and_covariance
 
     try:
         mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))

@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.npz import load_npz
-from tactile_bayes.posterior.chain_state import ChainState
+from tactile_bayes.inference.chain_state import ChainState
 
 SCHEMA = "tactile-bayes/checkpoint/2"
 SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2}

@@ -120,7 +120,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.log_quadratic import LogQuadratic
+    from tactile_bayes.size.log_quadratic import LogQuadratic
 
     calibration = read_size_calibration(path)
     if isinstance(calibration, LogQuadratic):

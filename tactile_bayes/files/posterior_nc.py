@@ -14,8 +14,8 @@ from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.netcdf import Variable, netcdf_bytes
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import Estimate
-from tactile_bayes.posterior.size import SizePosterior
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.posterior import SizePosterior
 
 SCHEMA = "tactile-bayes/posterior/1"
 

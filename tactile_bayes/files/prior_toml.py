@@ -7,7 +7,7 @@ from pathlib import Path
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
-from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.lump.bump import BumpPrior
 
 SCHEMA = "prior.schema.json"
 

@@ -23,7 +23,7 @@ from tactile_bayes.forward.scene import (
     Taxels,
     Tracker,
 )
-from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump
+from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 
 _SCHEMA: Final = "scene.schema.json"
 # A lump with one of the first is tissue; only a Gaussian one may have the others.

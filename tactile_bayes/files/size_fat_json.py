@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.files.size_parts_json import hidden_document, number, numbers, parse_hidden
-from tactile_bayes.posterior.fat_depth import POWERS, ROUND, FatCubic, FatDepth
 from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.size.fat_depth import POWERS, ROUND, FatCubic, FatDepth
 
 
 def fat_document(cubic: FatCubic) -> dict[str, Any]:

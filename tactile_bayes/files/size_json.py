@@ -16,15 +16,15 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.files.shipped import is_shipped
 from tactile_bayes.files.size_parts_json import number
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.size_calibration import (
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.eq6 import (
     COEFFICIENTS,
     AxisCalibration,
     LeftOutErrors,
     Recipe,
     SizeCalibration,
 )
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.log_quadratic import LogQuadratic
 
 SCHEMA = "tactile-bayes/size-calibration/1"
 SCHEMA_FILE = "size_calibration.schema.json"

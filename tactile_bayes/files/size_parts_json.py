@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.posterior.body_terms import HiddenTerms
+from tactile_bayes.size.hidden import HiddenTerms
 
 
 def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:

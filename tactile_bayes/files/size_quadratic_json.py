@@ -13,10 +13,10 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.files.size_fat_json import fat_document, parse_fat
 from tactile_bayes.files.size_parts_json import hidden_document, number, numbers, parse_hidden
-from tactile_bayes.posterior.body_terms import RoundLumps
-from tactile_bayes.posterior.log_quadratic import PARAMETERS, QUADRATIC, LogQuadratic
-from tactile_bayes.posterior.size_calibration import Recipe
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.hidden import RoundLumps
+from tactile_bayes.size.log_quadratic import PARAMETERS, QUADRATIC, LogQuadratic
 
 SCHEMA = "tactile-bayes/size-calibration/2"
 SCHEMA_FILE = "size_quadratic.schema.json"

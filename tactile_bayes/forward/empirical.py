@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.tactile_line import LineFrames
+from tactile_bayes.forward.plane.line import LineFrames
 from tactile_bayes.geometry import FloatArray
 
 SHARE = 0.5

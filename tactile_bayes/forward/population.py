@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes, Tracker
-from tactile_bayes.forward.solid_scene import SceneBody, SolidLump
+from tactile_bayes.forward.tissue import SceneBody, SolidLump
 
 Range = tuple[float, float]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head as Section
-from tactile_bayes.forward.solid_scene import Rib, SceneBody, SolidLump, check_solid
+from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump, check_solid
 from tactile_bayes.geometry import FloatArray, rigid, rotation_from_quaternion
 from tactile_bayes.presets import (
     HEAD_COLUMNS,

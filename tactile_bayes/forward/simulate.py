@@ -63,11 +63,11 @@ def simulate(
             )
         scene = replace(scene, head=scene.head.with_shoulders(head))
     if chosen == "solid":
-        from tactile_bayes.forward.solid_scan import simulate_solid
+        from tactile_bayes.forward.solid.scan import simulate_solid
 
         return simulate_solid(scene, rng=rng, progress=progress)
     if chosen in ("plane-strain", "empirical"):
-        from tactile_bayes.forward.plane_scan import simulate_plane
+        from tactile_bayes.forward.plane.scan import simulate_plane
 
         return simulate_plane(scene, rng=rng, fidelity=chosen, shoulders=head or SHOULDERS_INSIDE, progress=progress)
     if scene.solid_lumps or scene.ribs:

@@ -6,17 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.cells import trusted
-from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.fit import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
-from tactile_bayes.records import dataclass
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump.cells import trusted
+from tactile_bayes.posterior.white.detection import Detection
+from tactile_bayes.posterior.white.fit import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-CODES = ("empty", "undetected", "unresolved", "window", "prior", "extrapolated", "method")
 FEEL_AGAIN = "if a lump is felt, go over the place again, more slowly or with more lines, and map all scans together"
 NEEDED_IN_WIDTHS = 2.0
 """Widths of the bump beyond its centre that strokes should reach, so that its flank shows on every side."""
@@ -30,25 +29,6 @@ SIDES = {
     "the feet (-y)": (0.0, -1.0),
     "the head (+y)": (0.0, 1.0),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Abstention:
-    """No number.
-
-    Parameters
-    ----------
-    code
-        One of `CODES`.
-    reason
-        With the figure and the limit.
-    advice
-        What would fix it; empty when nothing would.
-    """
-
-    code: str
-    reason: str
-    advice: str = ""
 
 
 def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
@@ -202,15 +182,6 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
         )
         return Abstention("prior", reason, "scan again, more slowly or with more lines, and map all scans together")
     return None
-
-
-def extrapolated(far: Sequence[str]) -> Abstention:
-    """The map lies so far outside the calibration's table that nothing is known of the size's error."""
-    advice = (
-        "learn a calibration whose table holds such lumps (`population`, `calibrate size`), or give "
-        "--size-calibration none for amplitude and widths"
-    )
-    return Abstention("extrapolated", f"too far outside the calibration's range for a size: {'; '.join(far)}", advice)
 
 
 def prior_share(sigma_x: FloatArray, sigma_y: FloatArray, prior: BumpPrior) -> float:

@@ -8,26 +8,27 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import Abstention, shape_fault
-from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draws import ParameterDraws
-from tactile_bayes.posterior.fit import BumpFit
-from tactile_bayes.posterior.independent_estimate import chosen_rotation, draw_independent, judged_noise
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.posterior.abstention import shape_fault
 from tactile_bayes.posterior.search import scene_asked
-from tactile_bayes.posterior.size import SizePosterior, push_sizes
-from tactile_bayes.posterior.size_calibration import SizeCalibration
+from tactile_bayes.posterior.white.detection import Detection
+from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_independent, judged_noise
+from tactile_bayes.posterior.white.fit import BumpFit
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
+from tactile_bayes.size.eq6 import SizeCalibration
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.posterior import SizePosterior, push_sizes
 
 if TYPE_CHECKING:
+    from tactile_bayes.posterior.correlated.estimate import FieldAnswer
+    from tactile_bayes.posterior.correlated.selection import SceneChoice
     from tactile_bayes.posterior.estimate import EstimateOptions
-    from tactile_bayes.posterior.field_estimate import FieldAnswer
-    from tactile_bayes.posterior.scene_choice import SceneChoice
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 """Of interval ends of sizes, where none is given; the methods have the same for the widths."""
@@ -175,8 +176,8 @@ def _draw_under_field(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] | None,
 ) -> FieldAnswer:
-    from tactile_bayes.posterior.field_estimate import draw
-    from tactile_bayes.posterior.methods import MethodOptions
+    from tactile_bayes.posterior.correlated.draw import MethodOptions
+    from tactile_bayes.posterior.correlated.estimate import draw
 
     return draw(
         seen,

@@ -8,28 +8,30 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
+from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import Abstention, extrapolated, no_bump, searched, undetected
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.abstention import no_bump, searched, undetected
 from tactile_bayes.posterior.drawn import MapPosterior, draw_sized, medians, range_faults
-from tactile_bayes.posterior.draws import INDEPENDENT_DRAWS, ParameterDraws
-from tactile_bayes.posterior.fat_depth import head_profile
-from tactile_bayes.posterior.fit import BumpFit, Candidate, FitOptions, check_background
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import SizePriors, fat_left_out
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.search import ROTATION_ODDS, best_chance, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
-from tactile_bayes.posterior.size import SizePosterior
-from tactile_bayes.posterior.size_calibration import SizeCalibration
+from tactile_bayes.posterior.white.detection import Detection
+from tactile_bayes.posterior.white.fit import BumpFit, Candidate, FitOptions, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.records import dataclass
+from tactile_bayes.size.calibration_range import extrapolated
+from tactile_bayes.size.eq6 import SizeCalibration
+from tactile_bayes.size.fat_depth import head_profile
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import SizePriors, fat_left_out
+from tactile_bayes.size.posterior import SizePosterior
 
 if TYPE_CHECKING:
-    from tactile_bayes.posterior.chain_state import ChainStore
+    from tactile_bayes.inference.chain_state import ChainStore
+    from tactile_bayes.posterior.correlated.selection import SceneChoice
     from tactile_bayes.posterior.other_rises import Rise
-    from tactile_bayes.posterior.scene_choice import SceneChoice
 
 Status = Literal["estimate", "no_estimate"]
 DETECTED = 0.95

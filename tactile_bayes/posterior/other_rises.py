@@ -10,17 +10,17 @@ import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.beside import LEAST_RISE
-from tactile_bayes.posterior.cells import SMOOTHING_MM, candidate_centres, levelled, smoothed_excess
-from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.fit import BumpFit
+from tactile_bayes.posterior.correlated.neighbour import LEAST_RISE
+from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, candidate_centres, levelled, smoothed_excess
 from tactile_bayes.posterior.search import search
+from tactile_bayes.posterior.white.detection import Detection
+from tactile_bayes.posterior.white.fit import BumpFit
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
+    from tactile_bayes.posterior.correlated.estimate import FieldAnswer
     from tactile_bayes.posterior.drawn import MapPosterior
     from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
-    from tactile_bayes.posterior.field_estimate import FieldAnswer
 
 BESIDE_IN_WIDTHS = 2.5
 """Nearer to the lump than this many of its larger width, what a lump that is no Gaussian leaves looks like a rise."""
@@ -141,7 +141,7 @@ def _rise(seen: Detection | FieldAnswer, fit: BumpFit, estimate: Estimate) -> Ri
         sigma_x, sigma_y, _ = fit.widths()
         probability = seen.probability
     else:
-        from tactile_bayes.posterior.field_posterior import shape_draws
+        from tactile_bayes.posterior.correlated.fit import shape_draws
 
         chosen, probability = seen.choice.fit, seen.detection.probability
         sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(chosen, chosen.mode[None]))

@@ -11,9 +11,9 @@ import numpy as np
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import missing_strokes
-from tactile_bayes.posterior.cells import covered_share, levelled, window_cells
-from tactile_bayes.posterior.detection import Detection, detect
-from tactile_bayes.posterior.fit import (
+from tactile_bayes.posterior.lump.cells import covered_share, levelled, window_cells
+from tactile_bayes.posterior.white.detection import Detection, detect
+from tactile_bayes.posterior.white.fit import (
     LEAST_COVERED_SHARE,
     LEAST_WIDTH_IN_CELLS,
     OUTGROWN,
@@ -25,8 +25,8 @@ from tactile_bayes.posterior.fit import (
 )
 
 if TYPE_CHECKING:
+    from tactile_bayes.posterior.correlated.estimate import FieldAnswer
     from tactile_bayes.posterior.estimate import EstimateOptions
-    from tactile_bayes.posterior.field_estimate import FieldAnswer
 
 WIDE_IN_RADII = 0.4
 ENCLOSED_IN_WIDTHS = 1.6
@@ -155,7 +155,7 @@ def best_chance(
 
 def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
     """Under correlated errors a rise at the map's edge can grow to lie mostly beyond it, or shrink to a single cell."""
-    from tactile_bayes.posterior.field_posterior import shape_draws
+    from tactile_bayes.posterior.correlated.fit import shape_draws
 
     plain, cell = seen.choice.plain, tactile_map.recipe.cell_mm
     sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
@@ -194,7 +194,7 @@ def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tu
     """Whether there is a lump, under a noise field with the fit that says so; and why it can be none all the same."""
     if options.fit.noise != "field":
         return detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior), ""
-    from tactile_bayes.posterior.field_estimate import look, with_neighbours
+    from tactile_bayes.posterior.correlated.estimate import look, with_neighbours
 
     scene = scene_asked(options)
     try:

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.pareto import smooth_weights
-from tactile_bayes.posterior.quantity import weighted_quantiles_of
+from tactile_bayes.inference.pareto import smooth_weights
+from tactile_bayes.inference.summary import weighted_quantiles_of
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.records import dataclass
 
 WIDER = 2.0

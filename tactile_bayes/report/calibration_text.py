@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from tactile_bayes.posterior.size_calibration import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
-from tactile_bayes.posterior.size_terms import SizeTerms
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
+from tactile_bayes.size.learn.body_effects import SizeTerms
 
 LABELS = {
     "m": "m",

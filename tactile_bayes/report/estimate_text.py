@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.draws import ParameterDraws
 from tactile_bayes.posterior.estimate import Estimate
-from tactile_bayes.posterior.quantity import Quantity
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import SIZES, estimate_quantities
 from tactile_bayes.report.rise_text import rise_lines

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior.log_quadratic import LogQuadratic
-from tactile_bayes.posterior.pooling import PooledEstimate, fat_left_out
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
 from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text, variance_text
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import PooledEstimate, fat_left_out
 
 SCHEMA = "tactile-bayes/pooled/1"
 SIZES = ("max_size_mm", "min_size_mm")

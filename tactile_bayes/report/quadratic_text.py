@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from tactile_bayes.posterior.fat_depth import FatCubic
-from tactile_bayes.posterior.log_quadratic import QUADRATIC, LogQuadratic
 from tactile_bayes.presets import HELD, RESEARCH_USE
+from tactile_bayes.size.fat_depth import FatCubic
+from tactile_bayes.size.log_quadratic import QUADRATIC, LogQuadratic
 
 UNKNOWN_NAMES = {
     "depth_mm": "the depth",

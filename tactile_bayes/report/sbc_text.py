@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.posterior.rank_tests import BAND, RankTest, ecdf_band, ecdf_counts
-from tactile_bayes.posterior.sbc import DRAWS, RANKED, MapRanks, Truth, other_rises, rank_tests
+from tactile_bayes.inference.rank_tests import BAND, RankTest, ecdf_band, ecdf_counts
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.studies.sbc import DRAWS, RANKED, MapRanks, Truth, other_rises, rank_tests
 
 SCHEMA = "tactile-bayes/sbc/1"
 _COLOURS = ("#1f3b73", "#c8641e")

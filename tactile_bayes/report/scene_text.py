@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from tactile_bayes.posterior.bump import BumpPrior
-from tactile_bayes.posterior.field import LENGTHS_MM, SHARES
-from tactile_bayes.posterior.scene_choice import SceneChoice, Structure
+from tactile_bayes.posterior.correlated.noise import LENGTHS_MM, SHARES
+from tactile_bayes.posterior.correlated.selection import SceneChoice, Structure
+from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.sensitivity import Sensitivity
 
 ASKED = {

@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_bayes.forward.body import THICKNESS_MM, Layers
-from tactile_bayes.forward.layered import LayeredBody
-from tactile_bayes.forward.solid import solid_head
-from tactile_bayes.forward.solid_scan import face_of
-from tactile_bayes.forward.solid_study import RasterFitter, RasterFrames, SolidSettings, raster_frames
-from tactile_bayes.forward.study import (
+from tactile_bayes.forward.plane.study import (
     DETECTABLE,
     HARD_RATIO,
     StudyRow,
@@ -26,7 +22,11 @@ from tactile_bayes.forward.study import (
     width_changes,
     widths,
 )
-from tactile_bayes.forward.tables import PHANTOMS
+from tactile_bayes.forward.plane.tables import PHANTOMS
+from tactile_bayes.forward.solid.frames import solid_head
+from tactile_bayes.forward.solid.layers import LayeredBody
+from tactile_bayes.forward.solid.scan import face_of
+from tactile_bayes.forward.solid.study import RasterFitter, RasterFrames, SolidSettings, raster_frames
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE

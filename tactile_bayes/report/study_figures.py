@@ -10,7 +10,8 @@ import numpy as np
 
 from tactile_bayes.forward.body import THICKNESS_MM, Layers
 from tactile_bayes.forward.empirical import fit_empirical
-from tactile_bayes.forward.study import (
+from tactile_bayes.forward.plane.line import build_line, press_layers
+from tactile_bayes.forward.plane.study import (
     DETECTABLE,
     HARD_RATIO,
     Fit,
@@ -21,8 +22,7 @@ from tactile_bayes.forward.study import (
     seat_name,
     width_changes,
 )
-from tactile_bayes.forward.tables import PHANTOMS, Curves, Scene, mean_squared_difference, scene_curves
-from tactile_bayes.forward.tactile_line import build_line, press_layers
+from tactile_bayes.forward.plane.tables import PHANTOMS, Curves, Scene, mean_squared_difference, scene_curves
 from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 

@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.posterior.tradeoff import FIELD_ACCURACY_SD, Measured, Tradeoff
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.studies.estimate_tradeoff import FIELD_ACCURACY_SD, Measured, Tradeoff
 
 SCHEMA = "tactile-bayes/tradeoff-estimate/1"
 _MARKS = {"optimise": "s", "laplace": "^", "importance": "o", "ensemble": "D"}

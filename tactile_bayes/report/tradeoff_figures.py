@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_bayes.forward.tradeoff import EMPIRICAL, PLANE, SOLID
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.report.study_figures import _COLOURS, _MARKS, _finish
 from tactile_bayes.report.tradeoff_text import TradeoffReport
+from tactile_bayes.studies.forward_tradeoff import EMPIRICAL, PLANE, SOLID
 
 # Smaller errors are drawn here: below rounding of what anybody reads.
 _LEAST_PERCENT = 0.003

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.forward.study import seat_name
-from tactile_bayes.forward.tradeoff import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, change, cheapest
+from tactile_bayes.forward.plane.study import seat_name
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.report.size_rules import SizeRule
+from tactile_bayes.studies.forward_tradeoff import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, change, cheapest
+from tactile_bayes.studies.size_rules import SizeRule
 
 # Settings that differ in how finely the same thing is computed.
 _MESHES = ("mesh", "default", "contact cell", "reference")

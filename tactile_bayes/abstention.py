@@ -1,0 +1,26 @@
+"""No number: the reason in words and in a code that programs can read, and what would change it."""
+
+from __future__ import annotations
+
+from tactile_bayes.records import dataclass
+
+CODES = ("empty", "undetected", "unresolved", "window", "prior", "extrapolated", "method")
+
+
+@dataclass(frozen=True, slots=True)
+class Abstention:
+    """No number.
+
+    Parameters
+    ----------
+    code
+        One of `CODES`.
+    reason
+        With the figure and the limit.
+    advice
+        What would fix it; empty when nothing would.
+    """
+
+    code: str
+    reason: str
+    advice: str = ""

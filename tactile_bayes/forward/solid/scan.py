@@ -1,0 +1,153 @@
+"""A scan of lumps of tissue in a layered body, solved frame by frame in three dimensions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.head_face import HeadFace, head_face
+from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
+from tactile_bayes.forward.scene import Head, Scene
+from tactile_bayes.forward.solid.axisymmetric import CondensedLump, Tissue, condense_lump
+from tactile_bayes.forward.solid.frames import PlacedLump, SolidHead, skin_perturbation, solid_head
+from tactile_bayes.forward.solid.layers import LayeredBody
+from tactile_bayes.forward.solid.mesh import LumpGeometry
+from tactile_bayes.forward.tissue import SceneBody, SolidLump, fat_thickness
+from tactile_bayes.geometry import FloatArray
+
+Progress = Callable[[int, int], None]
+
+
+def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress | None = None) -> SimulatedScan:
+    """Make a scan of a scene that gives tissue.
+
+    Parameters
+    ----------
+    scene
+        Its Gaussian lumps must be none; without a body it takes the default one. Ribs are rows of balls.
+    rng
+        Used by the instrument alone: the tissue has no chance in it.
+    progress
+        Called with frames done and frames in all.
+
+    Notes
+    -----
+    The mean over the taxels follows the scene's background, as an examiner holds it by the tone; where the head sinks
+    less, over a lump, its pose says so. Tilts are the scene's. Each frame is at rest: nothing slides, creeps or lags.
+    """
+    refuse_bumps(scene, "solid")
+    time = frame_times(scene)
+    pressure, depth = solid_frames(scene, time, progress=progress)
+    return record(
+        scene,
+        felt=lambda at: pressure[np.searchsorted(time, at)],
+        depth=lambda at: np.interp(at, time, depth),
+        truth={"model": "solid", "head": scene.head.shoulders, **tissue_truth(scene)},
+        rng=rng,
+    )
+
+
+def tissue_truth(scene: Scene) -> dict[str, Any]:
+    """What lies below the skin, as plain data; the balls of a rib are no lumps."""
+    body = scene.body or SceneBody()
+    fat = fat_thickness(body, scene.solid_lumps)
+    return {
+        "lumps": [_lump_truth(lump, body, fat) for lump in scene.solid_lumps],
+        "ribs": [asdict(rib) | {"ball_x_mm": [ball.x_mm for ball in rib.balls()]} for rib in scene.ribs],
+        "body": asdict(body) | {"fat_mm": fat},
+        "background": asdict(scene.background),
+    }
+
+
+def refuse_bumps(scene: Scene, model: str) -> None:
+    """Raise BadDataError where the scene's lumps are no tissue, which `model` needs."""
+    if scene.lumps:
+        raise BadDataError(
+            "lump[0] gives no depth_ratio",
+            way_out=f"the {model} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
+        )
+
+
+def solid_frames(
+    scene: Scene, time_s: FloatArray, *, progress: Progress | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """What the head feels at (n,) times, without noise.
+
+    Returns
+    -------
+    pressure_kpa : (n, rows, columns) array
+    depth_mm : (n,) array
+        z of the head's apex in the scene's `plane`.
+    """
+    body = scene.body or SceneBody()
+    head, lumps = _head(scene.head, body, fat_thickness(body, scene.solid_lumps)), _placed(scene)
+    rotation, origin = head_positions(scene, time_s)
+    level = level_kpa(scene.background, time_s)
+    pressure = np.empty((len(time_s), scene.head.rows, scene.head.columns))
+    depth, touching = np.empty(len(time_s)), None
+    for i in range(len(time_s)):
+        frame = head.frame(
+            lumps,
+            rotation=rotation[i],
+            x_mm=float(origin[i, 0]),
+            y_mm=float(origin[i, 1]),
+            mean_kpa=float(level[i]),
+            touching=touching,
+        )
+        pressure[i], depth[i], touching = frame.pressure_kpa, frame.depth_mm, frame.contact.touching
+        if progress is not None:
+            progress(i + 1, len(time_s))
+    return pressure, depth
+
+
+def face_of(head: Head) -> HeadFace:
+    """The face that can touch; shoulders inside the array leave no room for a rim around it."""
+    rim = 0.0 if head.shoulder_mm > 0 else head.rim_mm
+    return head_face(head.surface_mm(), pitch_mm=head.pitch_mm, radius_mm=head.radius_mm, rim_mm=rim)
+
+
+def layers_of(body: SceneBody, fat_mm: float) -> LayeredBody:
+    """The body without lumps."""
+    return LayeredBody((body.fat_kpa, body.fat_kpa * body.gland_ratio), (fat_mm, body.thickness_mm - fat_mm), body.nu)
+
+
+def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> CondensedLump:
+    """What surrounds a lump, condensed; its stiffness and place do not matter here."""
+    geometry = LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, fat_mm, body.thickness_mm)
+    return condense_lump(geometry, Tissue(body.fat_kpa, body.gland_ratio, body.nu))
+
+
+def _head(head: Head, body: SceneBody, fat_mm: float) -> SolidHead:
+    return solid_head(face_of(head), layers_of(body, fat_mm))
+
+
+def _placed(scene: Scene) -> list[PlacedLump]:
+    """The scene's lumps; those of one size and depth are condensed once."""
+    body = scene.body or SceneBody()
+    fat = fat_thickness(body, scene.solid_lumps)
+
+    @cache
+    def condensed(d_mm: float, height_mm: float, depth_ratio: float) -> CondensedLump:
+        return condensed_lump(SolidLump(d_mm=d_mm, height_mm=height_mm, depth_ratio=depth_ratio), body, fat)
+
+    placed = []
+    for lump in scene.stiff_balls:
+        around = condensed(lump.d_mm, lump.vertical_mm, lump.depth_ratio)
+        change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
+        placed.append(PlacedLump(change, lump.x_mm, lump.y_mm))
+    return placed
+
+
+def _lump_truth(lump: SolidLump, body: SceneBody, fat_mm: float) -> dict[str, Any]:
+    seat = (fat_mm - lump.depth_mm) / (lump.vertical_mm / 2)
+    return asdict(lump) | {
+        "height_mm": lump.vertical_mm,
+        "seat": seat,
+        "depth_mm": lump.depth_mm,
+        "lump_kpa": lump.stiffness_ratio * body.fat_kpa,
+    }

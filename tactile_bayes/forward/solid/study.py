@@ -1,0 +1,261 @@
+"""The forward study in three dimensions: the frames over a ball, over sizes, depths, stiffnesses and seats.
+
+The head stands on a raster of places about the lump. By symmetry a quarter of them is solved and the rest mirrored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, Body
+from tactile_bayes.forward.plane.condense import FINENESS
+from tactile_bayes.forward.plane.line import MEAN_KPA
+from tactile_bayes.forward.plane.study import DETECTABLE, Geometry, StudyRow, seat_name
+from tactile_bayes.forward.scene import Head
+from tactile_bayes.forward.solid.axisymmetric import CondensedLump, Tissue, condense_lump
+from tactile_bayes.forward.solid.frames import RANK_TOLERANCE, PlacedLump, SolidHead, skin_perturbation, solid_head
+from tactile_bayes.forward.solid.layers import LayeredBody
+from tactile_bayes.forward.solid.mesh import LumpGeometry, MeshSize
+from tactile_bayes.forward.solid.scan import face_of
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import FIT_RADIUS_MM
+
+REACH_MM = 33.0
+LINES_MM = (0.0, 6.0, 12.0)
+BACKGROUNDS = ("fixed", "free")
+_LEVEL = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True)
+class SolidSettings:
+    """All that a solid study's table depends on besides its cases.
+
+    Parameters
+    ----------
+    head
+        The array and the rim around it.
+    mean_kpa
+        Mean over the taxels.
+    poisson, fat_kpa, gland_ratio, thickness_mm
+        As in `body.Body`.
+    reach_mm, lines_mm
+        The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on lines at these
+        distances either side along it, which must be whole steps.
+    fit_radius_mm
+        Eq 7 is fitted within this distance of the lump's axis.
+    fineness
+        Of the mesh; twice is half the element. See `mesh_size`.
+    rank_tolerance
+        See `solid.skin_perturbation`.
+    mesh_reach_mm
+        Radius at which the mesh ends, on a rim that does not move.
+    background
+        ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
+    flat_field
+        Whether each taxel is divided by what it reads of the same body without the lump.
+    """
+
+    head: Head = field(default_factory=Head)
+    mean_kpa: float = MEAN_KPA
+    poisson: float = POISSON
+    fat_kpa: float = FAT_KPA
+    gland_ratio: float = GLAND_RATIO
+    thickness_mm: float | None = None
+    reach_mm: float = REACH_MM
+    lines_mm: tuple[float, ...] = LINES_MM
+    fit_radius_mm: float = FIT_RADIUS_MM
+    fineness: int = FINENESS
+    rank_tolerance: float = RANK_TOLERANCE
+    mesh_reach_mm: float = MeshSize().reach_mm
+    background: str = "free"
+    flat_field: bool = True
+
+    def __post_init__(self) -> None:
+        half = self.head.rows * self.head.pitch_mm / 2
+        if not self.head.radius_mm > half:
+            raise BadDataError(
+                f"radius_mm of the head is {self.head.radius_mm:g}",
+                way_out=f"it must be above {half:g} mm, half the head's width",
+            )
+        if self.background not in BACKGROUNDS:
+            raise BadDataError(f"background is {self.background!r}", way_out=f"it must be {' or '.join(BACKGROUNDS)}")
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain data for a store's header."""
+        return {"model": "solid", **asdict(self)}
+
+    def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
+        """The body of a case."""
+        return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
+
+    def geometry(self, body: Body) -> LumpGeometry:
+        """The ball in the body."""
+        layers, radius = body.layers, body.radius_mm
+        return LumpGeometry(radius, radius, body.centre_mm, layers.fat_mm, layers.thickness_mm)
+
+    def condensed(self, body: Body) -> CondensedLump:
+        """What surrounds the ball, condensed."""
+        tissue = Tissue(body.fat_kpa, body.gland_ratio, body.poisson)
+        return condense_lump(self.geometry(body), tissue, size=self.mesh_size)
+
+    @property
+    def mesh_size(self) -> MeshSize:
+        """Of the fineness and the reach."""
+        return mesh_size(self.fineness, reach_mm=self.mesh_reach_mm)
+
+    def on(self, body: Body) -> SolidHead:
+        """The head on the body without its lump."""
+        layers = body.layers
+        moduli = (body.fat_kpa, body.fat_kpa * body.gland_ratio)
+        thicknesses = (layers.fat_mm, layers.thickness_mm - layers.fat_mm)
+        return solid_head(face_of(self.head), LayeredBody(moduli, thicknesses, body.poisson))
+
+    def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> PlacedLump:
+        """The lump under the middle of the raster."""
+        change = skin_perturbation(
+            condensed,
+            stiffness_ratio * self.fat_kpa,
+            square_mm=self.head.pitch_mm,
+            tolerance=self.rank_tolerance,
+        )
+        return PlacedLump(change, 0.0, 0.0)
+
+
+def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSize:
+    """The mesh of a fineness; 2 is the default one, and twice the fineness has half the element everywhere."""
+    default = MeshSize()
+    share = fineness / FINENESS
+    return MeshSize(
+        arc=round(default.arc * share),
+        rings=round(default.rings * share),
+        core=int(np.ceil(default.core * share)),
+        grade=float(default.grade ** (1.0 / share)),
+        reach_mm=reach_mm,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RasterFrames:
+    """Frames of a level head at many places.
+
+    Parameters
+    ----------
+    x_mm, y_mm, depth_mm : (n,) arrays
+        Where the apex of the head's face is, from the lump's axis and from the undisturbed skin.
+    pressure_kpa : (n, rows, columns) array
+    head
+        What was pressed.
+    plain_kpa : (rows, columns) array
+        The head's frame over the same body without the lump, where the map is to be divided by it.
+    """
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    depth_mm: FloatArray
+    pressure_kpa: FloatArray
+    head: Head
+    plain_kpa: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RasterFit:
+    """Eq 7 fitted to a raster's map.
+
+    Parameters
+    ----------
+    amplitude, sigma_x_mm, sigma_y_mm
+        a (height above the level, in units of the map) and the widths of Eq 7, across and along the head.
+    rms
+        Root mean square of what the Gaussian leaves, in units of the background.
+    resolved
+        Whether both widths are ones that array and window can tell.
+    """
+
+    amplitude: float
+    sigma_x_mm: float
+    sigma_y_mm: float
+    rms: float
+    resolved: bool
+
+
+RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]
+"""Builds the map of a raster and fits Eq 7 with the radius and the level of the settings."""
+
+
+def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSettings) -> RasterFrames:
+    """Frames of the whole raster about a lump, or about nothing.
+
+    Notes
+    -----
+    The lump is symmetric about both axes of the level head, so the frame at (-x, y) is the one at (x, y) with its rows
+    turned about, and that at (x, -y) with its columns. The layers are alike everywhere, so one frame tells all that the
+    head reads without the lump.
+    """
+    pitch = settings.head.pitch_mm
+    count = int(np.floor(settings.reach_mm / pitch + 1e-9))
+    places, depths, frames = [], [], []
+    touching: NDArray[np.bool_] | None = None
+    for line in settings.lines_mm:
+        y = pitch * round(line / pitch)
+        for x in pitch * np.arange(count + 1.0):
+            one = head.frame(
+                [] if lump is None else [lump],
+                rotation=_LEVEL,
+                x_mm=float(x),
+                y_mm=y,
+                mean_kpa=settings.mean_kpa,
+                touching=touching,
+            )
+            touching = one.contact.touching
+            for side in (1, -1) if x > 0 else (1,):
+                for end in (1, -1) if y > 0 else (1,):
+                    places.append((side * x, end * y))
+                    depths.append(one.depth_mm)
+                    frames.append(one.pressure_kpa[::side, ::end])
+    plain = None
+    if settings.flat_field:
+        plain = head.frame([], rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa).pressure_kpa
+    place = np.array(places)
+    return RasterFrames(place[:, 0], place[:, 1], np.array(depths), np.stack(frames), settings.head, plain)
+
+
+def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: RasterFitter) -> list[StudyRow]:
+    """The rows of one geometry: the body is condensed once for all stiffnesses of its lump.
+
+    Parameters
+    ----------
+    fit
+        How the map is built and Eq 7 fitted; importable by name, as `batch` needs it.
+    """
+    body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
+    head, condensed = settings.on(body), settings.condensed(body)
+    rows = []
+    for ratio in geometry.stiffness_ratios:
+        found = fit(raster_frames(head, settings.placed(condensed, ratio), settings), settings)
+        rows.append(
+            StudyRow(
+                seat_name(geometry.seat),
+                geometry.d_mm,
+                geometry.depth_ratio,
+                ratio,
+                found.amplitude,
+                found.sigma_x_mm,
+                found.rms,
+                bool(found.amplitude >= DETECTABLE and found.resolved),
+                found.sigma_y_mm,
+                body.layers.thickness_mm,
+                settings.head.radius_mm,
+                settings.head.shoulders,
+                normalise="mean",
+                background=settings.background,
+                fit_radius_mm=settings.fit_radius_mm,
+                noise="independent",
+                flat_field=settings.flat_field,
+            )
+        )
+    return rows

@@ -1,0 +1,227 @@
+"""Markov chain Monte Carlo by independent emcee ensembles that must agree with each other before they stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import emcee
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.arviz_data import chain_diagnostics
+from tactile_bayes.inference.chain_state import ChainState, ChainStore
+from tactile_bayes.inference.draws import ParameterDraws, student_draws
+from tactile_bayes.inference.laplace import LogDensity
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class EnsembleOptions:
+    """When to stop.
+
+    Parameters
+    ----------
+    ensembles
+        Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles.
+    walkers_per_parameter
+        Walkers of each ensemble, a parameter.
+    block
+        Steps between two looks at the diagnostics.
+    max_steps
+        Give up after this many.
+    least_ess, most_rhat
+        Bulk and tail effective draws, and R-hat, that every parameter must reach.
+    keep
+        Draws kept, thinned evenly over all ensembles.
+    """
+
+    ensembles: int = 4
+    walkers_per_parameter: int = 4
+    block: int = 150
+    max_steps: int = 6000
+    least_ess: float = 800.0
+    most_rhat: float = 1.01
+    keep: int = 8000
+
+    def identity(self) -> str:
+        """What a checkpoint is bound to: everything but how long to go on."""
+        said = asdict(self)
+        return str({name: said[name] for name in ("ensembles", "walkers_per_parameter", "block")})
+
+
+def ensemble(
+    log_density: LogDensity,
+    centre: FloatArray,
+    covariance: FloatArray,
+    *,
+    rng: np.random.Generator,
+    options: EnsembleOptions | None = None,
+    progress: Progress | None = None,
+    start: FloatArray | None = None,
+    store: ChainStore | None = None,
+    key: str = "",
+) -> ParameterDraws:
+    """Draw from a log density, starting from draws of it, or from overdispersed normal draws about its mode.
+
+    Parameters
+    ----------
+    log_density
+        Vectorised: (m, p) to (m,).
+    centre, covariance : (p,), (p, p) arrays
+        Mode and approximate covariance.
+    progress
+        Called with the effective draws so far and those wanted.
+    start : (n, p) array
+        Draws of about this density; walkers begin at some of them.
+    store, key
+        Where the state is kept after each block, and what it is bound to. A run goes on from a state that it finds,
+        and ends in the same draws as a run that was never stopped.
+
+    Raises
+    ------
+    NotConvergedError
+        When the diagnostics are not reached in ``max_steps``; says about how many steps would do.
+
+    Notes
+    -----
+    Differential-evolution moves (ter Braak 2006) in emcee (Foreman-Mackey et al. 2013). The first third of each
+    ensemble's steps is dropped. Diagnostics are rank-normalised (Vehtari et al. 2021).
+    """
+    options = options or EnsembleOptions()
+    samplers = [
+        _Ensemble(log_density, centre, covariance, rng=rng, options=options, start=start)
+        for _ in range(options.ensembles)
+    ]
+    kept = None if store is None else store.load(key)
+    if kept is not None:
+        for index, sampler in enumerate(samplers):
+            sampler.restore(kept, index)
+    figures: dict[str, float] = {}
+    # a state that had converged is looked at again before it is run further
+    for steps in range(max(options.block, samplers[0].steps), options.max_steps + 1, options.block):
+        if steps > samplers[0].steps:
+            for sampler in samplers:
+                sampler.advance(options.block)
+            if store is not None:
+                store.save(key, _state(samplers))
+        chains = np.stack([sampler.chain() for sampler in samplers])
+        figures = chain_diagnostics(chains)
+        least = min(figures["ess_bulk"], figures["ess_tail"])
+        if progress is not None:
+            progress(int(min(least, options.least_ess)), int(options.least_ess))
+        if least >= options.least_ess and figures["rhat"] <= options.most_rhat:
+            figures |= {"steps": float(steps), "walkers": float(samplers[0].walkers), "ensembles": len(samplers)}
+            figures |= {"evaluations": float(steps * samplers[0].walkers * len(samplers))}
+            figures |= {"acceptance": float(np.mean([sampler.acceptance() for sampler in samplers]))}
+            return ParameterDraws(_thin(chains, options.keep), "ensemble", figures)
+    if not figures:
+        raise NotConvergedError(f"the checkpoint has {samplers[0].steps} steps, more than --max-steps allows")
+    raise NotConvergedError(_advice(figures, options), diagnostics=figures)
+
+
+class _Ensemble:
+    """One emcee ensemble with a random stream of its own."""
+
+    def __init__(
+        self,
+        log_density: LogDensity,
+        centre: FloatArray,
+        covariance: FloatArray,
+        *,
+        rng: np.random.Generator,
+        options: EnsembleOptions,
+        start: FloatArray | None,
+    ) -> None:
+        p = len(centre)
+        self._centre, self._scale = centre, np.sqrt(np.diag(covariance))
+        self.walkers = max(2 * ((options.walkers_per_parameter * p + 1) // 2), 2 * p + 2)
+        self._sampler = emcee.EnsembleSampler(
+            self.walkers, p, self._standardised(log_density), vectorize=True, moves=[(emcee.moves.DEMove(), 1.0)]
+        )
+        # emcee's wrapper prints parameters and a traceback at any exception, Ctrl-C among them
+        self._sampler.log_prob_fn = self._standardised(log_density)
+        if start is None or len(start) < self.walkers:
+            begin = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
+        else:
+            unique = np.unique(start, axis=0)
+            begin = unique[rng.choice(len(unique), size=self.walkers, replace=len(unique) < self.walkers)]
+        # emcee takes neither an integer nor a Generator: it must be handed the state of a RandomState
+        random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
+        self._state = emcee.State((begin - self._centre) / self._scale, random_state=random_state)
+        self._chain = np.empty((0, self.walkers, p))
+        self._accepted = 0.0
+
+    def _standardised(self, log_density: LogDensity) -> LogDensity:
+        """The density of ``(theta - centre) / scale``: emcee judges the walkers' independence by their numbers."""
+        return lambda z: log_density(self._centre + self._scale * z)
+
+    @property
+    def steps(self) -> int:
+        """Steps taken."""
+        return len(self._chain)
+
+    def advance(self, steps: int) -> None:
+        """Take more steps."""
+        self._sampler.reset()
+        self._state = self._sampler.run_mcmc(self._state, steps)
+        self._chain = np.concatenate([self._chain, self._sampler.get_chain()])
+        self._accepted += float(np.mean(self._sampler.backend.accepted))
+
+    def chain(self) -> FloatArray:
+        """(draw, p): the last two thirds, walker after walker: neighbours in the array are neighbours in time."""
+        kept = self._centre + self._scale * self._chain[self.steps // 3 :]
+        return np.asarray(np.swapaxes(kept, 0, 1).reshape(-1, kept.shape[-1]))
+
+    def acceptance(self) -> float:
+        """Share of the proposals that were taken."""
+        return self._accepted / self.steps
+
+    def kept(self) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
+        """Chain, last log densities, accepted proposals, generator's key and its cursor."""
+        _, key, position, has_normal, normal = self._state.random_state
+        cursor = np.array([position, has_normal, normal], dtype=np.float64)
+        return self._chain, np.asarray(self._state.log_prob), self._accepted, key, cursor
+
+    def restore(self, state: ChainState, index: int) -> None:
+        """Go on from a kept state."""
+        self._chain, self._accepted = state.chain[index], float(state.accepted[index])
+        position, has_normal, normal = state.cursor[index]
+        random_state = ("MT19937", state.twister[index], int(position), int(has_normal), float(normal))
+        self._state = emcee.State(
+            self._chain[-1].copy(), log_prob=state.log_density[index].copy(), random_state=random_state
+        )
+
+
+def _state(samplers: list[_Ensemble]) -> ChainState:
+    return ChainState(*(np.stack(values) for values in zip(*(one.kept() for one in samplers), strict=True)))
+
+
+def _finite_start(
+    log_density: LogDensity, centre: FloatArray, covariance: FloatArray, *, number: int, rng: np.random.Generator
+) -> FloatArray:
+    """Overdispersed draws with finite density; wild ones are pulled towards the centre."""
+    draws = student_draws(centre, 1.5 * covariance, dof=np.inf, number=number, rng=rng)
+    for _ in range(60):
+        bad = ~np.isfinite(log_density(draws))
+        if not bad.any():
+            return draws
+        draws[bad] = centre + 0.7 * (draws[bad] - centre)
+    raise NotConvergedError("the posterior is not finite near its mode; check the map")
+
+
+def _thin(chains: FloatArray, keep: int) -> FloatArray:
+    stride = max(1, (chains.shape[0] * chains.shape[1]) // keep)
+    return np.ascontiguousarray(chains[:, ::stride])
+
+
+def _advice(figures: dict[str, float], options: EnsembleOptions) -> str:
+    least = max(min(figures["ess_bulk"], figures["ess_tail"]), 1.0)
+    factor = max(options.least_ess / least, 2.0 if figures["rhat"] > options.most_rhat else 1.0)
+    return (
+        f"not converged after {options.max_steps} steps: R-hat {figures['rhat']:.3f} (wanted {options.most_rhat}), "
+        f"effective draws {least:.0f} (wanted {options.least_ess:.0f}); "
+        f"run about {factor:.1f} times as long (--max-steps {int(np.ceil(factor * options.max_steps / 100)) * 100})"
+    )

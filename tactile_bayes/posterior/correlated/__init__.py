@@ -1,0 +1,1 @@
+"""A bump, and what may stand beside it, under spatially correlated errors."""

@@ -1,0 +1,229 @@
+"""A bump under correlated errors, from its least-squares fit to detection, scene and draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import field, replace
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.cache import Solved
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.paired import MOST_PAIRED, paired_points
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.correlated.draw import MethodOptions, draw_scene
+from tactile_bayes.posterior.correlated.fit import FieldFit, field_window, shape_draws, start_vector
+from tactile_bayes.posterior.correlated.neighbour import WANTED, add_beside, rising_ribs
+from tactile_bayes.posterior.correlated.noise import cosines_for
+from tactile_bayes.posterior.correlated.peakedness import ask_departure
+from tactile_bayes.posterior.correlated.pose_error import pose_covariance
+from tactile_bayes.posterior.correlated.ridge import ridge_instead, ridge_text
+from tactile_bayes.posterior.correlated.scene import Scene
+from tactile_bayes.posterior.correlated.selection import ASKING, SceneChoice, choose_shape
+from tactile_bayes.posterior.correlated.surroundings import Surroundings
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump.cells import trusted
+from tactile_bayes.posterior.white.detection import Detection, detection_from_odds
+from tactile_bayes.posterior.white.fit import BumpFit
+from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.records import dataclass
+
+Progress = Callable[[int, int], None]
+LEAST_VARIANCE = 1e-12
+"""Directions in which errors of the frames' places spread less, as a share of the largest, are left out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldAnswer:
+    """What the map says under correlated errors.
+
+    Parameters
+    ----------
+    detection
+        Whether there is a lump.
+    choice
+        The scene.
+    draws
+        Of the scene's parameters; None where they were not asked for.
+    posterior
+        Joint draws by the names of `MapPosterior`, each (chain, draw).
+    diagnostics
+        Figures of the fit and the noise.
+    """
+
+    detection: Detection
+    choice: SceneChoice
+    draws: ParameterDraws | None = None
+    posterior: Mapping[str, FloatArray] = field(default_factory=dict)
+    diagnostics: Mapping[str, object] = field(default_factory=dict)
+
+
+def look(
+    tactile_map: TactileMap,
+    fit: BumpFit,
+    *,
+    prior: BumpPrior,
+    radius_mm: float,
+    scene: str = "auto",
+    least_odds: float,
+    cosines: int | None = None,
+) -> FieldAnswer:
+    """Fit the bump under correlated errors and weigh it against none.
+
+    Parameters
+    ----------
+    cosines
+        As `FitOptions.field_cosines`. Without a number a bump that may be a lump and is narrow is fitted once more,
+        with a finer field.
+
+    Raises
+    ------
+    NotConvergedError
+        When the density has no mode.
+    """
+
+    def under(number: int, start: FloatArray) -> FieldAnswer:
+        choice = choose_shape(
+            field_window(fit, cosines=number),
+            start,
+            prior=prior,
+            radius_mm=radius_mm,
+            amplitude_scale=fit.bump.scale,
+            scene=scene,
+            least_odds=least_odds,
+        )
+        return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
+
+    full = Scene("rotated")
+    answer = under(cosines or FIELD_COSINES, start_vector(fit, full))
+    if cosines is not None or not answer.detection.log_bayes_factor > 0:
+        return answer
+    wanted = _called_for(answer.choice.plain)
+    if wanted <= FIELD_COSINES:
+        return answer
+    return under(wanted, answer.choice.plain.scene.carried(answer.choice.plain.mode, full))
+
+
+def _called_for(plain: FieldFit) -> int:
+    """Cosines that the fitted bump's narrower width calls for."""
+    sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
+    window = plain.target.window
+    return max(cosines_for(min(sigma_x, sigma_y), axis) for axis in (window.x_mm, window.y_mm))
+
+
+def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: float) -> Detection:
+    """Odds of a bump somewhere on the map against level, tilt and the same noise fields alone.
+
+    The window's evidence has the centre anywhere in the window; the search over the rest of the map is paid for.
+    """
+    return detection_from_odds(log_evidence - plain.target.null_log_evidence() - _searched(plain, tactile_map))
+
+
+def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
+    """Log of how many windows the map has."""
+    area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2
+    return float(np.log(max(area / (np.pi * plain.target.radius_mm**2), 1.0)))
+
+
+def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: str = "auto") -> FieldAnswer:
+    """The same with a second structure where the map asks for one, the lump weighed against a ridge where one rises.
+
+    A bump alone is asked whether it is a Gaussian. Only scenes that ask what lies beside the lump are weighed so:
+    without a rib in the model a lump beside one would lose to it.
+    """
+    if scene not in ASKING:
+        return replace(answer, choice=ask_departure(answer.choice))
+    surroundings = Surroundings.of(tactile_map)
+    ridges = rising_ribs(answer.choice.plain, surroundings)
+    choice = add_beside(answer.choice, surroundings, ridges=ridges, scene=scene)
+    ridge = ridge_instead(choice, ridges)
+    found = replace(answer, choice=ask_departure(choice))
+    if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
+        return found
+    log_factor = choice.fit.log_evidence - ridge.log_evidence - _searched(choice.plain, tactile_map)
+    return replace(found, detection=detection_from_odds(log_factor, ridge=ridge_text(ridge)))
+
+
+def draw(
+    answer: FieldAnswer,
+    tactile_map: TactileMap,
+    method: str,
+    *,
+    rng: np.random.Generator,
+    scene: str = "auto",
+    options: MethodOptions | None = None,
+    progress: Progress | None = None,
+) -> FieldAnswer:
+    """The same with draws.
+
+    Raises
+    ------
+    NotConvergedError
+        When no method converges, or the neighbour that the scene asks for was not found.
+    """
+    choice, wanted = answer.choice, WANTED.get(scene, "")
+    if wanted and choice.fit.scene.extra != wanted:
+        raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {scene}")
+    solved = Solved(choice.fit.target.conditional)
+    draws, passed_over = draw_scene(choice.fit, method, rng=rng, options=options, progress=progress, solved=solved)
+    detection = answer.detection
+    if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
+        detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
+    places = pose_covariance(choice.fit)
+    figures = _diagnostics(choice) | ({"passed_over": list(passed_over)} if passed_over else {})
+    figures["places_share"] = _places_share(choice.fit, places)
+    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
+
+
+def _posterior(
+    fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved, places: FloatArray
+) -> dict[str, FloatArray]:
+    """Draws by name, with what errors of the frames' places add to them."""
+    shape = draws.theta.shape[:2]
+    theta = draws.theta + _displaced(fit, draws, places, rng).reshape(draws.theta.shape)
+    sigma_x, sigma_y, angle = shape_draws(fit, theta)
+    amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
+    return {
+        "amplitude": amplitude[:, 0].reshape(shape),
+        "sigma_x_mm": sigma_x,
+        "sigma_y_mm": sigma_y,
+        "x_mm": fit.scene.column(theta, "x"),
+        "y_mm": fit.scene.column(theta, "y"),
+        "angle_rad": angle,
+        "background": level.reshape(shape),
+        "noise_sd": noise_sd.reshape(shape),
+    }
+
+
+def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(chain * draw, p) normal draws of a covariance, spread evenly over the draws in order of their mean width."""
+    values, vectors = np.linalg.eigh(places)
+    kept = np.flatnonzero(values > LEAST_VARIANCE * values[-1])[-MOST_PAIRED:]
+    if not values[-1] > 0:
+        return np.zeros_like(draws.flat)
+    width = fit.scene.column(draws.flat, "u") + fit.scene.column(draws.flat, "v")
+    points = paired_points(width, draws.replicates, len(kept), rng)
+    return np.asarray(normal_quantile(points) @ (vectors[:, kept] * np.sqrt(values[kept])).T)
+
+
+def _places_share(fit: FieldFit, places: FloatArray) -> float | None:
+    """Share of the variance of the log widths that errors of the frames' places make; None where they are not told."""
+    if fit.target.window.cells.pose_noise is None:
+        return None
+    widths = [fit.scene.names.index(name) for name in ("u", "v") if name in fit.scene.names]
+    added = float(np.diag(places)[widths].sum())
+    return added / (added + float(np.diag(fit.covariance)[widths].sum()))
+
+
+def _diagnostics(choice: SceneChoice) -> dict[str, object]:
+    odds = {one.name: one.odds for one in choice.structures}
+    found: dict[str, object] = {
+        "noise": "field",
+        "rotation_odds": odds.get("rotated"),
+        "rotated": choice.fit.rotated,
+        "field_cosines": choice.fit.target.window.cosines,
+    }
+    return found | choice.fit.target.field_summary(choice.fit.mode)

@@ -1,0 +1,200 @@
+"""What lies beside the bump: a second lump or the edge of a rib, looked for within and just beyond the window."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.correlated.fit import FieldFit
+from tactile_bayes.posterior.correlated.marginal import BLOCK
+from tactile_bayes.posterior.correlated.scene import APART, REACH_IN_RADII, BoolArray, Extra
+from tactile_bayes.posterior.correlated.selection import (
+    ASKING,
+    LEAST_ODDS,
+    Fitter,
+    SceneChoice,
+    Structure,
+    asked_again,
+    change_in_sd,
+    odds,
+)
+from tactile_bayes.posterior.correlated.surroundings import Surroundings
+from tactile_bayes.posterior.correlated.window import Profiles
+
+SECOND_ODDS = 10.0
+"""For a second lump or a rib: a bump that is not quite a Gaussian must not bring one."""
+LEAST_RISE = 0.05
+"""Of the bump's amplitude: beside 15 single simulated lumps the most was 0.01, beside a second one 0.08 and more."""
+LONG = 1.5
+"""A bump with a larger axis ratio is also tried as two round lumps side by side."""
+GRID_MM = 4.0
+GRID_WIDTHS_MM = (3.0, 5.0, 8.0)
+GRID_ANGLES = 12
+WANTED: dict[str, Extra] = {"second-lump": "second lump", "rib": "rib"}
+
+
+def add_beside(
+    choice: SceneChoice, surroundings: Surroundings, *, ridges: FloatArray, scene: str = "auto"
+) -> SceneChoice:
+    """Ask for a second lump or a rib beside the bump; the draws have it where the map asks for it, or `scene` does.
+
+    `ridges` are where a rib can be: `rising_ribs`. What is found must stand out on the map by `LEAST_RISE` of the
+    bump's amplitude, see `Surroundings.rise`. What is not found is not in the fit, even if it was asked for.
+    """
+    if scene not in ASKING:
+        return choice
+    fit, beside = _beside_questions(Fitter.of(choice.plain), choice.plain, surroundings, ridges, scene)
+    found = choice if fit is choice.plain else asked_again(choice, fit)
+    return replace(found, structures=(*found.structures, *beside))
+
+
+def _beside_questions(
+    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: str
+) -> tuple[FieldFit, list[Structure]]:
+    """A second lump and a rib, each against the scene without; the likelier of those that the map asks for."""
+    lumps = second_lumps(plain, fitter)
+    places: dict[Extra, FloatArray] = {
+        "second lump": lumps[rises(plain, surroundings, "second lump", lumps)],
+        "rib": _apart(plain, ridges),
+    }
+    fits = {
+        extra: _fit_beside(fitter, plain, surroundings, extra, rising, forced=WANTED.get(scene) == extra)
+        for extra, rising in places.items()
+    }
+    asked = [extra for extra, (fit, log_odds, _) in fits.items() if fit is not None and log_odds > np.log(SECOND_ODDS)]
+    likeliest: Extra = max(asked, key=lambda extra: fits[extra][1]) if asked else ""
+    used = WANTED.get(scene, likeliest)
+    chosen = fits[used][0] if used else plain
+    answers = []
+    for extra, (fit, log_odds, bound) in fits.items():
+        answer = Structure(extra, odds(log_odds), extra in asked, fit is not None and extra == used, bound)
+        if fit is not None:
+            sign = -1.0 if extra == used else 1.0
+            x, y = change_in_sd(plain, fit.scene.carried(fit.mode, plain.scene))
+            answer = replace(answer, change_x_sd=sign * x, change_y_sd=sign * y, place=_place(fit))
+        answers.append(answer)
+    return chosen or plain, answers
+
+
+def _fit_beside(
+    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, extra: Extra, rising: FloatArray, *, forced: bool
+) -> tuple[FieldFit | None, float, bool]:
+    """The fit with a second structure, its log odds, and whether these are only a bound (then there is no fit)."""
+    scene = replace(plain.scene, extra=extra)
+    starts, bound = _starts(plain, extra, rising)
+    if not starts or (bound < np.log(LEAST_ODDS) and not forced):
+        return None, min(bound, 0.0), True
+    fits = [fit for start in starts if (fit := fitter.fit_or_none(scene, start)) is not None]
+    standing = [fit for fit in fits if rises(fit, surroundings, extra, fit.mode[None, -3:])[0]]
+    if not standing:
+        return None, -np.inf, True
+    best = max(standing, key=lambda fit: fit.log_evidence)
+    return best, best.log_evidence - plain.log_evidence, False
+
+
+def _starts(plain: FieldFit, extra: Extra, rising: FloatArray) -> tuple[list[FloatArray], float]:
+    """Where to look for the mode with a second structure, and a bound on the log evidence gained there."""
+    gains = _gains(plain, rising, extra)
+    best = int(np.argmax(gains))
+    starts, bound = [np.concatenate([plain.mode, one]) for one in rising[best : best + 1]], float(gains[best])
+    if extra == "second lump" and (halves := _split(plain)) is not None:
+        # two lumps that one long bump was laid over: no template beside that bump would find them
+        return [*starts, halves], np.inf
+    return starts, bound
+
+
+def _split(plain: FieldFit) -> FloatArray | None:
+    """Two round lumps in the place of one long one; None where it is not long."""
+    scene, mode = plain.scene, plain.mode
+    p, q, r = (float(v) for v in scene.widths(mode))
+    ratio = float(np.hypot(q, r))
+    if ratio < np.log(LONG) / 2.0 or scene.shape == "round":
+        return None
+    along = 0.5 * np.arctan2(r, q)
+    step = 0.9 * np.exp(p + ratio) * np.array([np.cos(along), np.sin(along)])
+    halves = dict(zip(scene.names, mode, strict=True))
+    halves |= {"u": p - ratio, "v": p - ratio, "r": 0.0}
+    halves |= {"x": halves["x"] - step[0], "y": halves["y"] - step[1]}
+    beside = [halves["x"] + 2.0 * step[0], halves["y"] + 2.0 * step[1], p - ratio]
+    return np.array([*(halves[name] for name in scene.names), *beside])
+
+
+def rises(fit: FieldFit, surroundings: Surroundings, extra: Extra, places: FloatArray) -> BoolArray:
+    """(g,) whether the map rises by a share of the bump's amplitude at places of second lumps or ribs."""
+    scene, target = fit.scene, fit.target
+    amplitude = target.amplitude_at(fit.mode)
+    rise = surroundings.rise(
+        extra,
+        places,
+        bump_mm=(float(scene.column(fit.mode, "x")), float(scene.column(fit.mode, "y"))),
+        bump_width_mm=float(np.exp(scene.widths(fit.mode)[0])),
+        amplitude=amplitude,
+        middle=target.window.middle,
+    )
+    return np.asarray(rise > LEAST_RISE * amplitude)
+
+
+def second_lumps(plain: FieldFit, fitter: Fitter) -> FloatArray:
+    """(g, 3) centres and log widths of the second lumps that are tried, apart from the first."""
+    reach = REACH_IN_RADII * fitter.radius_mm
+    axis = np.arange(-reach, reach + 1e-9, GRID_MM)
+    x, y, w = (v.ravel() for v in np.meshgrid(axis, axis, np.log(GRID_WIDTHS_MM), indexing="ij"))
+    middle = fitter.window.middle
+    p = float(plain.scene.widths(plain.mode)[0])
+    centre = [float(plain.scene.column(plain.mode, name)) for name in "xy"]
+    apart = np.hypot(x + middle[0] - centre[0], y + middle[1] - centre[1]) > (APART + 0.5) * np.exp(np.maximum(p, w))
+    keep = apart & (np.hypot(x, y) < reach)
+    return np.asarray(np.stack([x + middle[0], y + middle[1], w], axis=1)[keep])
+
+
+def ribs(fitter: Fitter) -> FloatArray:
+    """(g, 3) angles, offsets and log widths of the ridges that are tried."""
+    reach = REACH_IN_RADII * fitter.radius_mm
+    offsets = np.arange(-reach + 0.5 * GRID_MM, reach, GRID_MM)
+    angles = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
+    grids = np.meshgrid(angles, offsets, np.log(GRID_WIDTHS_MM), indexing="ij")
+    return np.stack([v.ravel() for v in grids], axis=1)
+
+
+def _apart(plain: FieldFit, ridges: FloatArray) -> FloatArray:
+    """Those of some ridges that a scene may hold with a bump, see `Scene.rib_apart`."""
+    scene = replace(plain.scene, extra="rib")
+    theta = np.column_stack([np.tile(plain.mode, (len(ridges), 1)), ridges])
+    return np.asarray(ridges[scene.rib_apart(theta, plain.target.window.middle)])
+
+
+def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:
+    """(g, 3) those of `ribs` along which the map rises beside a bump."""
+    places = ribs(Fitter.of(plain))
+    return np.asarray(places[rises(plain, surroundings, "rib", places)])
+
+
+def _gains(plain: FieldFit, grid: FloatArray, extra: Extra) -> FloatArray:
+    """(g,) log evidence gained by each template beside the bump at its mode."""
+    window = plain.target.window
+    parts = []
+    for i in range(0, len(grid), BLOCK):
+        one, two, width = grid[i : i + BLOCK].T
+        templates: Profiles = (
+            window.bumps(one, two, p=width, q=np.zeros_like(width), r=None)
+            if extra == "second lump"
+            else window.ridges(one, two, log_width=width)
+        )
+        parts.append(plain.target.gains(templates, plain.mode))
+    return np.asarray(np.concatenate(parts)) if parts else np.array([-np.inf])
+
+
+def _place(fit: FieldFit) -> str:
+    scene, mode = fit.scene, fit.mode
+    width = float(np.exp(scene.column(mode, "w2")))
+    if scene.extra == "second lump":
+        x, y = float(scene.column(mode, "x2")), float(scene.column(mode, "y2"))
+        return f"at ({x:.1f}, {y:.1f}) mm, sigma {width:.1f} mm"
+    angle = float(np.degrees(scene.column(mode, "angle")) + 90.0) % 180.0
+    offset = float(scene.column(mode, "offset"))
+    middle, direction = fit.target.window.middle, float(scene.column(mode, "angle"))
+    centre = [float(scene.column(mode, name)) - m for name, m in zip("xy", middle, strict=True)]
+    away = abs(offset - centre[0] * np.cos(direction) - centre[1] * np.sin(direction))
+    return f"{away:.1f} mm from the lump's centre, along {angle:.0f} deg, sigma {width:.1f} mm"

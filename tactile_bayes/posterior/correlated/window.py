@@ -1,0 +1,211 @@
+r"""A window's cells as a grid, and inner products of many bumps with a few fixed vectors and a field's cosines on it.
+
+A Gaussian along the grid's axes is a product of two profiles, and so are the cosines: an inner product costs the work
+of the grid's rows, not of its cells times the cosines. Cells that the map does not cover have weight 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.correlated.noise import Whitening, cosine_profiles, gram_of_cosines, whitening
+from tactile_bayes.posterior.lump.cells import FitCells
+from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.records import dataclass
+
+RESOLVED = 3.0
+"""Widths above as many cells need no more than a cell's variance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projected:
+    """Inner products of m templates, every cell weighted by its inverse independent variance.
+
+    Parameters
+    ----------
+    low : (m, cosines^2) array
+        With the cosines.
+    plain : (m, c) array
+        With the fixed vectors.
+    square : (m,) array
+        With themselves.
+    """
+
+    low: FloatArray
+    plain: FloatArray
+    square: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profiles:
+    """m templates on the grid: products of `rows` (m, ny) and `columns` (m, nx), or `grid` (m, ny, nx) as it is."""
+
+    rows: FloatArray | None = None
+    columns: FloatArray | None = None
+    grid: FloatArray | None = None
+
+    def full(self) -> FloatArray:
+        """(m, ny, nx) templates."""
+        if self.grid is not None:
+            return self.grid
+        assert self.rows is not None
+        assert self.columns is not None
+        return np.asarray(self.rows[:, :, None] * self.columns[:, None, :])
+
+
+class Window:
+    """The grid of one window, its cosines, and the noise fields of several lengths (prepared when first asked for).
+
+    Parameters
+    ----------
+    cells
+        The window's cells.
+    variance : (k,) array
+        Independent variance of each cell, up to a common factor.
+    cosines
+        Of the noise field along each axis.
+    """
+
+    def __init__(self, cells: FitCells, variance: FloatArray, *, cosines: int = FIELD_COSINES) -> None:
+        self.cells, self.variance, self.cosines = cells, variance, cosines
+        self.x_mm, self._column = np.unique(cells.x_mm, return_inverse=True)
+        self.y_mm, self._row = np.unique(cells.y_mm, return_inverse=True)
+        self.weight = self.on_grid(1.0 / variance)
+        self._across, self._frequency_x = cosine_profiles(self.x_mm, cosines=cosines)
+        self._along, self._frequency_y = cosine_profiles(self.y_mm, cosines=cosines)
+        by_row = self.weight.T[:, :, None] * self._across[:, None, :]
+        self._weighted_across = by_row.reshape(len(self.x_mm), -1)
+        self._fields: dict[float, Whitening] = {}
+        self._gram: FloatArray | None = None
+
+    def on_grid(self, values: FloatArray) -> FloatArray:
+        """(..., ny, nx) grid of (..., k) cell values, 0 where there is no cell."""
+        grid = np.zeros((*values.shape[:-1], len(self.y_mm), len(self.x_mm)))
+        grid[..., self._row, self._column] = values
+        return grid
+
+    def of_cells(self, grid: FloatArray) -> FloatArray:
+        """(..., k) cell values of (..., ny, nx) grids."""
+        return np.asarray(grid[..., self._row, self._column])
+
+    def field(self, length_mm: float) -> Whitening:
+        """The noise field of one correlation length."""
+        if length_mm not in self._fields:
+            if self._gram is None:
+                self._gram = gram_of_cosines(self._along, self._across, weight=self.weight)
+            frequency2 = (self._frequency_y[:, None] + self._frequency_x[None, :]).ravel()
+            self._fields[length_mm] = whitening(self._gram, frequency2, length_mm=length_mm)
+        return self._fields[length_mm]
+
+    def project(self, templates: Profiles, plain: FloatArray) -> Projected:
+        """Inner products of templates with the cosines, with (c, ny, nx) weighted vectors, and with themselves."""
+        if templates.grid is not None:
+            return self._project_grid(templates.grid, plain)
+        rows, columns = templates.rows, templates.columns
+        assert rows is not None
+        assert columns is not None
+        m, c = len(rows), len(plain)
+        half = (columns @ self._weighted_across).reshape(m, len(self.y_mm), self.cosines)
+        low = np.matmul(self._along.T, half * rows[:, :, None]).reshape(m, -1)
+        beside = (columns @ plain.transpose(2, 1, 0).reshape(len(self.x_mm), -1)).reshape(m, -1, c)
+        with_plain = np.matmul(rows[:, None, :], beside)[:, 0]
+        square = np.einsum("mr,mr->m", rows**2, columns**2 @ self.weight.T)
+        return Projected(low, with_plain, square)
+
+    def _project_grid(self, grid: FloatArray, plain: FloatArray) -> Projected:
+        m = len(grid)
+        weighted = grid * self.weight
+        half = (weighted.reshape(-1, len(self.x_mm)) @ self._across).reshape(m, len(self.y_mm), self.cosines)
+        low = np.matmul(self._along.T, half).reshape(m, -1)
+        with_plain = grid.reshape(m, -1) @ plain.reshape(len(plain), -1).T
+        return Projected(low, with_plain, np.einsum("mrc,mrc->m", weighted, grid))
+
+    def product(self, one: Profiles, other: Profiles) -> FloatArray:
+        """(m,) inner products of templates with templates, pairwise."""
+        if one.grid is None and other.grid is None:
+            assert one.rows is not None
+            assert one.columns is not None
+            assert other.rows is not None
+            assert other.columns is not None
+            across = (one.columns * other.columns) @ self.weight.T
+            return np.asarray(np.einsum("mr,mr->m", one.rows * other.rows, across))
+        return np.asarray(np.einsum("mrc,mrc->m", one.full() * self.weight, other.full()))
+
+    def bumps(
+        self, x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, r: FloatArray | None
+    ) -> Profiles:
+        """Cell means of (m,) Gaussians of unit height, blurred; along the grid's axes when r is None."""
+        cell, noise = self.cells.cell_mm, self.cells.pose_noise
+        blur_x, blur_y = (0.0, 0.0) if noise is None else noise.sd_mm
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            if r is None:
+                columns = blurred_profile(self.x_mm - x_mm[:, None], np.exp(p + q), blur_mm=blur_x, cell_mm=cell)
+                rows = blurred_profile(self.y_mm - y_mm[:, None], np.exp(p - q), blur_mm=blur_y, cell_mm=cell)
+                return Profiles(rows, columns)
+            covariance = covariance_from_log_widths(p, q, r)
+            blurred = covariance + np.diag([blur_x**2, blur_y**2])
+            lower = np.sqrt(np.linalg.det(covariance) / np.linalg.det(blurred))
+            across, along = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
+            grid = turned_gaussians(across, along, covariance_mm2=blurred, cell_mm=cell)
+            grid *= lower[:, None, None]
+            return Profiles(grid=grid)
+
+    def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> Profiles:
+        """Straight ridges of unit height, Gaussian across, `offset_mm` from `middle` in direction `angle_rad`."""
+        x, y = self.middle
+        across_x = np.cos(angle_rad)[:, None] * (self.x_mm - x)
+        across_y = np.sin(angle_rad)[:, None] * (self.y_mm - y)
+        distance = across_x[:, None, :] + across_y[:, :, None] - offset_mm[:, None, None]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            # a square cell is as wide as a box of its side in every direction, as far as its variance goes
+            variance = np.exp(2.0 * log_width) + self.cells.cell_mm**2 / 12.0
+            height = np.exp(log_width) / np.sqrt(variance)
+            return Profiles(grid=height[:, None, None] * np.exp(-0.5 * distance**2 / variance[:, None, None]))
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Mean of the cells' centres, mm."""
+        return float(np.mean(self.cells.x_mm)), float(np.mean(self.cells.y_mm))
+
+
+def turned_gaussians(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: FloatArray, cell_mm: float) -> FloatArray:
+    """(m, ny, nx) cell means of turned Gaussians from (m, nx) and (m, ny) distances: `cell_mean_gaussian` on a grid.
+
+    Where every width is above `RESOLVED` cells the fourth cumulant of a cell is left out: below 3e-5 of the height.
+    """
+    wide = covariance_mm2 + cell_mm**2 / 12.0 * np.eye(2)
+    narrow = covariance_mm2[:, 0, 0] * covariance_mm2[:, 1, 1] - covariance_mm2[:, 0, 1] ** 2
+    mean = 0.5 * (covariance_mm2[:, 0, 0] + covariance_mm2[:, 1, 1])
+    least = mean - np.sqrt(np.maximum(mean**2 - narrow, 0.0))
+    if not np.nanmin(least) > (RESOLVED * cell_mm) ** 2:
+        x, y = x_mm[:, None, :], y_mm[:, :, None]
+        return cell_mean_gaussian(x, y, covariance_mm2=covariance_mm2[:, None], cell_mm=cell_mm)
+    det = wide[:, 0, 0] * wide[:, 1, 1] - wide[:, 0, 1] ** 2
+    half = -0.5 / det
+    square = (2.0 * half * -wide[:, 0, 1])[:, None, None] * y_mm[:, :, None] * x_mm[:, None, :]
+    square += (half * wide[:, 1, 1])[:, None, None] * np.square(x_mm)[:, None, :]
+    square += ((half * wide[:, 0, 0])[:, None] * np.square(y_mm))[:, :, None]
+    np.exp(square, out=square)
+    square *= np.sqrt(np.clip(narrow, 0.0, None) / det)[:, None, None]
+    return square
+
+
+def blurred_profile(distance_mm: FloatArray, sigma_mm: FloatArray, *, blur_mm: float, cell_mm: float) -> FloatArray:
+    """`cell_mean_profile` of Gaussians that were of unit height before they were blurred with this SD."""
+    wide = np.hypot(sigma_mm, blur_mm)
+    return (sigma_mm / wide)[:, None] * cell_mean_profile(distance_mm, sigma_mm=wide, cell_mm=cell_mm)
+
+
+def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> FloatArray:
+    """(m, k) means over cells of one-dimensional Gaussians of unit height, the factors of `cell_mean_gaussian`.
+
+    The two corrections of that function's series are multiplied here and added there: a difference of the order of
+    the terms that both leave out.
+    """
+    wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
+    square = distance_mm**2 / wide
+    gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
+    fourth = (square * (square - 6.0) + 3.0) / wide**2
+    return np.asarray(gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))

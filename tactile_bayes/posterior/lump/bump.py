@@ -1,0 +1,151 @@
+"""The scene model of the paper: one Gaussian bump on a level background (Eq 7), with the priors on it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.lump.cells import FitCells
+from tactile_bayes.records import dataclass
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+
+@dataclass(frozen=True, slots=True)
+class BumpPrior:
+    """Proper, weak priors; every one is printed with the estimate.
+
+    Parameters
+    ----------
+    amplitude_sd
+        Normal, centred on 0 and signed: a depression must be able to show itself. In units of the map's scale.
+    width_median_mm, log_width_sd
+        Log-normal on the geometric mean of the two widths.
+    log_ratio_sd
+        Normal on q and r, half the log of the axis ratio (and its direction).
+    tilt_sd
+        Normal on the level's slope along each axis, in units of the map's scale over half a window. It counts where
+        a tilt is weighed against none; once there is one it is flat.
+    """
+
+    amplitude_sd: float = 2.0
+    width_median_mm: float = 5.0
+    log_width_sd: float = 1.0
+    log_ratio_sd: float = 0.5
+    tilt_sd: float = 0.1
+
+    def as_dict(self) -> dict[str, float]:
+        """The numbers, for the report."""
+        return {
+            "amplitude_sd": self.amplitude_sd,
+            "width_median_mm": self.width_median_mm,
+            "log_width_sd": self.log_width_sd,
+            "log_ratio_sd": self.log_ratio_sd,
+            "tilt_sd": self.tilt_sd,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Bump:
+    """Which parameters the model spends: rotation and a free background only where they are asked for.
+
+    The parameter vector is ``(amplitude, x, y, p, q[, r][, background])``: mm for the centre, p and q the log widths
+    of `covariance_from_log_widths`.
+
+    Parameters
+    ----------
+    rotated
+        Whether the axes of the ellipse may turn (adds r).
+    background
+        Fixed level (1 in Eq 7), or None to fit it.
+    scale
+        Unit of amplitude for priors and steps, see `cells.value_scale`.
+    """
+
+    rotated: bool = False
+    background: float | None = 1.0
+    scale: float = 1.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        rotation = ("r",) if self.rotated else ()
+        level = ("background",) if self.background is None else ()
+        return ("amplitude", "x_mm", "y_mm", "p", "q", *rotation, *level)
+
+    @property
+    def step_scale(self) -> FloatArray:
+        """(p,) size over which the model bends in each parameter; steps of the fit are limited in these units."""
+        sizes = {"amplitude": self.scale, "background": self.scale, "x_mm": 2.0, "y_mm": 2.0}
+        return np.array([sizes.get(name, 0.3) for name in self.names])
+
+    def shape_parameters(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """p, q, r of (..., p) parameter vectors; r is 0 when the model has none."""
+        r = theta[..., 5] if self.rotated else np.zeros(theta.shape[:-1])
+        return theta[..., 3], theta[..., 4], r
+
+    def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """sigma_x_mm, sigma_y_mm and angle_rad of (..., p) parameter vectors."""
+        return principal_widths(*self.shape_parameters(theta))
+
+    def level(self, theta: FloatArray) -> FloatArray:
+        """Background of (..., p) parameter vectors."""
+        if self.background is None:
+            return np.asarray(theta[..., -1])
+        return np.full(theta.shape[:-1], self.background)
+
+    def unit_bump(self, theta: FloatArray, cells: FitCells) -> FloatArray:
+        """(m, k) bump of unit amplitude, averaged over each cell, for (m, p) parameter vectors."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            if not self.rotated:
+                return straight_bump(theta[:, 1], theta[:, 2], p=theta[:, 3], q=theta[:, 4], cells=cells)
+            return cell_mean_gaussian(
+                cells.x_mm - theta[:, 1, None],
+                cells.y_mm - theta[:, 2, None],
+                covariance_mm2=covariance_from_log_widths(*self.shape_parameters(theta)),
+                cell_mm=cells.cell_mm,
+            )
+
+    def predict(self, theta: FloatArray, cells: FitCells) -> FloatArray:
+        """(m, k) map values of (m, p) parameter vectors: Eq 7 averaged over the cells."""
+        return self.level(theta)[:, None] + theta[:, 0, None] * self.unit_bump(theta, cells)
+
+    def log_prior(self, theta: FloatArray, prior: BumpPrior) -> FloatArray:
+        """(m,) log density of the priors; flat in the background; the centre's is the window's."""
+        p, q, r = self.shape_parameters(theta)
+        z = [
+            (theta[..., 0] / self.scale / prior.amplitude_sd, prior.amplitude_sd * self.scale),
+            ((p - np.log(prior.width_median_mm)) / prior.log_width_sd, prior.log_width_sd),
+            (q / prior.log_ratio_sd, prior.log_ratio_sd),
+        ]
+        if self.rotated:
+            z.append((r / prior.log_ratio_sd, prior.log_ratio_sd))
+        total = sum(-0.5 * value**2 - np.log(sd * np.sqrt(2 * np.pi)) for value, sd in z)
+        return np.asarray(total)
+
+
+def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, cells: FitCells) -> FloatArray:
+    """(m, k) cell means of Gaussians along the grid's axes: `cell_mean_gaussian` from profiles of rows and columns.
+
+    It is the same formula. Its exponential is a product and its fourth cumulant a sum of what rows and columns have.
+    """
+    column, row = cells.column - cells.column.min(), cells.row - cells.row.min()
+    x, x_fourth = _profile(cells.x_mm, column, centre_mm=x_mm, sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
+    y, y_fourth = _profile(cells.y_mm, row, centre_mm=y_mm, sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
+    bump = (1.0 - y_fourth)[:, :, None] - x_fourth[:, None, :]
+    bump *= x[:, None, :]
+    bump *= y[:, :, None]
+    return np.asarray(bump.reshape(len(bump), -1).take(row * x.shape[1] + column, axis=1))
+
+
+def _profile(
+    place_mm: FloatArray, index: IntArray, *, centre_mm: FloatArray, sigma_mm: FloatArray, cell_mm: float
+) -> tuple[FloatArray, FloatArray]:
+    """(m, n) Gaussians averaged over the cells of an axis to second order, and the share that the fourth takes off."""
+    axis = np.zeros(int(index.max()) + 1)
+    axis[index] = place_mm
+    wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
+    square = (axis - centre_mm[:, None]) ** 2 / wide
+    gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
+    return gaussian, cell_mm**4 / 2880.0 * (square * (square - 6.0) + 3.0) / wide**2

@@ -1,0 +1,1 @@
+"""A bump under independent errors."""

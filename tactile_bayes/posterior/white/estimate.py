@@ -1,0 +1,106 @@
+"""A bump under independent errors, from its least-squares fit to rotation and draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.cache import Solved
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.search import ROTATION_ODDS
+from tactile_bayes.posterior.white.fit import BumpFit, FitOptions, rotation_odds
+from tactile_bayes.posterior.white.residuals import level_offset
+from tactile_bayes.posterior.white.target import Target
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.estimate import EstimateOptions
+
+Progress = Callable[[int, int], None]
+
+
+def chosen_rotation(
+    tactile_map: TactileMap, fit: BumpFit, *, options: FitOptions, prior: BumpPrior
+) -> tuple[BumpFit, float | None]:
+    """The fit, turned where the map asks for it, and the odds of that; None where it was not asked."""
+    if options.rotation != "auto":
+        return fit, None
+    odds, turned = rotation_odds(tactile_map, fit, options=options, prior=prior)
+    return (turned, odds) if turned is not None and odds > ROTATION_ODDS else (fit, odds)
+
+
+def draw_independent(
+    fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None
+) -> tuple[ParameterDraws, dict[str, FloatArray]]:
+    """Draws by the method asked for, and the joint draws by the names of `MapPosterior`."""
+    target = fit.target(options.prior)
+    solved = Solved(lambda theta: (target.excess(theta),))
+    draws = _draw(fit, target, solved, options, rng=rng, progress=progress)
+    theta = draws.theta
+    sigma_x, sigma_y, angle = fit.bump.widths(theta)
+    # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
+    exact = draws.method in ("ensemble", "importance")
+    excess = solved(draws.flat)[0] if exact else fit.linear_excess(draws.flat)
+    return draws, {
+        "amplitude": theta[..., 0],
+        "sigma_x_mm": sigma_x,
+        "sigma_y_mm": sigma_y,
+        "x_mm": theta[..., 1],
+        "y_mm": theta[..., 2],
+        "angle_rad": angle,
+        "background": fit.bump.level(theta),
+        "noise_sd": target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
+    }
+
+
+def _draw(
+    fit: BumpFit,
+    target: Target,
+    solved: Solved,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None,
+) -> ParameterDraws:
+    if options.method == "optimise":
+        from tactile_bayes.inference.optimise import optimise
+
+        return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
+    from tactile_bayes.inference.laplace import laplace, mode_and_covariance
+
+    scale = np.sqrt(np.diag(fit.covariance))
+    if options.method == "laplace":
+        return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
+    mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=scale)
+    if options.method == "importance":
+        from tactile_bayes.inference.importance import importance, importance_options
+
+        try:
+            density = partial(target.solved_density, solved=solved)
+            return importance(density, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
+        except NotConvergedError:
+            pass  # its weights cannot be trusted here; chains need none
+    if options.method in ("importance", "ensemble"):
+        from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
+
+        settings = EnsembleOptions() if options.max_steps is None else EnsembleOptions(max_steps=options.max_steps)
+        return ensemble(target, mode, covariance, rng=rng, options=settings, progress=progress)
+    raise ValueError(f"unknown method {options.method!r}")
+
+
+def judged_noise(fit: BumpFit, odds: float | None) -> dict[str, object]:
+    """What the errors were found to be, for the report."""
+    return {
+        "noise": "independent",
+        "noise_inflation": fit.errors.inflation,
+        "noise_dof": fit.errors.dof,
+        "level_offset": level_offset(fit.fit.residual, weight=fit.weight),
+        "rotation_odds": odds,
+        "rotated": fit.bump.rotated,
+    }

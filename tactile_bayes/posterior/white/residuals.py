@@ -1,0 +1,173 @@
+"""What the residuals of a fit say about the errors of a map: their size, how counts weigh, how far they correlate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.least_squares import inverse_information
+from tactile_bayes.posterior.lump.cells import FitCells
+from tactile_bayes.records import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorModel:
+    """Size and correlation of a map's errors, as a fit's residuals show them.
+
+    Parameters
+    ----------
+    noise_sd
+        Standard deviation of a cell of unit weight.
+    inflation
+        Factor by which correlated errors widen the parameters' variance over that of independent cells; at least 1.
+    dof
+        Effective degrees of freedom of `noise_sd`.
+    """
+
+    noise_sd: float
+    inflation: float
+    dof: float
+
+
+MINIMUM_DOF = 6.0
+"""Tails no heavier than a t with this many degrees of freedom: below it the draws' variance would mean nothing."""
+
+
+def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
+    """Weights from counts: the variance of a cell is ``v / n + delta^2``.
+
+    v is the pooled within-cell variance of a reading, n the count; delta^2 is what is left of the residual variance:
+    the model's own misfit, that more readings do not reduce. So counts weigh where readings are few, and level off
+    where the model, not the sensor, is the limit.
+
+    Parameters
+    ----------
+    residual_variance
+        Mean squared residual of a fit with equal weights.
+
+    Returns
+    -------
+    (k,) array
+        Scaled so that their mean is 1.
+    """
+    reading = cells.reading_variance
+    if not reading > 0:
+        return np.ones(len(cells))
+    misfit = max(residual_variance - reading * float(np.mean(1.0 / cells.count)), 1e-3 * residual_variance)
+    weight = 1.0 / (reading / cells.count + misfit)
+    return np.asarray(weight / weight.mean())
+
+
+def independent_errors(*, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
+    """The size of errors taken as independent, for fits to a model that itself has their correlation."""
+    k, p = jacobian.shape
+    dof = max(k - p, 1)
+    return ErrorModel(float(np.sqrt(weight @ residual**2 / dof)), 1.0, float(dof))
+
+
+def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
+    r"""Judge the errors from a fit's residuals.
+
+    Neighbouring cells share frames and the model's misfit, so their errors correlate. The least-squares estimate stays
+    what it is; its covariance becomes the sandwich :math:`H^{-1} J^T W C W J H^{-1}` with C from the residuals'
+    autocorrelation, and `inflation` is the mean factor over the parameters. Dividing the log-likelihood by it is the
+    magnitude adjustment of composite likelihoods.
+
+    A level and a tilt are taken out of the residuals first. They are the misfit of a fixed background, which the maps
+    that a size calibration was learned from share; `level_offset` reports it instead.
+
+    References
+    ----------
+    Chandler & Bate (2007), Biometrika 94:167; Pauli, Racugno & Ventura (2011), Statistica Sinica 21:149.
+    """
+    k, p = jacobian.shape
+    dof = max(k - p, 1)
+    residual = residual - fitted_tilt(cells, residual, weight=weight)
+    noise_variance = float(weight @ residual**2) / dof
+    if not noise_variance > 0 or k <= p:
+        return ErrorModel(float(np.sqrt(max(noise_variance, 0.0))), 1.0, float(dof))
+    white = residual * np.sqrt(weight / noise_variance)
+    grid = _on_grid(cells, white)
+    correlation, half = residual_autocorrelation(*grid)
+    root = jacobian * np.sqrt(weight)[:, None]
+    information = inverse_information(jacobian, weight)
+    if not np.isfinite(information).all():
+        return ErrorModel(float(np.sqrt(noise_variance)), 1.0, float(dof))
+    smeared = _correlate_columns(cells, root, correlation, half)
+    inflation = float(np.trace(information @ (root.T @ smeared)) / p)
+    inflation = float(np.clip(inflation, 1.0, k / (p + MINIMUM_DOF)))
+    return ErrorModel(float(np.sqrt(noise_variance)), inflation, max(dof / inflation, MINIMUM_DOF))
+
+
+def fitted_tilt(cells: FitCells, residual: FloatArray, *, weight: FloatArray) -> FloatArray:
+    """(k,) weighted least-squares plane through the residuals; zeros where there are too few cells for one."""
+    if len(cells) < 12:
+        return np.zeros(len(cells))
+    design = np.stack([np.ones(len(cells)), cells.x_mm - cells.x_mm.mean(), cells.y_mm - cells.y_mm.mean()], axis=1)
+    root = np.sqrt(weight)
+    solution = np.linalg.lstsq(design * root[:, None], residual * root, rcond=None)[0]
+    return np.asarray(design @ solution)
+
+
+def level_offset(residual: FloatArray, *, weight: FloatArray) -> float:
+    """Mean residual of the window: how far the map's level lies from the background that the fit assumed."""
+    return float(weight @ residual / weight.sum())
+
+
+def _on_grid(cells: FitCells, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Values on the smallest grid that holds the cells, and a mask of where they are."""
+    row, column = cells.row - cells.row.min(), cells.column - cells.column.min()
+    grid = np.zeros((int(row.max()) + 1, int(column.max()) + 1))
+    mask = np.zeros_like(grid)
+    grid[row, column] = values
+    mask[row, column] = 1.0
+    return grid, mask
+
+
+def residual_autocorrelation(grid: FloatArray, mask: FloatArray) -> tuple[FloatArray, int]:
+    """Radial autocorrelation of whitened residuals out to where it first falls below its own noise.
+
+    Returns
+    -------
+    correlation : (2 half + 1, 2 half + 1) array
+        By lag in cells, 1 in the middle; isotropic, and 0 beyond the first lag that is not clearly positive.
+    half
+        Largest lag kept, in cells.
+    """
+    ny, nx = grid.shape
+    size = (2 * ny, 2 * nx)
+    spectrum = np.fft.rfft2(grid, size)
+    cover = np.fft.rfft2(mask, size)
+    products = np.fft.irfft2(np.abs(spectrum) ** 2, size)
+    pairs = np.round(np.fft.irfft2(np.abs(cover) ** 2, size))
+    lag_y = np.fft.fftfreq(2 * ny, 1 / (2 * ny))[:, None]
+    lag_x = np.fft.fftfreq(2 * nx, 1 / (2 * nx))[None, :]
+    ring = np.round(np.hypot(lag_y, lag_x)).astype(int)
+    most = max(1, min(ny, nx) // 2)
+    near = (ring <= most) & (pairs > 0)
+    total = np.bincount(ring[near], products[near], most + 1)
+    number = np.bincount(ring[near], pairs[near], most + 1)
+    radial = total / np.maximum(number, 1)
+    radial = radial / radial[0] if radial[0] > 0 else np.eye(1, most + 1)[0]
+    quiet = np.flatnonzero(radial < 2.0 / np.sqrt(np.maximum(number / 2.0, 1.0)))
+    half = int(quiet[0]) - 1 if len(quiet) else most
+    axis = np.arange(-half, half + 1)
+    lag = np.round(np.hypot(axis[:, None], axis[None, :])).astype(int)
+    return np.where(lag <= half, radial[np.minimum(lag, most)], 0.0), half
+
+
+def _correlate_columns(cells: FitCells, columns: FloatArray, correlation: FloatArray, half: int) -> FloatArray:
+    """``C @ columns`` for the stationary correlation on the cells' grid."""
+    if half == 0:
+        return columns
+    row, column = cells.row - cells.row.min(), cells.column - cells.column.min()
+    ny, nx = int(row.max()) + 1, int(column.max()) + 1
+    size = (ny + 2 * half, nx + 2 * half)
+    kernel = np.fft.rfft2(correlation, size)
+    out = np.empty_like(columns)
+    for j in range(columns.shape[1]):
+        grid = np.zeros((ny, nx))
+        grid[row, column] = columns[:, j]
+        full = np.fft.irfft2(np.fft.rfft2(grid, size) * kernel, size)
+        out[:, j] = full[half : half + ny, half : half + nx][row, column]
+    return out

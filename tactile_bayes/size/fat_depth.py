@@ -1,0 +1,182 @@
+r"""A size calibration that knows how deep the fat under the head is, because the head's own pressure tells.
+
+Amplitude and width alone leave the lump's seat open: how far it stands out of the gland. Where no lump lies, the
+pressure over the head depends on the depth F of the fat-gland boundary, so the profile tells F. ln d is then a full
+cubic in :math:`u = \ln a - \alpha_0`, :math:`v = p - p_0` and :math:`w = \ln F - w_0`, which at one depth is a cubic in
+u and v. F is found by a quadratic learned over the same bodies; its error is part of what the cubic was learned with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import field
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.polynomials import monomials, powers
+
+ORDER = 3
+POWERS = tuple((i, j, k) for k in range(ORDER + 1) for i, j in powers(ORDER - k))
+"""Of u, v and w in the twenty terms of the cubic."""
+ROUND = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
+"""The same for what makes a ball's map oval."""
+SPREADS = 3
+"""Parameters after the coefficients: those of `log_quadratic.PARAMETERS`."""
+MOST_LEVERAGE = 1.0
+"""A profile is unlike the table's where its leverage exceeds this multiple of the table's largest."""
+
+
+def head_profile(quality: Mapping[str, float]) -> tuple[float, ...] | None:
+    """`HEAD_PROFILE` of a map from its figures; None where it has none, as an imported grid."""
+    values = tuple(float(quality.get(name, np.nan)) for name in HEAD_PROFILE)
+    return values if np.isfinite(values).all() else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FatDepth:
+    """ln F as a full quadratic in the profile.
+
+    Parameters
+    ----------
+    centre, scale : (3,) arrays
+        Of `HEAD_PROFILE`.
+    coefficients : (10,) array
+        Of 1, the three, and their products.
+    information_inverse : (10, 10) array
+        For the leverage of a new profile.
+    most_leverage
+        Largest in the table.
+    log_sd
+        How far single exams of the table lie from the truth.
+    """
+
+    centre: FloatArray
+    scale: FloatArray
+    coefficients: FloatArray
+    information_inverse: FloatArray
+    most_leverage: float
+    log_sd: float
+
+    def terms(self, profile: FloatArray) -> FloatArray:
+        """(..., 10) terms of (..., 3) profiles."""
+        return profile_terms((profile - self.centre) / self.scale)
+
+    def log_depth(self, profile: FloatArray) -> FloatArray:
+        """(...) ln F, F in mm, of (..., 3) profiles."""
+        return np.asarray(self.terms(profile) @ self.coefficients)
+
+    def unlike(self, profile: FloatArray) -> FloatArray:
+        """(...) leverage over the table's largest."""
+        x = self.terms(profile)
+        return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FatCubic:
+    """The calibration for maps with a profile; made by `learn_fat_cubic`.
+
+    Parameters
+    ----------
+    depth
+        From profile to F.
+    centre
+        alpha_0, p_0 and w_0.
+    mean, covariance : (23,), (23, 23) arrays
+        Posterior of the coefficients of `POWERS` and of the three spreads.
+    round_coefficients : (6,) array
+        Of `ROUND` in q0, see `RoundLumps`.
+    round_sd
+        Its spreads between bodies and between exams.
+    information_inverse : (20, 20) array
+    most_leverage
+        As in `LogQuadratic`.
+    fat_mm
+        Range of F in the table.
+    hidden
+        As in `LogQuadratic`, with (k, 20) `expected`.
+    fit
+        Figures of the fit.
+    """
+
+    depth: FatDepth
+    centre: tuple[float, float, float]
+    mean: FloatArray
+    covariance: FloatArray
+    round_coefficients: FloatArray
+    round_sd: tuple[float, float]
+    information_inverse: FloatArray
+    most_leverage: float
+    fat_mm: tuple[float, float]
+    hidden: HiddenTerms | None = None
+    fit: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        k = len(POWERS) + SPREADS
+        shapes = {"mean": (k,), "covariance": (k, k), "round_coefficients": (len(ROUND),)}
+        shapes["information_inverse"] = (len(POWERS), len(POWERS))
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise BadDataError(f"fat_cubic.{name} is no finite {shape}", way_out="learn the calibration anew")
+
+    def depths_apart(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float, float] | None:
+        """Least and largest depth of fat in mm by the profiles of maps, where they can hardly be of one body.
+
+        None where they agree to three SDs of a difference between two exams, or where fewer than two tell a depth.
+        """
+        known = np.array([one for one in profiles if one is not None], dtype=np.float64).reshape(
+            -1, len(self.depth.centre)
+        )
+        log_depth = self.depth.log_depth(known[self.depth.unlike(known) <= MOST_LEVERAGE])
+        if len(log_depth) < 2 or np.ptp(log_depth) <= 3.0 * np.sqrt(2.0) * self.depth.log_sd:
+            return None
+        return float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))
+
+    def log_depth(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float | None, str]:
+        """ln F of a mass from the profiles of its maps, and why there is none.
+
+        Profiles unlike the table's are left out; those of one mass are averaged, for its exams share the body.
+        """
+        known = np.array([one for one in profiles if one is not None], dtype=np.float64)
+        if not len(known):
+            return None, "the map has no pressure profile of the head"
+        like = self.depth.unlike(known) <= MOST_LEVERAGE
+        if not like.any():
+            return None, "the head's pressure profile is unlike any of the calibration's"
+        log_depth = float(self.depth.log_depth(known[like]).mean())
+        low, high = self.fat_mm
+        if not low <= np.exp(log_depth) <= high:
+            return (
+                None,
+                f"the fat under the head is {np.exp(log_depth):.3g} mm deep (table: {low:.3g} to {high:.3g} mm)",
+            )
+        return log_depth, ""
+
+    def contraction(self, log_depth: float) -> FloatArray:
+        """(10, 20) matrix: what the coefficients come to at one depth, in the order of `monomials.powers`."""
+        w, left = log_depth - self.centre[2], powers(ORDER)
+        found = np.zeros((len(left), len(POWERS)))
+        for column, (i, j, k) in enumerate(POWERS):
+            found[left.index((i, j)), column] = w**k
+        return found
+
+    def round_lumps(self, log_depth: float) -> RoundLumps:
+        """What a ball's map looks like at one depth."""
+        c, w = self.round_coefficients, log_depth - self.centre[2]
+        return RoundLumps(np.asarray(c[:3] + w * c[3:]), *self.round_sd)
+
+
+def cubic_terms(u: FloatArray, v: FloatArray, w: FloatArray) -> FloatArray:
+    """(n, 20) terms `POWERS`."""
+    return monomials((u, v, w), POWERS)
+
+
+def profile_terms(z: FloatArray) -> FloatArray:
+    """(..., 10) terms of a full quadratic in (..., 3) values."""
+    i, j = np.triu_indices(z.shape[-1])
+    return np.concatenate([np.ones((*z.shape[:-1], 1)), z, z[..., i] * z[..., j]], axis=-1)

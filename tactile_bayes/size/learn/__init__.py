@@ -1,0 +1,1 @@
+"""Learn a size calibration from known lumps."""

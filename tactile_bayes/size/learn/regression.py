@@ -1,0 +1,253 @@
+r"""How ln d depends on what the maps of a population show, when each body was examined one or more times.
+
+For the means over the exams of body j, with what the maps themselves leave open (m, from their posteriors) known,
+
+.. math:: \ln d_j = \bar x_j^T\beta + B_j + \bar E_j, \quad B_j \sim N(0, s_j^2),\;
+          \bar E_j \sim N(0, (t^2 + \bar m_j) / n_j).
+
+t comes from how the exams of one body differ in :math:`x^T\beta`. That difference says nothing of beta: a body has one
+diameter, so within it a regression of d on the map has slope 0 (errors in variables). Coefficients, spread between
+bodies and spread between exams are so told apart, and a patient's map adds its own m and nothing twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import ndtri
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.laplace import mode_and_covariance
+from tactile_bayes.presets import HELD
+from tactile_bayes.size.hidden import HiddenTerms
+
+Terms = Callable[[FloatArray, FloatArray], FloatArray]
+"""Takes (n,) ln a and p of a table's rows to (n, k) terms."""
+# Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
+_PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PopulationTable:
+    """Maps of known lumps, one map a row.
+
+    Parameters
+    ----------
+    body : (n,) array of int or str
+        Rows of one name are exams of one body.
+    d_mm, log_amplitude, log_width, half_log_ratio : (n,) arrays
+        True diameter; ln a, p and q of the map.
+    covariance : (n, 3, 3) array
+        Posterior covariance of the latter three.
+    unknowns
+        (n,) arrays of what was varied and no map shows, by name; logarithms of those in `LOGGED`.
+    profile : (n, 3) array
+        `presets.HEAD_PROFILE` of each map, NaN for a map without; None where no map has it.
+    log_fat : (n,) array
+        ln of the depth of the fat-gland boundary in mm; None with `profile`.
+    """
+
+    body: np.ndarray[tuple[int], np.dtype[np.generic]]
+    d_mm: FloatArray
+    log_amplitude: FloatArray
+    log_width: FloatArray
+    half_log_ratio: FloatArray
+    covariance: FloatArray
+    unknowns: Mapping[str, FloatArray] = field(default_factory=dict)
+    profile: FloatArray | None = None
+    log_fat: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.d_mm)
+
+    def rows(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> PopulationTable:
+        """The rows for which `keep` is true."""
+        return PopulationTable(
+            self.body[keep],
+            self.d_mm[keep],
+            self.log_amplitude[keep],
+            self.log_width[keep],
+            self.half_log_ratio[keep],
+            self.covariance[keep],
+            {name: values[keep] for name, values in self.unknowns.items()},
+            None if self.profile is None else self.profile[keep],
+            None if self.log_fat is None else self.log_fat[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyRegression:
+    """The table as the likelihood needs it: rows for maps, and their means over the exams of each body.
+
+    Parameters
+    ----------
+    terms : (n, k) array
+        What ln d is linear in; the second is u.
+    log_d, map_variance, group : (n,) arrays
+        ln d; variance of the predicted ln d by the map's own posterior; number of the body.
+    exams, mean_terms, mean_log_d
+        Of the bodies.
+    """
+
+    terms: FloatArray
+    log_d: FloatArray
+    map_variance: FloatArray
+    group: np.ndarray[tuple[int], np.dtype[np.intp]]
+    exams: FloatArray
+    mean_terms: FloatArray
+    mean_log_d: FloatArray
+
+    @classmethod
+    def of(cls, table: PopulationTable, terms_of: Terms) -> BodyRegression:
+        """The regression of a table on the terms of its ln a and p."""
+        terms, log_d = terms_of(table.log_amplitude, table.log_width), np.log(table.d_mm)
+        group = np.asarray(np.unique(table.body, return_inverse=True)[1])
+        exams = np.bincount(group).astype(np.float64)
+        mean_terms = np.stack([np.bincount(group, column) / exams for column in terms.T], axis=1)
+        b = np.linalg.lstsq(mean_terms, np.bincount(group, log_d) / exams, rcond=None)[0]
+        slope = _slopes(table, terms_of) @ b
+        variance = np.einsum("in,nij,jn->n", slope, table.covariance[:, :2, :2], slope)
+        return cls(terms, log_d, variance, group, exams, mean_terms, np.bincount(group, log_d) / exams)
+
+    @property
+    def groups(self) -> int:
+        """Number of bodies."""
+        return len(self.exams)
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """(groups,) means of (n,) values over the exams of each body."""
+        return np.asarray(np.bincount(self.group, values) / self.exams)
+
+    def least_squares(self) -> FloatArray:
+        """(k,) coefficients by ordinary least squares of the bodies' means."""
+        return np.asarray(np.linalg.lstsq(self.mean_terms, self.mean_log_d, rcond=None)[0])
+
+    def log_exam_sd(self, coefficients: FloatArray) -> tuple[float, float]:
+        """ln t and its variance: how sizes by the quadratic differ within a body beyond their maps' own noise.
+
+        Without bodies examined twice, the prior.
+        """
+        freedom = len(self.group) - self.groups
+        if freedom < 1:
+            return float(_PRIOR[2, 0]), float(_PRIOR[2, 1] ** 2)
+        k = self.terms.shape[1]
+        size = self.terms @ coefficients[:k]
+        within = float(np.sum((size - self.mean(size)[self.group]) ** 2) / freedom)
+        repeated = self.exams[self.group] > 1
+        beyond = max(within - float(self.map_variance[repeated].mean()), (0.1 * np.exp(_PRIOR[2, 0])) ** 2)
+        return float(0.5 * np.log(beyond)), float(0.5 * (within / beyond) ** 2 / freedom)
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """(m,) log posterior of (m, k + 2) coefficients, ln(sd between bodies) and its slope."""
+        exam = np.exp(2 * self.log_exam_sd(self.least_squares())[0])
+        residual = self.mean_log_d - theta[:, :-2] @ self.mean_terms.T
+        variance = np.exp(2 * (theta[:, -2:-1] + theta[:, -1:] * self.mean_terms[:, 1]))
+        variance = variance + (exam + self.mean(self.map_variance)) / self.exams
+        total = -0.5 * np.sum(np.log(variance) + residual**2 / variance, axis=1)
+        prior = -0.5 * np.sum(((theta[:, -2:] - _PRIOR[:2, 0]) / _PRIOR[:2, 1]) ** 2, axis=1)
+        return np.asarray(total + prior)
+
+    def body_residuals(self, mode: FloatArray) -> FloatArray:
+        """(groups,) residual of each body's mean."""
+        return np.asarray(self.mean_log_d - self.mean_terms @ mode[:-3])
+
+    def posterior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance, taken as normal: k coefficients, ln(sd between bodies), its slope, ln(sd between exams).
+
+        Raises
+        ------
+        NotConvergedError
+            When there is no mode.
+        """
+        b = self.least_squares()
+        left = float(np.var(self.mean_log_d - self.mean_terms @ b))
+        errors = np.sqrt(left * np.diag(np.linalg.inv(self.mean_terms.T @ self.mean_terms)))
+        start, scale = np.append(b, _PRIOR[:2, 0]), np.append(errors, [0.1, 0.05])
+        mode, covariance, _ = mode_and_covariance(self.log_density, start, scale=scale)
+        log_exam_sd, its_variance = self.log_exam_sd(mode)
+        covariance = np.pad(covariance, (0, 1))
+        covariance[-1, -1] = its_variance
+        return np.append(mode, log_exam_sd), covariance
+
+    def oval(self, table: PopulationTable, design: FloatArray) -> tuple[FloatArray, float, float]:
+        """What makes a ball's map oval: coefficients of q0 in the (n, c) design, its spread between bodies and exams.
+
+        By least squares over the balls, the two spreads by analysis of variance.
+        """
+        coefficients = np.asarray(np.linalg.lstsq(design, table.half_log_ratio, rcond=None)[0])
+        excess = table.half_log_ratio - design @ coefficients
+        mean = self.mean(excess)
+        freedom = len(excess) - self.groups
+        map_variance = float(np.median(table.covariance[:, 2, 2]))
+        within = float(np.sum((excess - mean[self.group]) ** 2) / freedom) if freedom > 0 else map_variance
+        between = float(np.var(mean) - within * np.mean(1.0 / self.exams))
+        return coefficients, float(np.sqrt(max(between, 0.0))), float(np.sqrt(max(within - map_variance, 0.0)))
+
+    def leverage(self) -> tuple[FloatArray, float]:
+        """(k, k) inverse of X^T X over the table's maps, and the largest leverage of one of them."""
+        inverse = np.asarray(np.linalg.inv(self.terms.T @ self.terms), dtype=np.float64)
+        return inverse, float(np.einsum("ni,ij,nj->n", self.terms, inverse, self.terms).max())
+
+
+def _slopes(table: PopulationTable, terms_of: Terms) -> FloatArray:
+    """(2, n, k) derivatives of the terms by ln a and p, by central differences."""
+    a, p, h = table.log_amplitude, table.log_width, 1e-4
+    by_a = (terms_of(a + h, p) - terms_of(a - h, p)) / (2 * h)
+    by_p = (terms_of(a, p + h) - terms_of(a, p - h)) / (2 * h)
+    return np.stack([by_a, by_p])
+
+
+def hidden_terms(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> HiddenTerms | None:
+    """Joint second moments of B and of what was varied, each about what the map leads one to expect of it."""
+    if not table.unknowns:
+        return None
+    design = data.mean_terms
+    varied = np.stack([data.mean(values) for values in table.unknowns.values()], axis=1)
+    both = np.concatenate([varied, data.body_residuals(mode)[:, None]], axis=1)
+    coefficients = np.linalg.lstsq(design, both, rcond=None)[0]
+    rest = both - design @ coefficients
+    moments = np.asarray(rest.T @ rest / max(data.groups - int(design.shape[1]), 1), dtype=np.float64)
+    return HiddenTerms(
+        names=tuple(table.unknowns),
+        expected=np.asarray(coefficients.T[:-1]),
+        covariance=moments[:-1, :-1],
+        with_body=moments[:-1, -1],
+        body_variance=float(moments[-1, -1]),
+    )
+
+
+def figures(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> dict[str, float]:
+    """Rows, spreads, and the errors of masses when each body is left out of the fit in turn."""
+    error = left_out_errors(data.mean_terms, data.mean_log_d)
+    return {
+        "maps": float(len(table)),
+        "bodies": float(data.groups),
+        "body_sd": float(np.exp(mode[-3])),
+        "exam_sd": float(np.exp(mode[-1])),
+        "left_out_sd": float(error.std()),
+        "left_out_mae_percent": float(100 * np.mean(np.abs(np.expm1(error)))),
+        "left_out_bias_percent": float(100 * np.mean(np.expm1(error))),
+        "left_out_held_percent": 100 * held(data, mode, error),
+    }
+
+
+def held(data: BodyRegression, mode: FloatArray, error: FloatArray) -> float:
+    """Share of the bodies left out whose size lies in the interval of `HELD` by the spreads that were learned."""
+    leverage = _leverage(data.mean_terms)
+    spread = np.exp(2 * (mode[-3] + mode[-2] * data.mean_terms[:, 1]))
+    spread = spread + (np.exp(2 * mode[-1]) + data.mean(data.map_variance)) / data.exams
+    return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(spread / (1.0 - leverage))))
+
+
+def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
+    """(n,) ln(predicted / true size) of each row when it is left out of the least-squares fit, in closed form."""
+    inverse = np.linalg.inv(terms.T @ terms)
+    residual = log_d - terms @ (inverse @ (terms.T @ log_d))
+    return np.asarray(-residual / (1.0 - _leverage(terms)))
+
+
+def _leverage(terms: FloatArray) -> FloatArray:
+    """(n,) weight of each row in its own least-squares prediction."""
+    return np.asarray(np.einsum("ni,ij,nj->n", terms, np.linalg.inv(terms.T @ terms), terms))

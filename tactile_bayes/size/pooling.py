@@ -1,0 +1,418 @@
+r"""Sizes from the maps of one mass, one or several, through the log-quadratic calibration.
+
+Map i gives :math:`g_i`, the log size by the calibration's quadratic, with its own noise. Maps of one mass differ by
+more than that: :math:`g_i = \ln d - B + E_i`, with :math:`E_i \sim N(0, \tau^2)` between maps. tau is learned from the
+maps at hand with a prior centred on the paper's 15 %; one map says nothing about it, so there the prior speaks. B, what
+no map shows of a body, is common to all of them and does not average out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
+
+import numpy as np
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import REPLICATES, Labels, even_replicates
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.paired import evened, paired_points
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.calibration_range import extrapolated
+from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, turned
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.posterior import SizePosterior
+
+OUTLYING = 3.0
+POOLED_DRAWS = 8192
+DIMENSIONS = 6
+"""Of the points: ln d given tau and the spread of B, these two, oval or round, and the two components of an oval."""
+MOST_INVALID = 0.05
+_GRID = np.geomspace(1e-3, 1.5, 240)
+
+
+@dataclass(frozen=True, slots=True)
+class BetweenMaps:
+    """Prior on tau, the standard deviation of ln d between maps of one mass: log-normal.
+
+    Parameters
+    ----------
+    median
+        0.15 in the paper (section 4: within-mass SD 15 %); 0 leaves the term out.
+    log_sd
+        0 takes the median as known.
+    """
+
+    median: float = 0.15
+    log_sd: float = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class SizePriors:
+    """What the size of a mass assumes besides its calibration.
+
+    Parameters
+    ----------
+    known
+        Properties of the body that somebody knows, by the names of `HiddenTerms`.
+    """
+
+    between_maps: BetweenMaps = field(default_factory=BetweenMaps)
+    shape: ShapePrior = field(default_factory=ShapePrior)
+    known: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShapeDraws:
+    """Joint draws of what one map shows, each (n,).
+
+    Parameters
+    ----------
+    log_amplitude, log_width
+        ln a, and p, the log of the geometric mean width in mm.
+    q, r
+        Half log axis ratio along the map's x axis and 45 degrees from it.
+    turn_rad
+        From the axes that the maps of a mass share to this map's.
+    profile
+        `presets.HEAD_PROFILE` of the map; None where it has none.
+    labels
+        Of the draws' independent replicates, as `ParameterDraws.labels`.
+    """
+
+    log_amplitude: FloatArray
+    log_width: FloatArray
+    q: FloatArray
+    r: FloatArray
+    turn_rad: float = 0.0
+    profile: tuple[float, ...] | None = None
+    labels: Labels | None = None
+
+    @property
+    def replicates(self) -> Labels:
+        """(n,) label of the independent replicate of each draw."""
+        return even_replicates(len(self.q)) if self.labels is None else self.labels
+
+    @property
+    def order(self) -> tuple[float, ...]:
+        """What maps are put in order by before they are pooled."""
+        return tuple(float(np.nansum(v)) for v in (self.log_width, self.log_amplitude, self.q, self.r))
+
+    @classmethod
+    def of(
+        cls,
+        amplitude: FloatArray,
+        sigma_x_mm: FloatArray,
+        sigma_y_mm: FloatArray,
+        angle_rad: FloatArray,
+        *,
+        turn_rad: float = 0.0,
+        profile: tuple[float, ...] | None = None,
+        labels: Labels | None = None,
+    ) -> ShapeDraws:
+        """From draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            log_a = np.log(np.where(amplitude > 0, amplitude, np.nan)).ravel()
+        half = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel()
+        angle = angle_rad.ravel()
+        p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
+        return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad, profile, labels)
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Medians of the amplitude and of the geometric mean width in mm."""
+        amplitude, sigma_mm = (float(np.exp(np.nanmedian(v))) for v in (self.log_amplitude, self.log_width))
+        return amplitude, sigma_mm
+
+    def rows(self, index: Labels) -> ShapeDraws:
+        """Some of the draws, as if independent."""
+        drawn = {name: getattr(self, name)[index] for name in ("log_amplitude", "log_width", "q", "r")}
+        return replace(self, **drawn, labels=None)
+
+
+def pooled_size(
+    maps: Sequence[ShapeDraws],
+    *,
+    calibration: LogQuadratic,
+    priors: SizePriors,
+    rng: np.random.Generator,
+    number: int | None = None,
+) -> SizePosterior:
+    """Size of a mass from its maps, with the calibration for the depth of fat that they tell.
+
+    Parameters
+    ----------
+    maps
+        One for each map on which the lump was found.
+    number
+        Draws of the result; None keeps those of a single map one by one.
+
+    Returns
+    -------
+    SizePosterior
+        Draws of shape (n,). `figures` holds ``between_map_sd`` (median), ``oval_probability``,
+        ``oval_half_log_ratio`` and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
+
+    Notes
+    -----
+    Given tau and the spread of B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau,
+    the spread of B and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
+    maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
+    """
+    calibration = calibration.at_fat([one.profile for one in maps])
+    used, replicates = _matched(maps, number, rng)
+    by_map = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
+    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
+    log_size = by_map if used is maps else [calibration.log_size(m.log_amplitude, m.log_width) for m in maps]
+    centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
+    tau = _between_at(points[:, 1], centre, noise, priors.between_maps)
+    weight = 1.0 / (noise[:, None] + tau**2 + 1e-12)
+    weight /= weight.sum(axis=0)
+    z, score = normal_quantile(points[:, [0, 2]].T)
+    known, variances = _left_open(used, calibration, priors, tau=tau, weight=weight, score=score)
+    map_part = np.sum(weight * by_map, axis=0)
+    oval, slope = _elongation(maps, calibration, priors.shape)
+    half = oval.at(points[:, 3:])
+    longer = np.hypot(half[:, 0], half[:, 1])
+    # round and oval draws are evened apart: a round lump's two sizes stay equal
+    mean, sd = map_part + known + longer, np.sqrt(sum(variances.values()))
+    log_largest = evened(mean + sd * z, mean, sd, 2 * replicates + (longer > 0))
+    log_smallest, o = log_largest.copy(), longer > 0
+    shorter = 2.0 * longer[o]
+    log_smallest[o] = evened(log_largest[o] - shorter, mean[o] - shorter, sd[o], replicates[o])
+    wide = half[:, 0] >= 0
+    share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(one)) for name, one in variances.items()}}
+    figures = {
+        "between_map_sd": float(np.median(tau)),
+        "oval_probability": oval.probability,
+        "oval_half_log_ratio": oval.magnitude,
+        "width_slope": slope,
+        **({f"weight_{i + 1}": float(w) for i, w in enumerate(weight.mean(axis=1))} if len(maps) > 1 else {}),
+    }
+    return SizePosterior(
+        np.exp(np.where(wide, log_largest, log_smallest)),
+        np.exp(np.where(wide, log_smallest, log_largest)),
+        _shares(share | {"shape": float(np.var(longer))}),
+        int((~np.isfinite(mean)).sum()),
+        replicates,
+        figures,
+        outlying_maps(centre, noise, priors.between_maps),
+    )
+
+
+def _matched(
+    maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
+) -> tuple[Sequence[ShapeDraws], Labels]:
+    """As many draws of each map, replicates beside replicates, and their labels."""
+    if number is None and len(maps) == 1:
+        return maps, maps[0].replicates
+    replicates = even_replicates(len(maps[0].q) if number is None else number)
+    return [m.rows(_picked(m.replicates, replicates, rng)) for m in maps], replicates
+
+
+def _picked(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
+    """Places of draws whose labels are the wanted ones, each draw of a replicate as often as the others."""
+    index = np.empty(len(wanted), dtype=np.intp)
+    for label in range(REPLICATES):
+        members, places = np.flatnonzero(have == label), np.flatnonzero(wanted == label)
+        members = members if len(members) else np.arange(len(have))
+        index[places] = rng.permutation(np.resize(rng.permutation(members), len(places)))
+    return index
+
+
+def _left_open(
+    maps: Sequence[ShapeDraws],
+    calibration: LogQuadratic,
+    priors: SizePriors,
+    *,
+    tau: FloatArray,
+    weight: FloatArray,
+    score: FloatArray,
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """What the maps leave open of ln d, a normal a draw: its mean, and its variances by source.
+
+    Parameters
+    ----------
+    maps
+        k maps with n draws each.
+    tau : (n,) array
+    weight : (k, n) array
+        Of the maps, for each tau.
+    score : (n,) array
+        Normal scores of the uncertain spread of B.
+    """
+    log_a, log_width = (np.stack([getattr(m, name) for m in maps]) for name in ("log_amplitude", "log_width"))
+    middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
+    terms = np.sum(weight[..., None] * calibration.terms(log_a, log_width), axis=0)
+    body_sd, shift, error = calibration.body_and_error(terms, middle_a, score)
+    expected, left = _known_body(calibration, priors.known, middle_a, middle_width)
+    return expected + shift, {
+        "between_maps": np.sum(weight**2, axis=0) * tau**2,
+        "calibration": error,
+        "body": (left * body_sd) ** 2,
+    }
+
+
+def fat_left_out(why: str) -> str:
+    """What sizes do without where maps do not tell the depth of the fat."""
+    return f"the depth of the fat, which would narrow the size: {why}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PooledEstimate:
+    """The answer for one mass.
+
+    Parameters
+    ----------
+    status, reason
+        As of `Estimate`.
+    size
+        None without an estimate.
+    centres
+        ln d by each map alone, by its place in the list; maps without a lump are missing.
+    outlying
+        Places of the maps that lie apart from the rest.
+    outside
+        How maps lie outside the calibration's table, in words.
+    calibration
+        The one used: for the depth of fat that the maps tell, where they do.
+    fat_apart_mm
+        Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise.
+    """
+
+    status: str
+    reason: str
+    size: SizePosterior | None = None
+    centres: Mapping[int, float] = field(default_factory=dict)
+    outlying: tuple[int, ...] = ()
+    outside: tuple[str, ...] = ()
+    calibration: LogQuadratic | None = None
+    fat_apart_mm: tuple[float, float] | None = None
+
+
+def pool_maps(
+    shapes: Sequence[ShapeDraws | None],
+    *,
+    calibration: LogQuadratic,
+    priors: SizePriors,
+    rng: np.random.Generator,
+) -> PooledEstimate:
+    """One size from the maps of a mass; None stands for a map on which no lump was found.
+
+    When fewer than half of the maps show the lump there is no size: those that do may be the noise's.
+    """
+    found = [i for i, shape in enumerate(shapes) if shape is not None]
+    if 2 * len(found) < len(shapes) or not found:
+        return PooledEstimate("no_estimate", f"a lump was found on {len(found)} of {len(shapes)} maps")
+    # one order whatever the caller's, so that the order leaves no trace in the draws
+    in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
+    used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
+    profiles = [one.profile for one in used]
+    fat_apart_mm = None if calibration.fat_cubic is None else calibration.fat_cubic.depths_apart(profiles)
+    calibration = calibration.at_fat(profiles)
+    middles = [one.middle for one in used]
+    for middle in middles:  # one map that does not go with the depth is enough: it is the same body
+        calibration = calibration.fitting(*middle)
+    named = sorted(zip(found, middles, strict=True))
+    far = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.too_far(*middle)]
+    if far:
+        return PooledEstimate("no_estimate", extrapolated(far).reason)
+    size = pooled_size(used, calibration=calibration, priors=priors, rng=rng, number=POOLED_DRAWS)
+    if size.invalid > MOST_INVALID * size.d_x_mm.size:
+        return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
+    centres = {
+        i: float(np.nanmean(calibration.log_size(shape.log_amplitude, shape.log_width)))
+        for i, shape in zip(found, used, strict=True)
+    }
+    outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
+    reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
+    outlying = tuple(sorted(found[i] for i in size.outliers))
+    if len(used) > 1:
+        weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
+        size = replace(size, figures={**size.figures, **weights})
+    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration, fat_apart_mm)
+
+
+def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> tuple[int, ...]:
+    """Places of the maps that lie more than three standard deviations from what the others lead one to expect.
+
+    The spread between maps is taken from the others alone, so that an outlier cannot hide itself by widening it.
+    """
+    if len(centre) < 3:
+        return ()
+    found = []
+    for i in range(len(centre)):
+        others = np.delete(centre, i), np.delete(noise, i)
+        density = _between_density(*others, prior)
+        tau2 = float(density @ _grid(prior) ** 2)
+        weight = 1.0 / (others[1] + tau2)
+        expected, variance = float(weight @ others[0] / weight.sum()), float(1.0 / weight.sum() + noise[i] + tau2)
+        if abs(centre[i] - expected) > OUTLYING * np.sqrt(variance):
+            found.append(i)
+    return tuple(found)
+
+
+def _grid(prior: BetweenMaps) -> FloatArray:
+    """Values of tau that are looked at."""
+    return np.array([prior.median]) if prior.median <= 0 or prior.log_sd <= 0 else _GRID
+
+
+def _between_density(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> FloatArray:
+    """Posterior weights over `_grid`: restricted likelihood of the maps' centres times the prior."""
+    grid = _grid(prior)
+    if len(grid) == 1:
+        return np.ones(1)
+    variance = noise[:, None] + grid**2
+    weight = 1.0 / variance
+    mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
+    log = -0.5 * np.sum(np.log(variance) + weight * (centre[:, None] - mean) ** 2, axis=0)
+    log += -0.5 * np.log(weight.sum(axis=0)) - 0.5 * (np.log(grid / prior.median) / prior.log_sd) ** 2
+    density = np.exp(log - log.max())  # even steps in ln tau, in which the prior is normal
+    return np.asarray(density / density.sum())
+
+
+def _between_at(points: FloatArray, centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> FloatArray:
+    """Draws of tau from its posterior, at uniform points."""
+    edges = np.cumsum(_between_density(centre, noise, prior))
+    grid = _grid(prior)
+    return np.asarray(grid[np.minimum(np.searchsorted(edges, points), len(grid) - 1)])
+
+
+def _known_body(
+    calibration: LogQuadratic, known: Mapping[str, float], log_amplitude: FloatArray, log_width: FloatArray
+) -> tuple[FloatArray, float]:
+    """Mean of B given what is known of the body, and the share of its standard deviation that is left."""
+    if not known:
+        return np.zeros(len(log_width)), 1.0
+    hidden = calibration.hidden
+    names = () if hidden is None else hidden.names
+    for name in known:
+        if name not in names:
+            raise UsageError(
+                f"the calibration knows nothing of {name}; it knows {', '.join(names) or 'nothing of a body'}"
+            )
+    assert hidden is not None
+    expected = hidden.expected_body(known, calibration.terms(log_amplitude, log_width))
+    return expected, float(np.sqrt(1.0 - hidden.share(*known)))
+
+
+def _elongation(maps: Sequence[ShapeDraws], calibration: LogQuadratic, prior: ShapePrior) -> tuple[Elongation, float]:
+    """Posterior of the lump's shape in the axes the maps share, and the slope that leads from map to lump."""
+    excess, covariance, slope = np.zeros(2), np.zeros((2, 2)), 0.0
+    k = len(maps)
+    for m in maps:
+        beyond = m.q - calibration.round_excess(m.log_amplitude, m.log_width)
+        both = np.stack([beyond, m.r], axis=-1)
+        both = turned(both[np.isfinite(both).all(axis=1)], -m.turn_rad)
+        excess += both.mean(axis=0) / k
+        covariance += np.cov(both.T) / k**2
+        slope += float(np.nanmean(calibration.width_slope(m.log_amplitude, m.log_width))) / k
+    balls = calibration.round_lumps
+    covariance += (balls.body_sd**2 + balls.exam_sd**2 / k + 1e-12) * np.eye(2)
+    return elongation(excess, covariance, slope=slope, prior=prior), slope
+
+
+def _shares(parts: dict[str, float]) -> dict[str, float]:
+    total = float(sum(parts.values()))
+    return {name: float(100.0 * value / total) if total > 0 else 0.0 for name, value in parts.items()}

@@ -1,0 +1,1 @@
+"""Simulated scans through the whole path: calibration populations, simulation-based calibration, trade-offs."""

@@ -1,0 +1,288 @@
+r"""Simulation-based calibration of the posterior of a map: truths from its own prior, and where they rank.
+
+Where a parameter is drawn from the prior, a map from the model, and draws from the posterior of that map, the rank of
+the parameter among the draws is uniform: any departure is a fault of the posterior. The priors here are those that
+`estimate_map` uses under a noise field (`Scene.log_prior`, `CollapsedTarget`, `field`), with these choices where they
+are improper or depend on the map:
+
+- amplitude: its normal prior restricted to rises, for an estimate needs one; ranks are conditional on that.
+- noise scale (improper): an independent SD of a cell log-uniform on `NOISE_SD`; level (improper): 1; tilt (improper):
+  normal of `BumpPrior.tilt_sd`. For such parameters of location and scale ranks are uniform at every value.
+- centre (uniform in a window that follows the map): uniform within `CENTRE_MM` of the map's middle;
+- field: the exponential correlation itself. The posterior writes it in cosines on a rectangle that follows its window:
+  what that approximation costs is part of what the ranks judge. (Cosines mirror a field at their rectangle's edge. Maps
+  made of them had folds where they reached beyond, which other windows took for lumps.)
+
+Maps that give no estimate have no ranks: ranks are conditional on detection. Whether a map gives one depends on the
+map alone, so that exact ranks stay uniform. Under a field much stronger than the bump another rise may be taken for it.
+The estimate gives a probability that there is a lump, and the draws keep to the place where it was found: such maps
+have no ranks either, but are held against the number that the probabilities announce.
+
+The size is that of a round lump: the true one is a draw of the size calibration's own law at the true amplitude and
+widths.
+
+References
+----------
+Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788; Saeilynoja, Buerkner & Vehtari (2022), Statistics
+and Computing 32:32 (simultaneous bands of the ECDF).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.rank_tests import RankTest, rank_test, uniform_strays
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.posterior.correlated.noise import LENGTHS_MM, SHARES
+from tactile_bayes.posterior.correlated.window import cell_mean_profile
+from tactile_bayes.posterior.drawn import MapPosterior
+from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII, FitOptions
+from tactile_bayes.size.elongation import ShapePrior
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+
+HALF_MM = 25.0
+CELL_MM = 1.0
+RADIUS_MM = 20.0
+CENTRE_MM = 5.0
+NOISE_SD = (0.005, 0.1)
+COUNTS = (20, 80)
+DRAWS = 99
+"""Draws among which a truth is ranked: 100 ranks, divisible into the bins and the intervals below."""
+PARAMETERS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm")
+"""Ranks of an amplitude or a width are those of its logarithm."""
+SIZE = "size_mm"
+RANKED = (*PARAMETERS, SIZE)
+ELSEWHERE = "elsewhere"
+MANY_ELSEWHERE = 1e-3
+"""More maps measured at another rise than all but this share of chances allow: the draws are too sure of the place."""
+ROUND = SizePriors(shape=ShapePrior(oval_sd=1e-9))
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What one simulated map was made from.
+
+    Parameters
+    ----------
+    amplitude, sigma_x_mm, sigma_y_mm, x_mm, y_mm
+        Of the bump.
+    length_mm, share
+        Of the noise field: correlation length, and its variance over the mean independent variance of a cell.
+    noise_sd
+        Root of that variance.
+    """
+
+    amplitude: float
+    sigma_x_mm: float
+    sigma_y_mm: float
+    x_mm: float
+    y_mm: float
+    length_mm: float
+    share: float
+    noise_sd: float
+
+
+@dataclass(frozen=True, slots=True)
+class MapRanks:
+    """One simulated map, and where its truth lies in the posterior.
+
+    Parameters
+    ----------
+    index
+        The map's number.
+    truth
+        What was put in.
+    ranks
+        Of `RANKED`: how many of `DRAWS` draws lie below the truth; None without an estimate of this bump.
+    outcome
+        The method that gave the draws, the code of the abstention, or `ELSEWHERE` when another rise was measured.
+    probability
+        That the estimate gives to what it measured being a lump; None without an estimate.
+    """
+
+    index: int
+    truth: Truth
+    ranks: tuple[int, ...] | None
+    outcome: str
+    probability: float | None = None
+
+
+def settings(method: str, seed: int, *, size: str = "", cosines: int | None = None) -> dict[str, object]:
+    """All that the ranks of a map depend on besides its number."""
+    return {
+        "method": method,
+        "seed": seed,
+        "draws": DRAWS,
+        "size_calibration": size,
+        "noise_sd": list(NOISE_SD),
+        "counts": list(COUNTS),
+        "lengths_mm": list(LENGTHS_MM),
+        "shares": list(SHARES),
+        "field": "exponential",
+        "field_cosines": cosines or "auto",
+        **BumpPrior().as_dict(),
+    }
+
+
+def ranks_of_map(
+    index: int, *, method: str, seed: int, calibration: LogQuadratic | None = None, cosines: int | None = None
+) -> MapRanks:
+    """Draw one map from the prior, estimate it and rank its truth: all random numbers come from seed and index.
+
+    Without a size calibration the size is not ranked.
+    """
+    rng = np.random.default_rng([seed, index])
+    prior = BumpPrior()
+    truth = draw_truth(rng, prior)
+    fit = FitOptions("free", RADIUS_MM, "off", None, "field", field_cosines=cosines)
+    options = EstimateOptions(method=method, fit=fit, prior=prior)
+    found = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
+    if found.map_posterior is None or found.draws is None or found.detection is None:
+        return MapRanks(index, truth, None, found.code or "none")
+    probability = found.detection.probability
+    if elsewhere(found.map_posterior, truth):
+        return MapRanks(index, truth, None, ELSEWHERE, probability)
+    ranks = _ranks_in(found.map_posterior, truth, rng, calibration)
+    return MapRanks(index, truth, ranks, found.draws.method, probability)
+
+
+def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
+    """Whether the measured bump is another rise: further from the true centre than either reaches with its width."""
+    away = np.hypot(np.median(posterior.x_mm) - truth.x_mm, np.median(posterior.y_mm) - truth.y_mm)
+    widths = truth.sigma_x_mm, truth.sigma_y_mm, np.median(posterior.sigma_x_mm), np.median(posterior.sigma_y_mm)
+    return bool(away > max(widths))
+
+
+@dataclass(frozen=True, slots=True)
+class OtherRises:
+    """Maps on which another rise was measured.
+
+    Parameters
+    ----------
+    number
+        Of them.
+    announced
+        How many the probabilities of all estimates lead one to expect.
+    chance
+        Of so many or more, were the probabilities right.
+    """
+
+    number: int
+    announced: float
+    chance: float
+
+    @property
+    def too_many(self) -> bool:
+        """Whether the draws are too sure of the place: they keep to the rise that was found first."""
+        return self.chance < MANY_ELSEWHERE
+
+
+def other_rises(maps: list[MapRanks]) -> OtherRises:
+    """Weigh the maps measured elsewhere against what their estimates announced; the chance is a Poisson one."""
+    from scipy.stats import poisson
+
+    number = sum(one.outcome == ELSEWHERE for one in maps)
+    announced = sum(1.0 - one.probability for one in maps if one.probability is not None)
+    return OtherRises(number, announced, float(poisson.sf(number - 1, announced)) if number else 1.0)
+
+
+def _ranks_in(
+    posterior: MapPosterior, truth: Truth, rng: np.random.Generator, calibration: LogQuadratic | None
+) -> tuple[int, ...]:
+    """Ranks of a truth among some of the joint draws, the same ones for every parameter."""
+    number = posterior.x_mm.size
+    chosen = rng.choice(number, size=DRAWS, replace=number < DRAWS)
+    drawn = {name: getattr(posterior, name).ravel()[chosen] for name in PARAMETERS}
+    true = {name: np.full(DRAWS, getattr(truth, name)) for name in PARAMETERS}
+    ranks = tuple(int(np.sum(drawn[name] < true[name])) for name in PARAMETERS)
+    if calibration is None:
+        return ranks
+    # sizes of all draws are spread evenly; some of them chosen by chance are as good as independent
+    sizes = _sizes({name: getattr(posterior, name).ravel() for name in PARAMETERS}, calibration, rng)[chosen]
+    return (*ranks, int(np.sum(sizes < _sizes(true, calibration, rng)[0])))
+
+
+def _sizes(bumps: Mapping[str, FloatArray], calibration: LogQuadratic, rng: np.random.Generator) -> FloatArray:
+    """(n,) sizes in mm, one a bump; one without a rise has none and counts as small."""
+    a, sigma_x, sigma_y = (bumps[name] for name in PARAMETERS[:3])
+    draws = ShapeDraws.of(a, sigma_x, sigma_y, np.zeros_like(a))
+    return np.nan_to_num(pooled_size([draws], calibration=calibration, priors=ROUND, rng=rng).max_size_mm.ravel())
+
+
+def draw_truth(rng: np.random.Generator, prior: BumpPrior) -> Truth:
+    """Bump and noise field from the prior of the field posterior; see the module for what is improper there."""
+    p, q = _draw_log_widths(rng, prior)
+    away, direction = CENTRE_MM * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
+    return Truth(
+        amplitude=float(abs(prior.amplitude_sd * rng.standard_normal())),
+        sigma_x_mm=float(np.exp(p + q)),
+        sigma_y_mm=float(np.exp(p - q)),
+        x_mm=float(away * np.cos(direction)),
+        y_mm=float(away * np.sin(direction)),
+        length_mm=float(rng.choice(LENGTHS_MM)),
+        share=float(rng.choice(SHARES)),
+        noise_sd=float(np.exp(rng.uniform(*np.log(NOISE_SD)))),
+    )
+
+
+def _draw_log_widths(rng: np.random.Generator, prior: BumpPrior) -> tuple[float, float]:
+    """Mean and half difference of the log widths, none wider than the window allows."""
+    widest = np.log(WIDEST_IN_RADII * RADIUS_MM)
+    while True:
+        p = np.log(prior.width_median_mm) + prior.log_width_sd * rng.standard_normal()
+        q = prior.log_ratio_sd * rng.standard_normal()
+        if p + abs(q) <= widest:
+            return float(p), float(q)
+
+
+def draw_map(truth: Truth, rng: np.random.Generator, prior: BumpPrior) -> TactileMap:
+    """A map of the bump on a sloping level of 1, with independent errors by count and the noise field."""
+    axis = np.arange(-HALF_MM, HALF_MM + 0.5 * CELL_MM, CELL_MM)
+    count = rng.integers(COUNTS[0], COUNTS[1], size=(len(axis), len(axis)), endpoint=True)
+    reading_variance = truth.noise_sd**2 / float(np.mean(1.0 / count))
+    slope = prior.tilt_sd * rng.standard_normal(2) / RADIUS_MM
+    level = 1.0 + slope[0] * axis + slope[1] * axis[:, None]
+    errors = np.sqrt(reading_variance / count) * rng.standard_normal(count.shape)
+    field = np.sqrt(truth.share) * truth.noise_sd * draw_field(axis, rng, length_mm=truth.length_mm)
+    return TactileMap(
+        mean=level + truth.amplitude * _bump(axis, truth) + errors + field,
+        variance=np.full(count.shape, reading_variance),
+        count=count.astype(np.int64),
+        x_mm=axis,
+        y_mm=axis,
+        recipe=MapRecipe("grid", "mean", CELL_MM),
+        background=1.0,
+    )
+
+
+def _bump(axis: FloatArray, truth: Truth) -> FloatArray:
+    """(n, n) cell means of the bump of unit height."""
+    centre, width = np.array([truth.x_mm, truth.y_mm]), np.array([truth.sigma_x_mm, truth.sigma_y_mm])
+    columns, rows = cell_mean_profile(axis - centre[:, None], sigma_mm=width, cell_mm=CELL_MM)
+    return np.asarray(rows[:, None] * columns)
+
+
+def draw_field(axis: FloatArray, rng: np.random.Generator, *, length_mm: float) -> FloatArray:
+    """(n, n) field of variance 1 and exponential correlation, cut from a torus on which the wrap does not matter."""
+    cell_mm = float(axis[1] - axis[0])
+    size = len(axis) + int(10 * length_mm / cell_mm)
+    lag = np.fft.fftfreq(size, 1 / size) * cell_mm
+    power = np.clip(np.fft.fft2(np.exp(-np.hypot(lag[:, None], lag) / length_mm)).real, 0.0, None)
+    white = rng.standard_normal(power.shape)
+    return np.asarray(np.fft.ifft2(np.fft.fft2(white) * np.sqrt(power)).real[: len(axis), : len(axis)])
+
+
+def rank_tests(maps: list[MapRanks]) -> list[RankTest]:
+    """One verdict a parameter; none where no map has ranks."""
+    ranks = np.array([one.ranks for one in maps if one.ranks is not None])
+    if not len(ranks):
+        return []
+    strays = uniform_strays(len(ranks), DRAWS)
+    return [rank_test(name, column, draws=DRAWS, strays=strays) for name, column in zip(RANKED, ranks.T, strict=False)]
