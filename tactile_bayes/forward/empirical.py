@@ -123,7 +123,7 @@ class EmpiricalModel:
         return np.asarray(bump * share**2 + kappa(x_c_mm, d_mm=self.d_mm) * p1)
 
     def frames(self, x_c_mm: FloatArray, s_mm: FloatArray) -> LineFrames:
-        """Frames at the given positions; `tactile_line.build_line` averages their curves to the map."""
+        """Frames at the given positions; `plane.line.build_line` averages their curves to the map."""
         return LineFrames(x_c_mm, s_mm, self.surface_pressure(s_mm[None, :], x_c_mm[:, None]))
 
 

@@ -60,7 +60,7 @@ class EstimateOptions:
     size_priors
         Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
     scene
-        One of `scene_choice.SCENES`, under a noise field.
+        One of `selection.SCENES`, under a noise field.
     accuracy_mm
         The same in mm; the finer of the two holds. Under a noise field.
     store

@@ -158,7 +158,7 @@ class FatCubic:
         return log_depth, ""
 
     def contraction(self, log_depth: float) -> FloatArray:
-        """(10, 20) matrix: what the coefficients come to at one depth, in the order of `monomials.powers`."""
+        """(10, 20) matrix: what the coefficients come to at one depth, in the order of `polynomials.powers`."""
         w, left = log_depth - self.centre[2], powers(ORDER)
         found = np.zeros((len(left), len(POWERS)))
         for column, (i, j, k) in enumerate(POWERS):

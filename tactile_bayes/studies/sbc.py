@@ -2,7 +2,7 @@ r"""Simulation-based calibration of the posterior of a map: truths from its own 
 
 Where a parameter is drawn from the prior, a map from the model, and draws from the posterior of that map, the rank of
 the parameter among the draws is uniform: any departure is a fault of the posterior. The priors here are those that
-`estimate_map` uses under a noise field (`Scene.log_prior`, `CollapsedTarget`, `field`), with these choices where they
+`estimate_map` uses under a noise field (`Scene.log_prior`, `CollapsedTarget`, `correlated.noise`), with these choices where they
 are improper or depend on the map:
 
 - amplitude: its normal prior restricted to rises, for an estimate needs one; ranks are conditional on that.

@@ -1,6 +1,6 @@
 r"""What a lump changes in the response of the skin: the body condensed onto its surface and onto the lump's boundary.
 
-The skin of the layered body without a lump answers exactly (`plane_layers.surface_compliance`). The lump adds a matrix
+The skin of the layered body without a lump answers exactly (`layers.surface_compliance`). The lump adds a matrix
 of low rank. With H the compliance of the body *with a hole* on the hole's boundary (and from there to the skin), and
 :math:`S = FF^T` the stiffness of a disc condensed onto the same boundary, filling the hole changes the skin by
 

@@ -51,7 +51,7 @@ class SolidSettings:
     fineness
         Of the mesh; twice is half the element. See `mesh_size`.
     rank_tolerance
-        See `solid.skin_perturbation`.
+        See `frames.skin_perturbation`.
     mesh_reach_mm
         Radius at which the mesh ends, on a rim that does not move.
     background

@@ -19,7 +19,7 @@ def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
     Parameters
     ----------
     ridges : (g, 3) array
-        Where the map rises along a line beyond the bump, see `beside.rising_ribs`.
+        Where the map rises along a line beyond the bump, see `neighbour.rising_ribs`.
 
     Returns
     -------

@@ -66,7 +66,7 @@ class FitOptions:
         About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`.
     field_cosines
         Of the noise field along each axis: more of them are slower and see finer correlation. None takes as many as the
-        bump's width calls for, see `field.cosines_for`.
+        bump's width calls for, see `correlated.noise.cosines_for`.
     """
 
     background: str = "fixed"

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapping_scans import shared_scan
+from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.mapping.build import build_map
@@ -15,9 +17,7 @@ from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate
 from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.scan import Scan
-from tests.mapping_scans import shared_scan
-from tests.posterior_maps import bump_values, grid_map
-from tests.test_extremes import NOISE, NOTHING, few, float32, unknown_level, without_a_quadrant
+from tests.posterior.test_extremes import NOISE, NOTHING, few, float32, unknown_level, without_a_quadrant
 
 FIELD = FitOptions("free", 20.0, "auto", None, "field")
 SLOW = [pytest.param(method, marks=pytest.mark.slow) for method in ("laplace", "ensemble")]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from posterior_maps import bump_map, bump_values, grid_map
 
 from tactile_bayes.abstention import CODES
 from tactile_bayes.errors import NotConvergedError, UsageError
@@ -15,7 +16,6 @@ from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.white.fit import Candidate, FitOptions, fit_bump
 from tactile_bayes.report.estimate_text import estimate_text
-from tests.posterior_maps import bump_map, bump_values, grid_map
 
 FIELD = FitOptions(background="free", noise="field")
 WHITE = 0.01 * np.random.default_rng(4).standard_normal((51, 51))

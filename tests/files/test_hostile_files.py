@@ -33,7 +33,7 @@ from tactile_bayes.files.size_posterior import read_stated_size
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.inference.chain_state import ChainState
 
-PACKAGE = Path(__file__).resolve().parents[1] / "tactile_bayes"
+PACKAGE = Path(__file__).resolve().parents[2] / "tactile_bayes"
 SCAN = PACKAGE / "demo" / "scan.mcap"
 MOST_BYTES = 300 * 10**6
 Read = Callable[[Path], object]

@@ -21,7 +21,7 @@ from tactile_bayes.files.grid_import import read_grid
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 
-DEMO = Path(__file__).resolve().parents[1] / "tactile_bayes" / "demo"
+DEMO = Path(__file__).resolve().parents[2] / "tactile_bayes" / "demo"
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 # Runs the program with files of up to 900 bytes: the system refuses the rest, as a full disk does.

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.correlated import neighbour as beside
@@ -17,7 +18,6 @@ from tactile_bayes.posterior.correlated.surroundings import Surroundings
 from tactile_bayes.posterior.correlated.window import Window
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import window_cells
-from tests.posterior_maps import bump_values, correlated_field, grid_map
 
 RADIUS, HALF, SIZE = 20.0, 35.0, 71
 AXIS = np.arange(SIZE) - HALF

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from posterior_maps import grid_map
 
 from tactile_bayes.posterior.correlated import estimate as field_estimate
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.white.fit import FitOptions
-from tests.posterior_maps import grid_map
-from tests.test_scene_choice import AXIS, bump, errors
+from tests.posterior.correlated.test_selection import AXIS, bump, errors
 
 
 def ridge(seed: int) -> np.ndarray:

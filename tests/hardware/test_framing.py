@@ -83,7 +83,7 @@ def test_codes_that_do_not_end_with_the_data_are_refused(broken):
 def test_golden_packets(name):
     made, golden = GOLDEN[name]
     assert made.hex(" ") == golden
-    page = (Path(__file__).parent.parent / "docs" / "scan-head-protocol.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "scan-head-protocol.md").read_text(encoding="utf-8")
     assert golden in page
 
 

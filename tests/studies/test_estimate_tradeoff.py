@@ -12,6 +12,7 @@ from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
+from posterior_maps import bump_map, correlated_field, grid_map
 
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
@@ -19,7 +20,6 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.report.tradeoff_estimate import advice, draw_tradeoff, tradeoff_document, tradeoff_text
 from tactile_bayes.studies import estimate_tradeoff as tradeoff
 from tactile_bayes.studies.estimate_tradeoff import Measured, Tradeoff, measure
-from tests.posterior_maps import bump_map, correlated_field, grid_map
 
 Run = Callable[..., "CompletedProcess[str]"]
 

@@ -22,9 +22,9 @@ from tactile_bayes.inference.laplace import mode_and_covariance
 from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
 from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.correlated.scene import Scene
-from tests.test_collapsed import cells_of, fitted, noise
-from tests.test_methods import LINEAR
-from tests.test_scene_methods import half_covered, strong, weak
+from tests.inference.test_methods import LINEAR
+from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
+from tests.posterior.correlated.test_scene_draws import half_covered, strong, weak
 
 LogDensity = Callable[[np.ndarray], np.ndarray]
 WANTED = 0.02

@@ -6,12 +6,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from posterior_maps import bump_map, correlated_field
 
 from tactile_bayes.posterior.correlated.noise import cosines_for
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
-from tests.posterior_maps import bump_map, correlated_field
 
 WINDOW = np.arange(-20.0, 21.0)
 NARROW_MM = 2.0

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapping_scans import shared_scan
+from posterior_maps import bump_map, correlated_field, grid_map
 
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.white.fit import FitOptions
-from tests.mapping_scans import shared_scan
-from tests.posterior_maps import bump_map, correlated_field, grid_map
 
 SIZE, NOISE = 51, 0.02
 # "none" stops after the question: no draws are made

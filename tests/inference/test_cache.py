@@ -15,7 +15,7 @@ from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.lump.bump import Bump, BumpPrior
 from tactile_bayes.posterior.lump.cells import window_cells
 from tactile_bayes.posterior.white.fit import FitOptions, find_bump
-from tests.test_collapsed import cells_of, fitted, noise
+from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 
 
 class Counting:

@@ -10,7 +10,7 @@ from tactile_bayes.posterior.correlated import marginal as collapsed
 from tactile_bayes.posterior.correlated.basis import Spanned
 from tactile_bayes.posterior.correlated.marginal import CollapsedTarget
 from tactile_bayes.posterior.correlated.scene import Scene
-from tests.test_collapsed import START, TURNED, cells_of, noise, target_of
+from tests.posterior.correlated.test_marginal import START, TURNED, cells_of, noise, target_of
 
 NEAR = 0.03
 AROUND = {

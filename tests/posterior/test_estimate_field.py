@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_map
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
 from tactile_bayes.posterior.white.fit import FitOptions
 from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
-from tests.posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_map
 
 FIELD = EstimateOptions(method="importance", fit=FitOptions(background="free", noise="field"))
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from emulated_devices import short_scan
 from PIL import Image
-from test_hw_live import seen_of
+from test_live import seen_of
 from test_orientation import UPPER_RIGHT, corner, live_state, lump_in_base
 from websockets.sync.client import ClientConnection, connect
 

@@ -24,7 +24,7 @@ from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.scan import Scan, TrackerPoses
 
-PAGE = Path(__file__).parents[1] / "docs" / "recording.md"
+PAGE = Path(__file__).parents[2] / "docs" / "recording.md"
 DURATION_S = 3.0
 PAUSE_S = 1.5
 

@@ -18,8 +18,8 @@ from tactile_bayes.posterior.correlated.draw import MethodOptions, Sampled, disa
 from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene
 from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tests.test_collapsed import cells_of, fitted, noise
-from tests.test_scene_choice import bump, choose, errors, rib, second
+from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
+from tests.posterior.correlated.test_selection import bump, choose, errors, rib, second
 
 
 @cache

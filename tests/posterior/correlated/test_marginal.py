@@ -6,6 +6,7 @@ from math import lgamma
 
 import numpy as np
 import pytest
+from posterior_maps import TRUTH, bump_map, correlated_field
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.posterior.correlated import marginal as collapsed
@@ -18,7 +19,6 @@ from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.correlated.window import Window
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import FitCells, window_cells
-from tests.posterior_maps import TRUTH, bump_map, correlated_field
 
 RADIUS = 20.0
 START = np.array([np.log(6.0), np.log(4.5), 1.3, -0.8, 0.0])

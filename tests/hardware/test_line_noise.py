@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from emulated_devices import short_scan
-from test_hw_resync import NAMES, parser_of, stream_of
+from test_resync import NAMES, parser_of, stream_of
 
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedHead, EmulatedTracker
