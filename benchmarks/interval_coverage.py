@@ -44,8 +44,10 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions, default_errors, fit_bump
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.white.fit import default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
 
 NOMINAL = 0.9

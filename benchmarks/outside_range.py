@@ -37,8 +37,8 @@ from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import EstimateOptions, calibration_for, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import calibration_for, estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.size.eq6 import Recipe, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration
 from tactile_bayes.size.log_quadratic import LogQuadratic

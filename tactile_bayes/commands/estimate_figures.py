@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.estimate import Estimate
+    from tactile_bayes.posterior.result import Estimate
     from tactile_bayes.report.map_figure import FitContour
 
 

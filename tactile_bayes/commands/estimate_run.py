@@ -13,8 +13,8 @@ from tactile_bayes.records import dataclass
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
-    from tactile_bayes.posterior.white.fit import FitOptions
+    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+    from tactile_bayes.posterior.result import Estimate
     from tactile_bayes.size.eq6 import SizeCalibration
     from tactile_bayes.size.log_quadratic import LogQuadratic
     from tactile_bayes.size.pooling import ShapeDraws, SizePriors
@@ -209,8 +209,8 @@ def _options(
     Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
     """
     from tactile_bayes.files.prior_toml import read_prior
-    from tactile_bayes.posterior.estimate import EstimateOptions
-    from tactile_bayes.posterior.white.fit import FitOptions, default_errors
+    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+    from tactile_bayes.posterior.white.fit import default_errors
 
     background, noise = default_errors(tactile_map)
     if settings.background or settings.method == "optimise":

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.hardware.live import LiveMap, LiveState
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.drawn import MapPosterior
+    from tactile_bayes.posterior.lump.posterior import MapPosterior
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
     from tactile_bayes.size.eq6 import SizeCalibration
     from tactile_bayes.size.log_quadratic import LogQuadratic
@@ -204,9 +204,9 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
     import numpy as np
 
     from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+    from tactile_bayes.posterior.estimate import estimate_map
     from tactile_bayes.posterior.lump.cells import candidate_centres
-    from tactile_bayes.posterior.white.fit import FitOptions
+    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
 
     try:

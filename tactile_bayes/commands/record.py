@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
 from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.record_request import Request
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 
 if TYPE_CHECKING:
@@ -100,65 +100,13 @@ def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
     ctx.exit(EXIT_INTERRUPTED if interrupted and request.duration_s is not None else 0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Request:
-    """The options of one recording, as they were given."""
-
-    output: Path
-    head_url: str
-    tracker_url: str | None
-    tracker_protocol: str
-    head_baud: int
-    tracker_baud: int | None
-    tracker_rom: Path | None
-    every: int
-    duration_s: float | None
-    at_once: bool
-    clock: str
-    invert_rotation: bool
-    like: Path | None
-    head_geometry: Path | None
-    array_calibration: Path | None
-    uncalibrated: bool
-    accept_calibration: bool
-    calibration_days: float
-    landmarks: Path | None
-    side: str | None
-    posture: str | None
-    lubricant: str | None
-    examiner: str | None
-    subject: str | None
-    live: bool
-    serve: str | None
-    size_calibration: str
-    force: bool
-
-    def session(self, hello: HelloReading) -> dict[str, str]:
-        """Plain text facts for the file."""
-        facts = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
-        tracker = self.tracker_protocol if self.tracker_url else "none"
-        devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker}
-        more = {"clock": self.clock, "rotation": "inverted"} if self.invert_rotation else {"clock": self.clock}
-        return devices | more | {name: value for name, value in facts.items() if value}
-
-    def settings(self, hello: HelloReading) -> dict[str, Any]:
-        """For the provenance."""
-        return {
-            "tracker_protocol": self.tracker_protocol if self.tracker_url else None,
-            "rate_hz": hello.rate_hz / self.every,
-            "every": self.every,
-            "clock": self.clock,
-            "invert_rotation": self.invert_rotation,
-            "calibrated": not self.uncalibrated,
-        }
-
-
 def _record(request: Request) -> tuple[Report, bool]:
     """Check everything, record, close the file; the account, and whether somebody interrupted."""
     from dataclasses import asdict
     from datetime import date
 
-    from tactile_bayes.commands.record_parts import Stopper, instrument_of, provenance_of, refuse_calibration
+    from tactile_bayes.commands.record_keys import Stopper
+    from tactile_bayes.commands.record_parts import instrument_of, provenance_of, refuse_calibration
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
     from tactile_bayes.files.schema import check_document
     from tactile_bayes.hardware.recorder import Recorder
@@ -277,7 +225,7 @@ def _place(landmarks: Landmarks | None, writer: Any, observer: Observer | None) 
 
 
 def _run(recorder: Recorder, stopper: Any, head: HeadGeometry, request: Request) -> Report:
-    from tactile_bayes.commands.record_parts import Keys
+    from tactile_bayes.commands.record_keys import Keys
 
     with Keys(recorder, head.scanhead_from_tracker, wait=request.duration_s is None and not request.at_once) as keys:
         if not keys.waiting:

@@ -308,8 +308,8 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
     """
     import numpy as np
 
-    from tactile_bayes.forward.empirical import fit_shape
     from tactile_bayes.forward.gaussian import cell_mean_gaussian
+    from tactile_bayes.forward.plane.empirical import fit_shape
     from tactile_bayes.forward.plane.study import LineFit
     from tactile_bayes.posterior.white.fit import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
 

@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.netcdf import Variable, netcdf_bytes
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior.estimate import Estimate
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.posterior import SizePosterior
 

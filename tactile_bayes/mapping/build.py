@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray, Plane, patient_from_plane
-from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, no_progress, sources_of
+from tactile_bayes.mapping.accumulate import Accumulated, accumulate
 from tactile_bayes.mapping.convention import check_convention, hint
 from tactile_bayes.mapping.engine import Engine, choose_engine
 from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
@@ -22,6 +22,7 @@ from tactile_bayes.mapping.pose_noise import pose_noise_figures
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.quality import cell_figures, frame_figures, plane_figures, stroke_figures
 from tactile_bayes.mapping.shared_frames import shared_frame_figures
+from tactile_bayes.mapping.source import Progress, no_progress, sources_of
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.mapping.timing import timing_figures

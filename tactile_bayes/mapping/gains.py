@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.accumulate import Progress, Source, no_progress
+from tactile_bayes.mapping.source import Progress, Source, no_progress
 
 MAX_GAIN_PASSES = 50
 # Cells of this many readings are kept between passes (4 bytes each); beyond, they are found anew in every pass.

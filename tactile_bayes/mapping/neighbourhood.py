@@ -8,11 +8,12 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse
-from tactile_bayes.mapping.accumulate import add_all, sources_of
+from tactile_bayes.mapping.accumulate import add_all
 from tactile_bayes.mapping.engine import Engine
 from tactile_bayes.mapping.frames import SelectedFrames
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.poses import FramePoses
+from tactile_bayes.mapping.source import sources_of
 from tactile_bayes.mapping.strokes import smooth
 from tactile_bayes.mapping.tactile_map import FEW_READINGS
 

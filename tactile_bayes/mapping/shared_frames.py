@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.accumulate import Source
 from tactile_bayes.mapping.cells import VALUE_STEP, CellSums
+from tactile_bayes.mapping.source import Source
 from tactile_bayes.mapping.tactile_map import FEW_READINGS
 
 # Runs of successive frames, spread evenly over the scan: enough pairs for a correlation to 0.01, at 400 frames' cost.

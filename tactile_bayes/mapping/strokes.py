@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.accumulate import Source
 from tactile_bayes.mapping.cells import CellSums
 from tactile_bayes.mapping.engine import Engine
 from tactile_bayes.mapping.frames import chunks
 from tactile_bayes.mapping.project import Projection
+from tactile_bayes.mapping.source import Source
 
 # A stroke is a run in one direction over at least this far.
 LEAST_REACH_MM = 10.0

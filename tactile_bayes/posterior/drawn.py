@@ -10,11 +10,11 @@ import numpy as np
 
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import shape_fault
-from tactile_bayes.posterior.search import scene_asked
+from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.options import EstimateOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.white.fit import BumpFit
@@ -28,25 +28,11 @@ from tactile_bayes.size.posterior import SizePosterior, push_sizes
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.estimate import FieldAnswer
     from tactile_bayes.posterior.correlated.selection import SceneChoice
-    from tactile_bayes.posterior.estimate import EstimateOptions
+    from tactile_bayes.posterior.options import EstimateOptions
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 """Of interval ends of sizes, where none is given; the methods have the same for the widths."""
 MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapPosterior:
-    """Joint draws of what Eq 7 describes, each (chain, draw)."""
-
-    amplitude: FloatArray
-    sigma_x_mm: FloatArray
-    sigma_y_mm: FloatArray
-    x_mm: FloatArray
-    y_mm: FloatArray
-    angle_rad: FloatArray
-    background: FloatArray
-    noise_sd: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,129 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tactile_bayes.abstention import Abstention
-from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
-from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws
+from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import no_bump, searched, undetected
-from tactile_bayes.posterior.drawn import MapPosterior, draw_sized, medians, range_faults
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.search import ROTATION_ODDS, best_chance, search
+from tactile_bayes.posterior.drawn import draw_sized, medians, range_faults
+from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions, check_options
+from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.search import best_chance, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.white.detection import Detection
-from tactile_bayes.posterior.white.fit import BumpFit, Candidate, FitOptions, check_background
+from tactile_bayes.posterior.white.fit import BumpFit, Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
-from tactile_bayes.records import dataclass
 from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.fat_depth import head_profile
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import SizePriors, fat_left_out
+from tactile_bayes.size.pooling import fat_left_out
 from tactile_bayes.size.posterior import SizePosterior
 
 if TYPE_CHECKING:
-    from tactile_bayes.inference.chain_state import ChainStore
-    from tactile_bayes.posterior.correlated.selection import SceneChoice
-    from tactile_bayes.posterior.other_rises import Rise
+    pass
 
-Status = Literal["estimate", "no_estimate"]
-DETECTED = 0.95
 MOST_INVALID = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class EstimateOptions:
-    """Settings of an estimate.
-
-    Parameters
-    ----------
-    method
-        One of `presets.METHODS`.
-    fit
-        Background, window, rotation, centre, noise.
-    prior
-        On the bump.
-    least_probability
-        Below this probability of a lump there is no estimate.
-    max_steps
-        Of the ensemble; None for its default.
-    accuracy_sd
-        Wanted Monte-Carlo error of the ends of 95 % intervals, of sizes and widths alike, in posterior SDs; None for
-        the method's default.
-    size_priors
-        Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
-    scene
-        One of `selection.SCENES`, under a noise field.
-    accuracy_mm
-        The same in mm; the finer of the two holds. Under a noise field.
-    store
-        Where an ensemble keeps its state between runs, under a noise field.
-    draws
-        Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD.
-    """
-
-    method: str = "importance"
-    fit: FitOptions = field(default_factory=FitOptions)
-    prior: BumpPrior = field(default_factory=BumpPrior)
-    least_probability: float = DETECTED
-    max_steps: int | None = None
-    accuracy_sd: float | None = None
-    size_priors: SizePriors = field(default_factory=SizePriors)
-    scene: str = "auto"
-    accuracy_mm: float | None = None
-    store: ChainStore | None = None
-    draws: int = INDEPENDENT_DRAWS
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
-    """The answer for one map.
-
-    Parameters
-    ----------
-    status, reason
-        ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is missing from it, if
-        anything.
-    detection
-        None when no bump could be tested.
-    fit, draws, map_posterior, size
-        None without an estimate; `size` is None also without a size calibration.
-    candidates
-        Every place that was looked at.
-    diagnostics
-        Figures and flags for the report.
-    left_out
-        What the estimate does not contain, in words.
-    code, advice
-        Without an estimate: one of `abstention.CODES`, and what would fix it.
-    scene
-        Under a noise field: what the window holds, and what was asked about it.
-    sensitivity
-        How far the answer leans on the prior of the widths.
-    other_rises
-        Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked.
-    """
-
-    status: Status
-    reason: str
-    detection: Detection | None = None
-    fit: BumpFit | None = None
-    draws: ParameterDraws | None = None
-    map_posterior: MapPosterior | None = None
-    size: SizePosterior | None = None
-    candidates: tuple[Candidate, ...] = ()
-    diagnostics: Mapping[str, object] = field(default_factory=dict)
-    left_out: tuple[str, ...] = ()
-    code: str = ""
-    advice: str = ""
-    scene: SceneChoice | None = None
-    sensitivity: Sensitivity | None = None
-    other_rises: tuple[Rise, ...] = ()
 
 
 def estimate_map(
@@ -153,7 +58,7 @@ def estimate_map(
         When an option does not go with another, or with the map.
     """
     check_background(tactile_map, options.fit)
-    _check_options(options)
+    check_options(options)
     if calibration is not None:
         check_recipe(tactile_map, calibration, options.fit)
         calibration = calibration_for(tactile_map, calibration)
@@ -264,22 +169,6 @@ def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuad
             f"the size calibration was learned by another recipe: {'; '.join(differs)}",
             way_out="build and fit the map as the calibration's maps were, or learn a calibration for this recipe",
         )
-
-
-def _check_options(options: EstimateOptions) -> None:
-    if options.fit.noise != "field":
-        asked = {"scene": options.scene not in ("auto", "none"), "accuracy in mm": options.accuracy_mm is not None}
-        asked |= {"checkpoint": options.store is not None}
-        for name, given in asked.items():
-            if given:
-                raise UsageError(f"a {name} goes with correlated errors; give --noise field")
-        return
-    if options.store is not None and options.method != "ensemble":
-        raise UsageError("only the ensemble has checkpoints; give --method ensemble")
-    if options.method == "optimise":
-        raise UsageError("optimise is the paper's least squares and has no noise field; choose another --method")
-    if options.fit.background != "free":
-        raise UsageError("a noise field takes level and tilt with it; give --background free")
 
 
 def _diagnostics(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,50 +12,21 @@ from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.correlated.neighbour import LEAST_RISE
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, candidate_centres, levelled, smoothed_excess
+from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.result import Estimate, Rise
 from tactile_bayes.posterior.search import search
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import BumpFit
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.estimate import FieldAnswer
-    from tactile_bayes.posterior.drawn import MapPosterior
-    from tactile_bayes.posterior.estimate import Estimate, EstimateOptions
 
 BESIDE_IN_WIDTHS = 2.5
 """Nearer to the lump than this many of its larger width, what a lump that is no Gaussian leaves looks like a rise."""
 MOST_NAMED, MOST_LOOKS = 4, 3
 """Rises that are named, and places that turn out to be none before the search ends: each look costs some 50 ms."""
 LEAST_PROBABILITY = 0.95
-
-
-@dataclass(frozen=True, slots=True)
-class Rise:
-    """Another rise.
-
-    Parameters
-    ----------
-    x_mm, y_mm
-        Its centre in `plane`.
-    distance_mm
-        From the lump that was measured; None where there is none.
-    amplitude, sigma_x_mm, sigma_y_mm
-        Of its bump at the mode; widths along the axes of its ellipse.
-    probability
-        That it is a lump, as `Detection` has it.
-    """
-
-    x_mm: float
-    y_mm: float
-    distance_mm: float | None
-    amplitude: float
-    sigma_x_mm: float
-    sigma_y_mm: float
-    probability: float
-
-    def as_dict(self) -> dict[str, float | None]:
-        """As JSON holds it."""
-        return {name: None if value is None else float(f"{value:.6g}") for name, value in asdict(self).items()}
 
 
 def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOptions) -> tuple[Rise, ...]:

@@ -12,6 +12,7 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import missing_strokes
 from tactile_bayes.posterior.lump.cells import covered_share, levelled, window_cells
+from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection, detect
 from tactile_bayes.posterior.white.fit import (
     LEAST_COVERED_SHARE,
@@ -19,14 +20,13 @@ from tactile_bayes.posterior.white.fit import (
     OUTGROWN,
     BumpFit,
     Candidate,
-    FitOptions,
     fit_close,
     fitted_candidates,
 )
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.estimate import FieldAnswer
-    from tactile_bayes.posterior.estimate import EstimateOptions
+    from tactile_bayes.posterior.options import EstimateOptions
 
 WIDE_IN_RADII = 0.4
 ENCLOSED_IN_WIDTHS = 1.6
@@ -36,8 +36,6 @@ Of 800 simulated exams 46 showed a lump wider than 8 mm, all of them enclosed so
 """
 MOST_LOOKS = 3
 """Places that are no lump by the evidence before the search ends: each look is a chance to be wrong."""
-ROTATION_ODDS = 3.0
-"""A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
 
 
 def search(
@@ -214,9 +212,3 @@ def _look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> tu
     if fault or seen.detection.probability < options.least_probability:
         return seen, fault
     return with_neighbours(seen, tactile_map, scene=scene), ""
-
-
-def scene_asked(options: EstimateOptions) -> str:
-    """The scene asked for; the option that turns the ellipse decides where none was named."""
-    turned = {"on": "rotated", "off": "ellipse"}.get(options.fit.rotation, "auto")
-    return turned if options.scene == "auto" else options.scene

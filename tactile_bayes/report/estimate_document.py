@@ -12,8 +12,8 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.scene_text import scene_document
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import Estimate
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import SIZES, estimate_quantities
 from tactile_bayes.report.rise_text import rise_lines

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tactile_bayes.posterior.other_rises import Rise
+    from tactile_bayes.posterior.result import Rise
 
 
 def rise_lines(rises: Sequence[Rise]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_bayes.forward.body import THICKNESS_MM, Layers
-from tactile_bayes.forward.empirical import fit_empirical
+from tactile_bayes.forward.plane.empirical import fit_empirical
 from tactile_bayes.forward.plane.line import build_line, press_layers
 from tactile_bayes.forward.plane.study import (
     DETECTABLE,

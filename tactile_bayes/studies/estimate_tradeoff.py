@@ -16,10 +16,10 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
 from tactile_bayes.posterior.correlated.estimate import FieldAnswer
 from tactile_bayes.posterior.correlated.fit import FieldFit, laplace_mixture, shape_draws
-from tactile_bayes.posterior.estimate import EstimateOptions
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.search import search
-from tactile_bayes.posterior.white.fit import BumpFit, FitOptions, fit_bump
+from tactile_bayes.posterior.white.fit import BumpFit, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
 ENDS = (0.025, 0.975)

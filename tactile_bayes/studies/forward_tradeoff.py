@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import THICKNESS_MM, Body
-from tactile_bayes.forward.empirical import fit_empirical
+from tactile_bayes.forward.plane.empirical import fit_empirical
 from tactile_bayes.forward.plane.line import build_line, head_positions, press, press_layers
 from tactile_bayes.forward.plane.study import HARD_RATIO, Fit, Geometry, StudyRow, StudySettings, run_geometry
 from tactile_bayes.forward.scene import Scene

@@ -13,8 +13,8 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.fat_depth import head_profile

@@ -2,8 +2,8 @@ r"""Simulation-based calibration of the posterior of a map: truths from its own 
 
 Where a parameter is drawn from the prior, a map from the model, and draws from the posterior of that map, the rank of
 the parameter among the draws is uniform: any departure is a fault of the posterior. The priors here are those that
-`estimate_map` uses under a noise field (`Scene.log_prior`, `CollapsedTarget`, `correlated.noise`), with these choices where they
-are improper or depend on the map:
+`estimate_map` uses under a noise field (`Scene.log_prior`, `CollapsedTarget`, `correlated.noise`), with these choices
+where they are improper or depend on the map:
 
 - amplitude: its normal prior restricted to rises, for an estimate needs one; ranks are conditional on that.
 - noise scale (improper): an independent SD of a cell log-uniform on `NOISE_SD`; level (improper): 1; tilt (improper):
@@ -39,10 +39,11 @@ from tactile_bayes.inference.rank_tests import RankTest, rank_test, uniform_stra
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.posterior.correlated.noise import LENGTHS_MM, SHARES
 from tactile_bayes.posterior.correlated.window import cell_mean_profile
-from tactile_bayes.posterior.drawn import MapPosterior
-from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
+from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII, FitOptions
+from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size

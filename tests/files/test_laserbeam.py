@@ -16,8 +16,9 @@ from scipy.optimize import curve_fit
 
 from tactile_bayes.files.grid_import import read_grid
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 
 PIXEL_MM = 0.1
 BEAMS = {"laserbeam_astigmatic.tif": 10.0, "laserbeam_t-210mm.pgm": 15.0}

@@ -14,7 +14,8 @@ from tactile_bayes.posterior.correlated.draw import draw_scene
 from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.lump.bump import Bump, BumpPrior
 from tactile_bayes.posterior.lump.cells import window_cells
-from tactile_bayes.posterior.white.fit import FitOptions, find_bump
+from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.white.fit import find_bump
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 
 

@@ -16,8 +16,9 @@ from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.laplace import find_mode, laplace, mode_and_covariance
 from tactile_bayes.inference.optimise import optimise
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white.residuals import ErrorModel
 from tactile_bayes.posterior.white.target import Target, flat_prior
 from tactile_bayes.presets import METHODS

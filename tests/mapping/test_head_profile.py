@@ -24,8 +24,8 @@ from tactile_bayes.mapping.frame_marks import NO_LIMIT, frame_marks, marks_limit
 from tactile_bayes.mapping.head_profile import LEAST_FRAMES, MOST_FRAMES, ProfileReader, profile_figures
 from tactile_bayes.mapping.poses import poses_at
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.fat_depth import head_profile

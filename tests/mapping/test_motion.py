@@ -11,7 +11,8 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import head_positions, simulate
 from tactile_bayes.mapping import TactileMap, build_map
-from tactile_bayes.posterior.white.fit import FitOptions, fit_bump
+from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.white.fit import fit_bump
 from tactile_bayes.scan import PressureFrames, Scan
 
 TRUE_POSES = Noise(tracker_mm=0.0, tracker_deg=0.0)

@@ -12,9 +12,11 @@ from tactile_bayes.abstention import CODES
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.posterior.abstention import extend_advice, fault_code, missing_strokes, shape_fault
 from tactile_bayes.posterior.correlated import draw as methods
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.white.fit import Candidate, FitOptions, fit_bump
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.white.fit import Candidate, fit_bump
 from tactile_bayes.report.estimate_text import estimate_text
 
 FIELD = FitOptions(background="free", noise="field")

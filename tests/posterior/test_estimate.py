@@ -10,9 +10,10 @@ from posterior_maps import TRUTH, bump_map, correlated_field, grid_map
 
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_document import estimate_document
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration

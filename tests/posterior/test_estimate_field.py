@@ -9,8 +9,9 @@ import pytest
 from posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_map
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
 
 FIELD = EstimateOptions(method="importance", fit=FitOptions(background="free", noise="field"))

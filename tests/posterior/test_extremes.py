@@ -7,8 +7,9 @@ import pytest
 from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import METHODS
 from tactile_bayes.report.estimate_text import estimate_text
 

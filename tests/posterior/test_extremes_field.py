@@ -13,8 +13,9 @@ from posterior_maps import bump_values, grid_map
 from tactile_bayes.errors import UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.scan import Scan
 from tests.posterior.test_extremes import NOISE, NOTHING, few, float32, unknown_level, without_a_quadrant

@@ -16,8 +16,9 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions, default_errors, fit_bump
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.white.fit import default_errors, fit_bump
 
 UNIT = 37.0
 SLOPE = 0.002 * (np.arange(41) - 20.0)

@@ -12,9 +12,10 @@ from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.other_rises import Rise, other_rises
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.other_rises import other_rises
+from tactile_bayes.posterior.result import Estimate, Rise
 
 HALF_MM = 35.0
 SMALL = (15.0, 2.0)

@@ -10,9 +10,10 @@ from posterior_maps import bump_map, bump_values, grid_map
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior import search
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.cells import levelled
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 
 FIELD = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
 

@@ -161,7 +161,7 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
         return drawn.Drawn(None, None, draws, None, {}, None, size, None, None)
 
     monkeypatch.setattr(drawn, "_drawn", once)
-    from tactile_bayes.posterior.estimate import EstimateOptions
+    from tactile_bayes.posterior.options import EstimateOptions
 
     for options in (EstimateOptions(), EstimateOptions(accuracy_sd=0.01), EstimateOptions(accuracy_mm=0.02)):
         asked.clear()

@@ -19,8 +19,8 @@ from tactile_bayes.inference.rank_tests import (
     uniform_strays,
 )
 from tactile_bayes.posterior.correlated.noise import LENGTHS_MM
-from tactile_bayes.posterior.drawn import MapPosterior
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.report.sbc_text import verdict
 from tactile_bayes.studies import sbc
 from tactile_bayes.studies.sbc import DRAWS, ELSEWHERE, MapRanks, Truth, other_rises

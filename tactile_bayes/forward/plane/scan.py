@@ -15,14 +15,14 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import MOST_SEAT, Body, Layers
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.empirical import EmpiricalModel, fit_empirical
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.plane.condense import SurfaceCompliance, condense
+from tactile_bayes.forward.plane.empirical import EmpiricalModel, fit_empirical
 from tactile_bayes.forward.plane.line import press, press_layers
 from tactile_bayes.forward.plane.mesh import REACH_MM
 from tactile_bayes.forward.scene import Scene
-from tactile_bayes.forward.solid.scan import refuse_bumps, tissue_truth
 from tactile_bayes.forward.tissue import SceneBody, SolidLump, fat_thickness
+from tactile_bayes.forward.truth import refuse_bumps, tissue_truth
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import SHOULDERS_INSIDE
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_bayes.forward.empirical import EmpiricalModel, fit_empirical
+from tactile_bayes.forward.plane.empirical import EmpiricalModel, fit_empirical
 from tactile_bayes.forward.plane.line import LineFrames, TactileLine, build_line, press_layers
 from tactile_bayes.forward.plane.study import HARD_RATIO, Fit, LineFit, StudySettings
 from tactile_bayes.geometry import FloatArray

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import cache
-from typing import Any
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.head_face import HeadFace, head_face
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.scene import Head, Scene
@@ -18,6 +15,7 @@ from tactile_bayes.forward.solid.frames import PlacedLump, SolidHead, skin_pertu
 from tactile_bayes.forward.solid.layers import LayeredBody
 from tactile_bayes.forward.solid.mesh import LumpGeometry
 from tactile_bayes.forward.tissue import SceneBody, SolidLump, fat_thickness
+from tactile_bayes.forward.truth import refuse_bumps, tissue_truth
 from tactile_bayes.geometry import FloatArray
 
 Progress = Callable[[int, int], None]
@@ -50,27 +48,6 @@ def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress
         truth={"model": "solid", "head": scene.head.shoulders, **tissue_truth(scene)},
         rng=rng,
     )
-
-
-def tissue_truth(scene: Scene) -> dict[str, Any]:
-    """What lies below the skin, as plain data; the balls of a rib are no lumps."""
-    body = scene.body or SceneBody()
-    fat = fat_thickness(body, scene.solid_lumps)
-    return {
-        "lumps": [_lump_truth(lump, body, fat) for lump in scene.solid_lumps],
-        "ribs": [asdict(rib) | {"ball_x_mm": [ball.x_mm for ball in rib.balls()]} for rib in scene.ribs],
-        "body": asdict(body) | {"fat_mm": fat},
-        "background": asdict(scene.background),
-    }
-
-
-def refuse_bumps(scene: Scene, model: str) -> None:
-    """Raise BadDataError where the scene's lumps are no tissue, which `model` needs."""
-    if scene.lumps:
-        raise BadDataError(
-            "lump[0] gives no depth_ratio",
-            way_out=f"the {model} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
-        )
 
 
 def solid_frames(
@@ -141,13 +118,3 @@ def _placed(scene: Scene) -> list[PlacedLump]:
         change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
         placed.append(PlacedLump(change, lump.x_mm, lump.y_mm))
     return placed
-
-
-def _lump_truth(lump: SolidLump, body: SceneBody, fat_mm: float) -> dict[str, Any]:
-    seat = (fat_mm - lump.depth_mm) / (lump.vertical_mm / 2)
-    return asdict(lump) | {
-        "height_mm": lump.vertical_mm,
-        "seat": seat,
-        "depth_mm": lump.depth_mm,
-        "lump_kpa": lump.stiffness_ratio * body.fat_kpa,
-    }

@@ -14,13 +14,13 @@ from tactile_bayes.inference.cache import Solved
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.search import ROTATION_ODDS
-from tactile_bayes.posterior.white.fit import BumpFit, FitOptions, rotation_odds
+from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
+from tactile_bayes.posterior.white.fit import BumpFit, rotation_odds
 from tactile_bayes.posterior.white.residuals import level_offset
 from tactile_bayes.posterior.white.target import Target
 
 if TYPE_CHECKING:
-    from tactile_bayes.posterior.estimate import EstimateOptions
+    from tactile_bayes.posterior.options import EstimateOptions
 
 Progress = Callable[[int, int], None]
 

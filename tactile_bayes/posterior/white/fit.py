@@ -20,6 +20,7 @@ from tactile_bayes.posterior.lump.cells import (
     value_scale,
     window_cells,
 )
+from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white.residuals import ErrorModel, count_weights, error_model, independent_errors
 from tactile_bayes.posterior.white.target import LogPrior, Target, flat_prior
 from tactile_bayes.records import dataclass
@@ -42,40 +43,6 @@ PLACE_TOLERANCE = 1e-2
 """The same where least squares only finds the place: the posterior's mode is sought from there."""
 JOINED = 0.05
 """So near to a minimum, in the same units, a fit ends in it."""
-
-
-@dataclass(frozen=True, slots=True)
-class FitOptions:
-    """How a map is fitted; a size calibration records the same and must agree.
-
-    Parameters
-    ----------
-    background
-        ``"fixed"`` at the level that normalising defines (1 in Eq 7), or ``"free"``. A map whose level is not known
-        can only have a free one.
-    radius_mm
-        Cells within this distance of the lump's centre are fitted.
-    rotation
-        ``"auto"`` spends a rotation only where the map asks for it; ``"off"`` and ``"on"`` decide beforehand.
-    centre_mm
-        Where to look, in `plane`; None takes the highest bump that can be a lump.
-    noise
-        ``"independent"``: least squares, the likelihood divided by the inflation of correlated errors.
-        ``"field"``: correlated errors in the model; level and tilt are integrated out with them.
-    start_width_mm
-        About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`.
-    field_cosines
-        Of the noise field along each axis: more of them are slower and see finer correlation. None takes as many as the
-        bump's width calls for, see `correlated.noise.cosines_for`.
-    """
-
-    background: str = "fixed"
-    radius_mm: float = 20.0
-    rotation: str = "auto"
-    centre_mm: tuple[float, float] | None = None
-    noise: str = "independent"
-    start_width_mm: float | None = None
-    field_cosines: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

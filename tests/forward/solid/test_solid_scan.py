@@ -30,7 +30,8 @@ from tactile_bayes.geometry import (
     unroll_quaternion_signs,
 )
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.posterior.white.fit import FitOptions, find_bump
+from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.white.fit import find_bump
 
 Run = Callable[..., "CompletedProcess[str]"]
 SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)

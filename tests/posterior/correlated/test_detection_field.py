@@ -11,8 +11,9 @@ from posterior_maps import bump_map, correlated_field, grid_map
 
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 
 SIZE, NOISE = 51, 0.02
 # "none" stops after the question: no draws are made

@@ -15,8 +15,9 @@ from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.correlated.peakedness import _departure, ask_departure
 from tactile_bayes.posterior.correlated.selection import Structure
 from tactile_bayes.posterior.correlated.tangent import tangent_columns
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.scene_text import scene_lines
 
 AXIS = np.arange(-26.0, 27.0)

@@ -25,9 +25,10 @@ from tactile_bayes.posterior.correlated.marginal import independent_variance
 from tactile_bayes.posterior.correlated.pose_error import pose_covariance
 from tactile_bayes.posterior.correlated.tangent import tangent_columns
 from tactile_bayes.posterior.correlated.window import Window
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
+from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.cells import PoseNoise, window_cells
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import POSE_NOISE
 from tactile_bayes.report.estimate_text import estimate_text
 from tactile_bayes.report.map_text import map_text

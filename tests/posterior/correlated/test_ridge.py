@@ -7,8 +7,9 @@ import pytest
 from posterior_maps import grid_map
 
 from tactile_bayes.posterior.correlated import estimate as field_estimate
-from tactile_bayes.posterior.estimate import Estimate, EstimateOptions, estimate_map
-from tactile_bayes.posterior.white.fit import FitOptions
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate
 from tests.posterior.correlated.test_selection import AXIS, bump, errors
 
 

@@ -7,7 +7,8 @@ import pytest
 from posterior_maps import bump_map, correlated_field, grid_map
 
 from tactile_bayes.posterior.lump.cells import window_cells
-from tactile_bayes.posterior.white.fit import BumpFit, FitOptions, fit_bump
+from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.white.fit import BumpFit, fit_bump
 from tactile_bayes.posterior.white.residuals import count_weights, fitted_tilt, level_offset, residual_autocorrelation
 
 NOISE = 0.02

@@ -13,8 +13,9 @@ from scipy.special import erf
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white import fit as fit_module
-from tactile_bayes.posterior.white.fit import BumpFit, FitOptions, find_bump, fit_bump, rotation_odds
+from tactile_bayes.posterior.white.fit import BumpFit, find_bump, fit_bump, rotation_odds
 
 OFF = FitOptions(rotation="off")
 ON = FitOptions(rotation="on")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.empirical import (
+from tactile_bayes.forward.plane.empirical import (
     SHARE,
     EmpiricalModel,
     fit_empirical,

@@ -1,0 +1,120 @@
+"""How a map is fitted and estimated: one record, checked once, used by every step."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import TYPE_CHECKING
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.inference.draws import INDEPENDENT_DRAWS
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.pooling import SizePriors
+
+if TYPE_CHECKING:
+    from tactile_bayes.inference.chain_state import ChainStore
+
+DETECTED = 0.95
+ROTATION_ODDS = 3.0
+"""A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitOptions:
+    """How a map is fitted; a size calibration records the same and must agree.
+
+    Parameters
+    ----------
+    background
+        ``"fixed"`` at the level that normalising defines (1 in Eq 7), or ``"free"``. A map whose level is not known
+        can only have a free one.
+    radius_mm
+        Cells within this distance of the lump's centre are fitted.
+    rotation
+        ``"auto"`` spends a rotation only where the map asks for it; ``"off"`` and ``"on"`` decide beforehand.
+    centre_mm
+        Where to look, in `plane`; None takes the highest bump that can be a lump.
+    noise
+        ``"independent"``: least squares, the likelihood divided by the inflation of correlated errors.
+        ``"field"``: correlated errors in the model; level and tilt are integrated out with them.
+    start_width_mm
+        About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`.
+    field_cosines
+        Of the noise field along each axis: more of them are slower and see finer correlation. None takes as many as the
+        bump's width calls for, see `correlated.noise.cosines_for`.
+    """
+
+    background: str = "fixed"
+    radius_mm: float = 20.0
+    rotation: str = "auto"
+    centre_mm: tuple[float, float] | None = None
+    noise: str = "independent"
+    start_width_mm: float | None = None
+    field_cosines: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateOptions:
+    """Settings of an estimate.
+
+    Parameters
+    ----------
+    method
+        One of `presets.METHODS`.
+    fit
+        Background, window, rotation, centre, noise.
+    prior
+        On the bump.
+    least_probability
+        Below this probability of a lump there is no estimate.
+    max_steps
+        Of the ensemble; None for its default.
+    accuracy_sd
+        Wanted Monte-Carlo error of the ends of 95 % intervals, of sizes and widths alike, in posterior SDs; None for
+        the method's default.
+    size_priors
+        Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
+    scene
+        One of `selection.SCENES`, under a noise field.
+    accuracy_mm
+        The same in mm; the finer of the two holds. Under a noise field.
+    store
+        Where an ensemble keeps its state between runs, under a noise field.
+    draws
+        Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD.
+    """
+
+    method: str = "importance"
+    fit: FitOptions = field(default_factory=FitOptions)
+    prior: BumpPrior = field(default_factory=BumpPrior)
+    least_probability: float = DETECTED
+    max_steps: int | None = None
+    accuracy_sd: float | None = None
+    size_priors: SizePriors = field(default_factory=SizePriors)
+    scene: str = "auto"
+    accuracy_mm: float | None = None
+    store: ChainStore | None = None
+    draws: int = INDEPENDENT_DRAWS
+
+
+def check_options(options: EstimateOptions) -> None:
+    """Refuse options that contradict each other."""
+    if options.fit.noise != "field":
+        asked = {"scene": options.scene not in ("auto", "none"), "accuracy in mm": options.accuracy_mm is not None}
+        asked |= {"checkpoint": options.store is not None}
+        for name, given in asked.items():
+            if given:
+                raise UsageError(f"a {name} goes with correlated errors; give --noise field")
+        return
+    if options.store is not None and options.method != "ensemble":
+        raise UsageError("only the ensemble has checkpoints; give --method ensemble")
+    if options.method == "optimise":
+        raise UsageError("optimise is the paper's least squares and has no noise field; choose another --method")
+    if options.fit.background != "free":
+        raise UsageError("a noise field takes level and tilt with it; give --background free")
+
+
+def scene_asked(options: EstimateOptions) -> str:
+    """The scene asked for; the option that turns the ellipse decides where none was named."""
+    turned = {"on": "rotated", "off": "ellipse"}.get(options.fit.rotation, "auto")
+    return turned if options.scene == "auto" else options.scene

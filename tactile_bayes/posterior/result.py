@@ -1,0 +1,95 @@
+"""The answer for one map: an estimate, or the reason why there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, field
+from typing import TYPE_CHECKING, Literal
+
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.sensitivity import Sensitivity
+from tactile_bayes.posterior.white.detection import Detection
+from tactile_bayes.posterior.white.fit import BumpFit, Candidate
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.posterior import SizePosterior
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.correlated.selection import SceneChoice
+
+Status = Literal["estimate", "no_estimate"]
+
+
+@dataclass(frozen=True, slots=True)
+class Rise:
+    """Another rise.
+
+    Parameters
+    ----------
+    x_mm, y_mm
+        Its centre in `plane`.
+    distance_mm
+        From the lump that was measured; None where there is none.
+    amplitude, sigma_x_mm, sigma_y_mm
+        Of its bump at the mode; widths along the axes of its ellipse.
+    probability
+        That it is a lump, as `Detection` has it.
+    """
+
+    x_mm: float
+    y_mm: float
+    distance_mm: float | None
+    amplitude: float
+    sigma_x_mm: float
+    sigma_y_mm: float
+    probability: float
+
+    def as_dict(self) -> dict[str, float | None]:
+        """As JSON holds it."""
+        return {name: None if value is None else float(f"{value:.6g}") for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The answer for one map.
+
+    Parameters
+    ----------
+    status, reason
+        ``"estimate"``, or ``"no_estimate"`` and why. With an estimate the reason says what is missing from it, if
+        anything.
+    detection
+        None when no bump could be tested.
+    fit, draws, map_posterior, size
+        None without an estimate; `size` is None also without a size calibration.
+    candidates
+        Every place that was looked at.
+    diagnostics
+        Figures and flags for the report.
+    left_out
+        What the estimate does not contain, in words.
+    code, advice
+        Without an estimate: one of `abstention.CODES`, and what would fix it.
+    scene
+        Under a noise field: what the window holds, and what was asked about it.
+    sensitivity
+        How far the answer leans on the prior of the widths.
+    other_rises
+        Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked.
+    """
+
+    status: Status
+    reason: str
+    detection: Detection | None = None
+    fit: BumpFit | None = None
+    draws: ParameterDraws | None = None
+    map_posterior: MapPosterior | None = None
+    size: SizePosterior | None = None
+    candidates: tuple[Candidate, ...] = ()
+    diagnostics: Mapping[str, object] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    code: str = ""
+    advice: str = ""
+    scene: SceneChoice | None = None
+    sensitivity: Sensitivity | None = None
+    other_rises: tuple[Rise, ...] = ()
