@@ -60,6 +60,13 @@ _CODE = "A code, not a name."
 @click.option("--lubricant", metavar="TEXT", help="What was put on the skin.")
 @click.option("--examiner", metavar="CODE", help=_CODE)
 @click.option("--subject", metavar="CODE", help=_CODE)
+@click.option(
+    "--session",
+    "session_file",
+    type=_FILE,
+    metavar="SESSION.toml",
+    help="Take these five, and other plain text facts, from a file; an option overrides it.",
+)
 @click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
 @click.option(
     "--serve", metavar="HOST:PORT", help="Show it to a browser on this computer, with a tone for the pressure."
@@ -109,13 +116,16 @@ def _record(request: Request) -> tuple[Report, bool]:
     from tactile_bayes.commands.record_parts import instrument_of, provenance_of, refuse_calibration
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
     from tactile_bayes.files.schema import check_document
+    from tactile_bayes.files.session_toml import SCHEMA
     from tactile_bayes.hardware.recorder import Recorder
 
     head, calibration, landmarks = instrument_of(request)
+    facts = request.facts()
     with ExitStack() as stack:
         hello, lines = _connect(request, stack)
         _check_fit(hello, head, request)
-        check_document(request.session(hello), "scan_session.schema.json", path=request.output)
+        session = request.session(hello, facts)
+        check_document(session, SCHEMA, path=request.output)
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
         observer = _look_on(request, head, calibration, stack)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
@@ -123,7 +133,7 @@ def _record(request: Request) -> tuple[Report, bool]:
             stream,
             head=head,
             element_calibration=calibration,
-            session=request.session(hello),
+            session=session,
             provenance=provenance_of(request, request.settings(hello)),
         )
         stack.callback(writer.stop_syncing)

@@ -38,18 +38,34 @@ class Request:
     lubricant: str | None
     examiner: str | None
     subject: str | None
+    session_file: Path | None
     live: bool
     serve: str | None
     size_calibration: str
     force: bool
 
-    def session(self, hello: HelloReading) -> dict[str, str]:
-        """Plain text facts for the file."""
-        facts = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
+    def facts(self) -> dict[str, str]:
+        """Plain text facts of the session: the file's, and the options' where both name one.
+
+        Raises
+        ------
+        BadDataError
+            When the file cannot be read, or a fact is not as `scan_session.schema.json` has it.
+        """
+        from tactile_bayes.files.schema import check_document
+        from tactile_bayes.files.session_toml import SCHEMA, read_session
+
+        facts = read_session(self.session_file) if self.session_file else {}
+        options = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
+        facts |= {name: value for name, value in options.items() if value}
+        check_document(facts, SCHEMA, path=self.output)
+        return facts
+
+    def session(self, hello: HelloReading, facts: dict[str, str]) -> dict[str, str]:
+        """What the file records of the session: the devices, the clock, and the facts."""
         tracker = self.tracker_protocol if self.tracker_url else "none"
-        devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker}
-        more = {"clock": self.clock, "rotation": "inverted"} if self.invert_rotation else {"clock": self.clock}
-        return devices | more | {name: value for name, value in facts.items() if value}
+        devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker, "clock": self.clock}
+        return devices | ({"rotation": "inverted"} if self.invert_rotation else {}) | facts
 
     def settings(self, hello: HelloReading) -> dict[str, Any]:
         """For the provenance."""

@@ -119,7 +119,8 @@ def notes(path: Path) -> list[tuple[str, str]]:
 @pytest.mark.parametrize("tcp", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["pty", "tcp"])
 def test_a_recorded_scan_gives_the_bit_identical_map(record, tmp_path, source, scan, tcp):
     with head_and_tracker(scan, tcp=tcp, speed=FAST) as devices:
-        words = ["--clock", "shared", "--landmarks", source, "--side", "phantom", "--examiner", "E7"]
+        (tmp_path / "s.toml").write_text('side = "left"\nexaminer = "E7"\nvisit = "2"\n')
+        words = ["--clock", "shared", "--landmarks", source, "--side", "phantom", "--session", "s.toml"]
         done = record(*devices, *words)
     assert done.returncode == 0, done.stderr
     assert "200 frames in 0.995 s, 200.0 Hz; 120 poses" in done.stdout
@@ -132,7 +133,8 @@ def test_a_recorded_scan_gives_the_bit_identical_map(record, tmp_path, source, s
     one, other = build_map([file.scan]), build_map([scan])
     for name in ("mean", "variance", "count", "x_mm", "y_mm", "plane_from_base", "patient_from_plane"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-    assert file.scan.session["examiner"] == "E7"
+    session = file.scan.session
+    assert (session["side"], session["examiner"], session["visit"]) == ("phantom", "E7", "2"), "an option goes first"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
@@ -346,6 +348,24 @@ def test_mistakes_end_in_one_line(record, tmp_path, source, scan, words, code, s
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+SESSIONS = {
+    'clock = "shared"': "clock is set by the recording itself; leave clock out",
+    'subject = "two words"': "(found 'two words')",
+    "subject = 7": "subject must be string (found 7)",
+    'patient_name = "x"': "patient_name",
+    "side = left": "is not TOML",
+}
+
+
+@pytest.mark.parametrize("text", SESSIONS)
+def test_a_session_file_is_checked_before_a_port_is_opened(record, tmp_path, text):
+    (tmp_path / "s.toml").write_text(text)
+    done = record("--head", "/dev/nothing", "--session", "s.toml")
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
+    assert SESSIONS[text] in done.stderr
+    assert [one.name for one in tmp_path.iterdir()] == ["s.toml"]
 
 
 def test_keys_touch_landmarks_start_and_stop(child_environment, tmp_path, source, long_scan):
