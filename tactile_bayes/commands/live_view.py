@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.lump.posterior import MapPosterior
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
-    from tactile_bayes.size.eq6 import SizeCalibration
-    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.calibration import Calibration
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2
@@ -193,7 +192,7 @@ def _calibration_file(name: str) -> str | None:
 
 
 @cache
-def _calibration_of(path: str) -> SizeCalibration | LogQuadratic:
+def _calibration_of(path: str) -> Calibration:
     from tactile_bayes.files.size_json import read_size_calibration
 
     return read_size_calibration(Path(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,9 @@ from tactile_bayes.size.eq6 import (
     Recipe,
     SizeCalibration,
 )
-from tactile_bayes.size.log_quadratic import LogQuadratic
+
+if TYPE_CHECKING:
+    from tactile_bayes.size.calibration import Calibration
 
 SCHEMA = "tactile-bayes/size-calibration/1"
 SCHEMA_FILE = "size_calibration.schema.json"
@@ -50,7 +52,7 @@ def write_size_calibration(
     write_text(path, dump_json(document), force=force)
 
 
-def read_size_calibration(path: Path) -> SizeCalibration | LogQuadratic:
+def read_size_calibration(path: Path) -> Calibration:
     """Read a size calibration of either form.
 
     Raises

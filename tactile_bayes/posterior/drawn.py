@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,10 +20,9 @@ from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_indepen
 from tactile_bayes.posterior.white.fit import BumpFit
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.eq6 import SizeCalibration
-from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
-from tactile_bayes.size.posterior import SizePosterior, push_sizes
+from tactile_bayes.size.calibration import Calibration, draw_sizes
+from tactile_bayes.size.pooling import SizePriors
+from tactile_bayes.size.posterior import SizePosterior
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.estimate import FieldAnswer
@@ -47,7 +46,7 @@ class Drawn:
     scene: SceneChoice | None
     size: SizePosterior | None
     fault: Abstention | None
-    calibration: SizeCalibration | LogQuadratic | None
+    calibration: Calibration | None
     too_far: tuple[str, ...] = ()
 
 
@@ -55,7 +54,7 @@ def draw_sized(
     tactile_map: TactileMap,
     fit: BumpFit,
     seen: Detection | FieldAnswer,
-    calibration: SizeCalibration | LogQuadratic | None,
+    calibration: Calibration | None,
     options: EstimateOptions,
     *,
     rng: np.random.Generator,
@@ -95,7 +94,7 @@ def _drawn(
     tactile_map: TactileMap,
     fit: BumpFit,
     seen: Detection | FieldAnswer,
-    calibration: SizeCalibration | LogQuadratic | None,
+    calibration: Calibration | None,
     options: EstimateOptions,
     *,
     rng: np.random.Generator,
@@ -117,7 +116,7 @@ def _drawn(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
     calibration = fitting_calibration(posterior, calibration)
-    far = tuple(range_faults(posterior, calibration, "too_far"))
+    far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
     size = None if fault or far else _size(posterior, draws, calibration, options.size_priors, rng=rng)
     return Drawn(detection, fit, draws, posterior, figures, scene, size, fault, calibration, far)
 
@@ -125,32 +124,22 @@ def _drawn(
 def _size(
     posterior: MapPosterior,
     draws: ParameterDraws,
-    calibration: SizeCalibration | LogQuadratic | None,
+    calibration: Calibration | None,
     priors: SizePriors,
     *,
     rng: np.random.Generator,
 ) -> SizePosterior | None:
     if calibration is None:
         return None
-    if isinstance(calibration, LogQuadratic):
-        shape_draws = ShapeDraws.of(
-            posterior.amplitude,
-            posterior.sigma_x_mm,
-            posterior.sigma_y_mm,
-            posterior.angle_rad,
-            labels=draws.replicates,
-        )
-        size = pooled_size([shape_draws], calibration=calibration, priors=priors, rng=rng)
-        shape = posterior.amplitude.shape
-        return replace(size, d_x_mm=size.d_x_mm.reshape(shape), d_y_mm=size.d_y_mm.reshape(shape))
-    return push_sizes(
+    return draw_sizes(
         posterior.amplitude,
         posterior.sigma_x_mm,
         posterior.sigma_y_mm,
         posterior.angle_rad,
         calibration=calibration,
-        rng=rng,
+        priors=priors,
         replicates=draws.replicates,
+        rng=rng,
     )
 
 
@@ -178,30 +167,6 @@ def _draw_under_field(
     )
 
 
-def medians(posterior: MapPosterior) -> tuple[float, float, float]:
-    """sigma_x_mm, sigma_y_mm and amplitude in the middle of the posterior."""
-    x, y, a = (np.median(v) for v in (posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.amplitude))
-    return float(x), float(y), float(a)
-
-
-def fitting_calibration(
-    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None
-) -> SizeCalibration | LogQuadratic | None:
+def fitting_calibration(posterior: MapPosterior, calibration: Calibration | None) -> Calibration | None:
     """The calibration without the depth of fat where no body of its table looks like the map at that depth."""
-    if not isinstance(calibration, LogQuadratic):
-        return calibration
-    sigma_x, sigma_y, amplitude = medians(posterior)
-    return calibration.fitting(amplitude, float(np.sqrt(sigma_x * sigma_y)))
-
-
-def range_faults(
-    posterior: MapPosterior, calibration: SizeCalibration | LogQuadratic | None, how: Literal["outside", "too_far"]
-) -> list[str]:
-    """In what a map lies outside the calibration's table, or too far outside it for a size, in words."""
-    sigma_x, sigma_y, amplitude = medians(posterior)
-    if calibration is None:
-        return []
-    if isinstance(calibration, LogQuadratic):
-        return list(getattr(calibration, how)(amplitude, float(np.sqrt(sigma_x * sigma_y))))
-    found = [f"x: {text}" for text in getattr(calibration.x, how)(sigma_x, amplitude)]
-    return found + [f"y: {text}" for text in getattr(calibration.y, how)(sigma_y, amplitude)]
+    return None if calibration is None else calibration.fitting(*posterior.medians)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import no_bump, searched, undetected
-from tactile_bayes.posterior.drawn import draw_sized, medians, range_faults
+from tactile_bayes.posterior.drawn import draw_sized
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions, check_options
 from tactile_bayes.posterior.result import Estimate
@@ -20,15 +19,11 @@ from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import BumpFit, Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
+from tactile_bayes.size import omissions
+from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.calibration_range import extrapolated
-from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.fat_depth import head_profile
-from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import fat_left_out
 from tactile_bayes.size.posterior import SizePosterior
-
-if TYPE_CHECKING:
-    pass
 
 MOST_INVALID = 0.05
 
@@ -36,7 +31,7 @@ MOST_INVALID = 0.05
 def estimate_map(
     tactile_map: TactileMap,
     *,
-    calibration: SizeCalibration | LogQuadratic | None,
+    calibration: Calibration | None,
     options: EstimateOptions,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] | None = None,
@@ -139,18 +134,12 @@ def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: E
     return prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior)
 
 
-def calibration_for(
-    tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic
-) -> SizeCalibration | LogQuadratic:
+def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibration:
     """The calibration for the depth of fat that the map tells, where both know of it."""
-    if not isinstance(calibration, LogQuadratic):
-        return calibration
     return calibration.at_fat([head_profile(tactile_map.quality)])
 
 
-def recipe_differences(
-    tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic, fit: FitOptions
-) -> list[str]:
+def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: FitOptions) -> list[str]:
     """What differs between a map with its fit and the calibration's recipe, in words; empty when nothing does."""
     return calibration.recipe.differences(
         normalise=tactile_map.recipe.normalise,
@@ -161,7 +150,7 @@ def recipe_differences(
     )
 
 
-def check_recipe(tactile_map: TactileMap, calibration: SizeCalibration | LogQuadratic, fit: FitOptions) -> None:
+def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: FitOptions) -> None:
     """Refuse a map or fit options that differ from the recipe the calibration was learned with."""
     differs = recipe_differences(tactile_map, calibration, fit)
     if differs:
@@ -175,22 +164,22 @@ def _diagnostics(
     tactile_map: TactileMap,
     fit: BumpFit,
     posterior: MapPosterior,
-    calibration: SizeCalibration | LogQuadratic | None,
+    calibration: Calibration | None,
 ) -> dict[str, object]:
-    sigma_x, sigma_y, _ = medians(posterior)
+    _, sigma_x, sigma_y = posterior.medians
     return {
         "cells": len(fit.cells),
         "covered_share": fit.covered_share,
         "coarse_cells": tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(sigma_x, sigma_y),
-        "outside_calibration": range_faults(posterior, calibration, "outside"),
-        **({"fat_mm": calibration.fat_mm} if isinstance(calibration, LogQuadratic) else {}),
+        "outside_calibration": [] if calibration is None else calibration.outside(*posterior.medians),
+        "fat_mm": None if calibration is None else calibration.fat_mm,
     }
 
 
 def _left_out(
     tactile_map: TactileMap,
     options: EstimateOptions,
-    calibration: SizeCalibration | LogQuadratic | None,
+    calibration: Calibration | None,
     diagnostics: Mapping[str, object],
 ) -> tuple[str, ...]:
     notes = []
@@ -201,11 +190,6 @@ def _left_out(
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
     if options.fit.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")
-    between = options.size_priors.between_maps
-    if not isinstance(calibration, LogQuadratic) or between.median <= 0:
-        notes.append("spread between maps of one mass (15 % in the paper): this is one map")
-    if isinstance(calibration, SizeCalibration) and calibration.axes == ("both",):
-        notes.append("a difference between the head's axes: the calibration has one width")
-    if isinstance(calibration, LogQuadratic) and calibration.fat_note:
-        notes.append(fat_left_out(calibration.fat_note))
-    return tuple(notes)
+    if calibration is None:
+        return (*notes, omissions.SPREAD)
+    return (*notes, *calibration.omissions(options.size_priors.between_maps.median))

@@ -11,8 +11,9 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
 from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text, variance_text
+from tactile_bayes.size import omissions
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import PooledEstimate, fat_left_out
+from tactile_bayes.size.pooling import PooledEstimate
 
 SCHEMA = "tactile-bayes/pooled/1"
 SIZES = ("max_size_mm", "min_size_mm")
@@ -46,7 +47,7 @@ def pooled_document(
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
-        "left_out": [fat_left_out(used.fat_note)] if used.fat_note else [],
+        "left_out": [omissions.fat_depth(used.fat_note)] if used.fat_note else [],
         "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
         "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, field
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
+from tactile_bayes.size import omissions
 from tactile_bayes.size.calibration_range import outside_domain, too_far
 
 COEFFICIENTS = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
@@ -189,3 +190,34 @@ class SizeCalibration:
     def __post_init__(self) -> None:
         if not -1.0 <= self.residual_correlation <= 1.0:
             raise BadDataError(f"residual_correlation is {self.residual_correlation}", way_out="it must lie in -1 to 1")
+
+    @property
+    def fat_mm(self) -> None:
+        """The depth of fat that the calibration is for: Eq 6 has none."""
+
+    def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> SizeCalibration:
+        """This calibration: Eq 6 has no depth of fat."""
+        del profiles
+        return self
+
+    def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> SizeCalibration:
+        """This calibration: there is no other for other maps."""
+        del amplitude, sigma_x_mm, sigma_y_mm
+        return self
+
+    def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
+        """In what a map lies outside the tables of the two axes, in words; empty when it lies inside."""
+        return self._by_axis(self.x.outside(sigma_x_mm, amplitude), self.y.outside(sigma_y_mm, amplitude))
+
+    def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
+        """In what a map lies so far outside the tables that there is no size, in words."""
+        return self._by_axis(self.x.too_far(sigma_x_mm, amplitude), self.y.too_far(sigma_y_mm, amplitude))
+
+    @staticmethod
+    def _by_axis(x: Sequence[str], y: Sequence[str]) -> list[str]:
+        return [f"x: {text}" for text in x] + [f"y: {text}" for text in y]
+
+    def omissions(self, between_map_sd: float) -> list[str]:
+        """What a size does not contain, in words; Eq 6 knows no spread between maps."""
+        del between_map_sd
+        return [omissions.SPREAD] + ([omissions.ONE_WIDTH] if self.axes == ("both",) else [])

@@ -22,6 +22,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
+from tactile_bayes.size import omissions
 from tactile_bayes.size.calibration_range import outside_domain, too_far
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import ORDER as FAT_ORDER
@@ -132,11 +133,12 @@ class LogQuadratic:
             any_depth=replace(self, fat_cubic=None),
         )
 
-    def fitting(self, amplitude: float, sigma_mm: float) -> LogQuadratic:
+    def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> LogQuadratic:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth.
 
         A polynomial of third order says nothing beyond its table: there sizes were wrong by up to a factor of 11.
         """
+        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         if self.any_depth is None or self.leverage(amplitude, sigma_mm) <= MOST_LEVERAGE:
             return self
         what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
@@ -205,8 +207,9 @@ class LogQuadratic:
         x = self.terms(np.log(np.array(amplitude)), np.log(np.array(sigma_mm)))
         return float(x @ self.information_inverse @ x) / self.most_leverage
 
-    def outside(self, amplitude: float, sigma_mm: float) -> list[str]:
+    def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies outside the table, in words; empty when it lies inside."""
+        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         found = outside_domain(self.domain, amplitude, sigma_mm)
         if not found and self.leverage(amplitude, sigma_mm) > MOST_LEVERAGE:
             found.append(self._unlike(amplitude, sigma_mm))
@@ -214,18 +217,35 @@ class LogQuadratic:
             found.append(f"{self.fat_note}, so that depth is not used")
         return found
 
-    def too_far(self, amplitude: float, sigma_mm: float) -> list[str]:
+    def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
         """In what a map lies so far outside the table that there is no size, in words."""
+        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         found = too_far(self.domain, amplitude, sigma_mm)
         if not found and self.leverage(amplitude, sigma_mm) > FARTHEST_LEVERAGE:
             found.append(self._unlike(amplitude, sigma_mm))
         return found
+
+    def omissions(self, between_map_sd: float) -> list[str]:
+        """What a size from one map does not contain, in words.
+
+        Parameters
+        ----------
+        between_map_sd
+            Median of the prior on the spread of ln d between maps of one mass; 0 leaves the term out.
+        """
+        spread = [] if between_map_sd > 0 else [omissions.SPREAD]
+        return spread + ([omissions.fat_depth(self.fat_note)] if self.fat_note else [])
 
     def _unlike(self, amplitude: float, sigma_mm: float) -> str:
         return (
             f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike any of the table "
             f"(leverage {self.leverage(amplitude, sigma_mm):.1f} times its largest)"
         )
+
+
+def mean_width_mm(sigma_x_mm: float, sigma_y_mm: float | None) -> float:
+    """The geometric mean of two widths; one alone stands for both."""
+    return float(np.sqrt(sigma_x_mm * (sigma_x_mm if sigma_y_mm is None else sigma_y_mm)))
 
 
 def quadratic_terms(u: FloatArray, v: FloatArray) -> FloatArray:

@@ -254,11 +254,6 @@ def _left_open(
     }
 
 
-def fat_left_out(why: str) -> str:
-    """What sizes do without where maps do not tell the depth of the fat."""
-    return f"the depth of the fat, which would narrow the size: {why}"
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PooledEstimate:
     """The answer for one mass.

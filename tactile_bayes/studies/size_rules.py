@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.forward.plane.study import StudyRow, learn_as_printed
+from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.eq6 import SizeCalibration
-from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.log_quadratic import LogQuadratic, mean_width_mm
 from tactile_bayes.studies.forward_tradeoff import Measured
 
 Sizes = Callable[[float, float, float | None], list[float]]
@@ -72,7 +73,7 @@ def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
     return SizeRule(sizes, scatter, f"Eq 6 in two stages from {len(shown)} hard {kind} of 10 to 25 mm in this body")
 
 
-def calibrated_rule(calibration: SizeCalibration | LogQuadratic, *, name: str) -> SizeRule:
+def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
     """The point estimate of a calibration of either form; `name` is for people."""
     if isinstance(calibration, LogQuadratic):
         return _quadratic_rule(calibration, name)
@@ -105,15 +106,9 @@ def _quadratic_rule(calibration: LogQuadratic, name: str) -> SizeRule:
     has one width, which stands for both.
     """
 
-    def mean_width(sigma_x_mm: float, sigma_y_mm: float | None) -> float:
-        return float(np.sqrt(sigma_x_mm * (sigma_x_mm if sigma_y_mm is None else sigma_y_mm)))
-
     def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        width = mean_width(sigma_x_mm, sigma_y_mm)
+        width = mean_width_mm(sigma_x_mm, sigma_y_mm)
         return [float(np.exp(calibration.log_size(np.log(np.array(amplitude)), np.log(np.array(width)))))]
 
-    def outside(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[str]:
-        return calibration.outside(amplitude, mean_width(sigma_x_mm, sigma_y_mm))
-
     scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.mean[6])))
-    return SizeRule(sizes, float(scatter), f"the log-quadratic of {name}", outside)
+    return SizeRule(sizes, float(scatter), f"the log-quadratic of {name}", calibration.outside)

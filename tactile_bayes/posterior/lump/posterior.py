@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
 
@@ -18,3 +20,9 @@ class MapPosterior:
     angle_rad: FloatArray
     background: FloatArray
     noise_sd: FloatArray
+
+    @property
+    def medians(self) -> tuple[float, float, float]:
+        """Amplitude, sigma_x_mm and sigma_y_mm in the middle of the posterior."""
+        amplitude, x, y = (float(np.median(v)) for v in (self.amplitude, self.sigma_x_mm, self.sigma_y_mm))
+        return amplitude, x, y
