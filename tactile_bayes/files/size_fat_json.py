@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from tactile_bayes.files.size_parts_json import hidden_document, number, numbers, parse_hidden
+from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.fat_depth import POWERS, ROUND, FatCubic, FatDepth
 
@@ -52,20 +50,20 @@ def parse_fat(document: dict[str, Any]) -> FatCubic:
     """
     depth, balls, centre = document["depth"], document["round_lumps"], document["centre"]
     low, high = document["fat_mm"]
-    arrays = {name: np.asarray(depth[name], dtype=np.float64) for name in ("centre", "scale", "coefficients")}
+    arrays = {name: array_of(depth, name) for name in ("centre", "scale", "coefficients")}
     return FatCubic(
         depth=FatDepth(
             **arrays,
-            information_inverse=np.asarray(depth["information_inverse"], dtype=np.float64),
+            information_inverse=array_of(depth, "information_inverse"),
             most_leverage=float(depth["most_leverage"]),
             log_sd=float(depth["log_sd"]),
         ),
         centre=(float(centre["log_amplitude"]), float(centre["log_width"]), float(centre["log_fat"])),
-        mean=np.asarray(document["mean"], dtype=np.float64),
-        covariance=np.asarray(document["covariance"], dtype=np.float64),
-        round_coefficients=np.asarray(balls["coefficients"], dtype=np.float64),
+        mean=array_of(document, "mean"),
+        covariance=array_of(document, "covariance"),
+        round_coefficients=array_of(balls, "coefficients"),
         round_sd=(float(balls["body_sd"]), float(balls["exam_sd"])),
-        information_inverse=np.asarray(document["information_inverse"], dtype=np.float64),
+        information_inverse=array_of(document, "information_inverse"),
         most_leverage=float(document["most_leverage"]),
         fat_mm=(float(low), float(high)),
         hidden=parse_hidden(document["hidden"], terms=len(POWERS)),

@@ -15,7 +15,7 @@ from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.files.shipped import is_shipped
-from tactile_bayes.files.size_parts_json import number
+from tactile_bayes.files.size_parts_json import array_of, number
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.eq6 import (
     COEFFICIENTS,
@@ -111,7 +111,7 @@ def _axis_document(axis: AxisCalibration) -> dict[str, Any]:
 
 def _axis(document: dict[str, Any]) -> AxisCalibration:
     return AxisCalibration(
-        draws=np.asarray(document["draws"], dtype=np.float64),
+        draws=array_of(document, "draws"),
         reference_amplitude=float(document["reference_amplitude"]),
         domain={name: (float(low), float(high)) for name, (low, high) in document["domain"].items()},
         fit={name: float(value) for name, value in document["fit"].items()},

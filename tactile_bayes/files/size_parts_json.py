@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.hidden import HiddenTerms
 
 
@@ -26,11 +27,25 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
     if document is None:
         return None
     names, k = tuple(document["names"]), len(document["names"])
-    arrays = [np.asarray(document[name], dtype=np.float64) for name in ("expected", "covariance", "with_body")]
+    arrays = [array_of(document, name) for name in ("expected", "covariance", "with_body")]
     if [array.shape for array in arrays] != [(k, terms), (k, k), (k,)]:
         raise BadDataError("hidden has arrays of other sizes than its names", way_out="learn the calibration anew")
     expected, covariance, with_body = arrays
     return HiddenTerms(names, expected, covariance, with_body, float(document["body_variance"]))
+
+
+def array_of(document: dict[str, Any], name: str) -> FloatArray:
+    """The array that nested lists of numbers make.
+
+    Raises
+    ------
+    BadDataError
+        When its rows differ in length.
+    """
+    try:
+        return np.asarray(document[name], dtype=np.float64)
+    except ValueError:
+        raise BadDataError(f"{name} has rows of different lengths", way_out="learn the calibration anew") from None
 
 
 def number(value: float) -> float:

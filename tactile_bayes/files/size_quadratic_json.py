@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.files.size_fat_json import fat_document, parse_fat
-from tactile_bayes.files.size_parts_json import hidden_document, number, numbers, parse_hidden
+from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import RoundLumps
@@ -69,12 +67,10 @@ def parse_log_quadratic(document: dict[str, Any], *, path: Path) -> LogQuadratic
     try:
         return LogQuadratic(
             centre=(float(document["centre"]["log_amplitude"]), float(document["centre"]["log_width"])),
-            mean=np.asarray(document["mean"], dtype=np.float64),
-            covariance=np.asarray(document["covariance"], dtype=np.float64),
-            round_lumps=RoundLumps(
-                np.asarray(balls["coefficients"], dtype=np.float64), float(balls["body_sd"]), float(balls["exam_sd"])
-            ),
-            information_inverse=np.asarray(document["information_inverse"], dtype=np.float64),
+            mean=array_of(document, "mean"),
+            covariance=array_of(document, "covariance"),
+            round_lumps=RoundLumps(array_of(balls, "coefficients"), float(balls["body_sd"]), float(balls["exam_sd"])),
+            information_inverse=array_of(document, "information_inverse"),
             most_leverage=float(document["most_leverage"]),
             domain={name: (float(low), float(high)) for name, (low, high) in document["domain"].items()},
             recipe=Recipe(**document["recipe"]),

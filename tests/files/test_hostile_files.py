@@ -152,10 +152,16 @@ def test_a_key_of_a_few_parts_is_no_long_one() -> None:
     assert parse_toml("[a.b]\nc.'d e'.f = 1\nx = '1.2.3.4'\n", way_out="")["a"]["b"]["c"]["d e"]["f"] == 1
 
 
-def test_a_calibration_with_a_short_row_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "place",
+    [("covariance",), ("hidden", "expected"), ("hidden", "covariance"), ("fat_cubic", "hidden", "expected"),
+     ("fat_cubic", "covariance"), ("fat_cubic", "depth", "information_inverse")],
+    ids=".".join,
+)  # fmt: skip
+def test_a_calibration_with_a_short_row_is_one_line(place: tuple[str, ...], tmp_path: Path) -> None:
     path = tmp_path / "size.json"
-    path.write_text(hostile.ragged_calibration(PACKAGE / "calibrations" / "solid.json"))
-    with pytest.raises(BadDataError):
+    path.write_text(hostile.ragged_calibration(PACKAGE / "calibrations" / "solid.json", *place))
+    with pytest.raises(BadDataError, match=place[-1]):
         read_size_calibration(path)
 
 

@@ -107,10 +107,13 @@ def deflate_bomb(path: Path, megabytes: int) -> None:
         file["mean"].id.write_direct_chunk((0, 0), data + bytes(4))
 
 
-def ragged_calibration(source: Path) -> str:
-    """A size calibration in which one row of a matrix is short."""
+def ragged_calibration(source: Path, *place: str) -> str:
+    """A size calibration in which one row of the matrix at `place` is short."""
     document = json.loads(source.read_text())
-    document["covariance"][0] = document["covariance"][0][:-1]
+    matrix = document
+    for name in place:
+        matrix = matrix[name]
+    matrix[0] = matrix[0][:-1]
     return json.dumps(document)
 
 
