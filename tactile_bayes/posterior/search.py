@@ -59,7 +59,7 @@ def search(
             continue
         seen, fault = _look(tactile_map, candidate.fit, options)
         if fault:
-            tried[-1] = replace(candidate, fault=fault)
+            tried[-1] = replace(candidate, fault=fault, detection=_detection(seen))
             continue
         detection = _detection(seen)
         if detection.probability >= options.least_probability:
@@ -118,6 +118,7 @@ def _close_search(
             continue
         fit = _with_cells_of(tactile_map, fit, settings)
         seen, fault = _look(tactile_map, fit, options)
+        tried[i] = replace(candidate, detection=_detection(seen))
         if isinstance(seen, Detection) or fault:
             continue
         if seen.detection.probability >= options.least_probability:
@@ -137,18 +138,24 @@ def best_chance(
     fit to a single cell says nothing of a lump and is passed over.
     """
     weighed: list[tuple[Candidate, Detection]] = []
-    settings, found_on = _search_options(tactile_map, options.fit), levelled(tactile_map)
     for candidate in candidates:
-        fit = candidate.fit
-        if fit is None or candidate.fault.startswith(OUTGROWN):
-            fit, _ = fit_close(found_on, candidate.centre_mm, options=settings)
-        if fit is None or min(fit.widths()[:2]) < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
-            continue
-        seen, _ = _look(tactile_map, _with_cells_of(tactile_map, fit, settings), options)
-        weighed.append((candidate, _detection(seen)))
+        detection = candidate.detection or _weighed(tactile_map, candidate, options)
+        if detection is not None:
+            weighed.append((candidate, detection))
         if len(weighed) == MOST_LOOKS:
             break
     return max(weighed, key=lambda one: one[1].probability) if weighed else None
+
+
+def _weighed(tactile_map: TactileMap, candidate: Candidate, options: EstimateOptions) -> Detection | None:
+    """Odds of a lump at a place that has a fault, from close by where its fit ran away or outgrew the window."""
+    fit, settings = candidate.fit, _search_options(tactile_map, options.fit)
+    if fit is None or candidate.fault.startswith(OUTGROWN):
+        fit, _ = fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
+    if fit is None or min(fit.widths()[:2]) < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
+        return None
+    seen, _ = _look(tactile_map, _with_cells_of(tactile_map, fit, settings), options)
+    return _detection(seen)
 
 
 def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:

@@ -21,6 +21,7 @@ from tactile_bayes.posterior.lump.cells import (
     window_cells,
 )
 from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.residuals import ErrorModel, count_weights, error_model, independent_errors
 from tactile_bayes.posterior.white.target import LogPrior, Target, flat_prior
 from tactile_bayes.records import dataclass
@@ -114,11 +115,24 @@ class BumpFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """One place looked at: its fit when there is one, and why it cannot be a lump (empty when it can)."""
+    """One place looked at.
+
+    Parameters
+    ----------
+    centre_mm
+        Where the search began.
+    fit
+        None where least squares found no minimum.
+    fault
+        Why the place cannot be a lump; empty when it can.
+    detection
+        Odds of a lump there; None where nobody has weighed them.
+    """
 
     centre_mm: tuple[float, float]
     fit: BumpFit | None
     fault: str
+    detection: Detection | None = None
 
 
 def find_bump(tactile_map: TactileMap, options: FitOptions) -> list[Candidate]:
