@@ -132,18 +132,19 @@ def _close_search(
 def best_chance(
     tactile_map: TactileMap, candidates: Sequence[Candidate], options: EstimateOptions
 ) -> tuple[Candidate, Detection] | None:
-    """The likeliest lump among the highest rises, none of which can be measured; None where none can be weighed.
+    """The likeliest lump among rises none of which can be measured; None where none can be weighed.
 
-    `MOST_LOOKS` of them are weighed all the same, from a smaller window where the fit ran away or outgrew its own. A
-    fit to a single cell says nothing of a lump and is passed over.
+    Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too,
+    from a smaller window where the fit ran away or outgrew its own. A fit to a single cell says nothing of a lump and
+    is passed over.
     """
-    weighed: list[tuple[Candidate, Detection]] = []
+    weighed = [(one, one.detection) for one in candidates if one.detection is not None]
     for candidate in candidates:
-        detection = candidate.detection or _weighed(tactile_map, candidate, options)
+        if len(weighed) >= MOST_LOOKS:
+            break
+        detection = None if candidate.detection else _weighed(tactile_map, candidate, options)
         if detection is not None:
             weighed.append((candidate, detection))
-        if len(weighed) == MOST_LOOKS:
-            break
     return max(weighed, key=lambda one: one[1].probability) if weighed else None
 
 

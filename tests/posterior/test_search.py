@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from posterior_maps import bump_map, bump_values, grid_map
+from scipy.ndimage import gaussian_filter
 
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior import search
@@ -14,6 +15,7 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.cells import levelled
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.white.fit import BumpFit
 
 FIELD = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
 
@@ -50,6 +52,24 @@ def test_a_lower_lump_is_found_behind_a_rise_at_the_edge():
     assert np.median(found.map_posterior.x_mm) == pytest.approx(-12.0, abs=1.0)
     assert np.median(found.map_posterior.sigma_x_mm) == pytest.approx(4.0, rel=0.15)
     assert any("rim" in candidate.fault or "ran away" in candidate.fault for candidate in found.candidates)
+
+
+def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hills 6 mm wide that are no lump: seven weighings, two of them repeated, before a place kept its own."""
+    hills = gaussian_filter(np.random.default_rng(5).standard_normal((81, 81)), 6.0, mode="wrap")
+    weigh, places = search._look, []
+
+    def counted(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> object:
+        places.append(tuple(fit.theta[1:3]))
+        return weigh(tactile_map, fit, options)
+
+    monkeypatch.setattr(search, "_look", counted)
+    found = look(grid_map(1.0 + 0.05 * hills / hills.std() + noise(104)))
+    assert found.status == "no_estimate"
+    assert len(places) == len(set(places)) == 4
+    weighed = [one.detection.probability for one in found.candidates if one.detection is not None]
+    assert found.detection is not None
+    assert found.detection.probability == max(weighed)
 
 
 def beside_a_rib(amplitude: float) -> TactileMap:
