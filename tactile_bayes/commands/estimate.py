@@ -14,7 +14,7 @@ import click
 from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import FiniteRange, WholeOrAuto
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
 
@@ -203,7 +203,8 @@ def command(
     if figure is not None and size_calibration == "none":
         raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
     outputs = {"output": output, "figure": figure, "map figure": map_figure}
-    _check_outputs([path for path in outputs.values() if path], maps, _named(size_calibration), pool, force=force)
+    _check_outputs([path for path in outputs.values() if path], maps, pool, force=force)
+    also_read(_named(size_calibration))
     begun = time.perf_counter()
     if pool:
         from tactile_bayes.commands.estimate_pool import estimate_pool
@@ -229,10 +230,8 @@ def _named(calibration: str | None) -> Path | None:
     return None if calibration is None else size_calibration_path(calibration)
 
 
-def _check_outputs(
-    outputs: list[Path], maps: tuple[Path, ...], calibration: Path | None, pool: bool, *, force: bool
-) -> None:
-    """Stop before any work is done if an output cannot be written or would destroy an input."""
+def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, force: bool) -> None:
+    """Stop before any work is done if an output cannot be written."""
     from tactile_bayes.files.atomic import refuse_existing
 
     twice = [path for index, path in enumerate(maps) if path in maps[:index]]
@@ -240,12 +239,7 @@ def _check_outputs(
         raise UsageError(f"{twice[0]} is given twice; give each map once")
     if outputs and len(maps) > 1 and not pool:
         raise UsageError("--output and the figures take one map at a time; use --json for several")
-    if len({path.absolute() for path in outputs}) < len(outputs):
-        raise UsageError("two outputs have one name; choose another for one of them")
-    inputs = [path for path in (*maps, calibration) if path is not None and path.exists()]
     for path in outputs:
-        if any(path.exists() and path.samefile(one) for one in inputs):
-            raise UsageError(f"{path} is an input of this command; choose another name for the output")
         refuse_existing(path, force=force)
 
 

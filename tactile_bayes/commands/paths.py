@@ -46,6 +46,19 @@ class FilePath(click.Path):
         return path
 
 
+def also_read(*paths: Path | None) -> None:
+    """Refuse the call if it writes one of the files that it reads besides those on its command line.
+
+    Raises
+    ------
+    UsageError
+        When one of its outputs is one of them.
+    """
+    context = click.get_current_context(silent=True)
+    seen: list[tuple[Path, bool]] = [] if context is None else context.meta.get(_SEEN, [])
+    refuse_same([path for path, written in seen if written], [path for path in paths if path is not None])
+
+
 def refuse_same(
     outputs: Iterable[Path | None], inputs: Iterable[Path], *, what: str = "an input of this command"
 ) -> None:

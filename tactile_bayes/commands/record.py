@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.commands.record_request import Request
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
 
@@ -90,10 +90,12 @@ def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
     Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
     """
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.report.record_text import record_text
 
     refuse_existing(output, force=bool(options["force"]))
     request = Request(output=output, **options)
+    also_read(size_calibration_path(request.size_calibration))
     if request.tracker_rom is not None and (request.tracker_protocol != "ndi" or not request.tracker_rom.is_file()):
         raise UsageError(
             f"--tracker-rom {request.tracker_rom} is "

@@ -64,12 +64,16 @@ def command(
     """
     import json
 
+    from tactile_bayes.commands.paths import also_read
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.presets import RESEARCH_USE
     from tactile_bayes.report.tradeoff_text import tradeoff_document, tradeoff_text
 
     if figure is not None:
         refuse_existing(figure, force=force)
+    if size_calibration not in (None, "learned"):
+        also_read(size_calibration_path(size_calibration))
     report = run_tradeoff(_case(scene), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
     if figure is not None:
         from tactile_bayes.report.tradeoff_figures import draw_tradeoff

@@ -24,6 +24,7 @@ class TrialInputs:
 
 def load_trial(trial: Path, excision: Path, columns: Path | None) -> TrialInputs:
     """Read and check both tables; `columns` maps a wide one."""
+    from tactile_bayes.commands.paths import also_read
     from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
     from tactile_bayes.files.size_posterior import fill_from_posteriors
     from tactile_bayes.files.tables import check_references, read_table
@@ -38,6 +39,7 @@ def load_trial(trial: Path, excision: Path, columns: Path | None) -> TrialInputs
     table = read_table(trial, "trial.table.json") if columns is None else read_wide(trial, columns)
     check_references(table, "trial.table.json", targets={"excision": sizes})
     filled, posteriors = fill_from_posteriors(table.columns, trial.parent, fault=table.error)
+    also_read(*posteriors)
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
     files = {"trial": trial, "excision": excision} | ({} if columns is None else {"columns": columns})
     return TrialInputs(

@@ -108,7 +108,6 @@ def command(
 
     for target in (output, html):
         if target:
-            _refuse_inputs(target, *(one for one in (trial, excision, columns, protocol) if one))
             refuse_existing(target, force=force)
     title, chosen = _settings(settings, protocol)
     outcome = _analyse(load_trial(trial, excision, columns), chosen, protocol, title=title)
@@ -222,10 +221,3 @@ def _write_html(path: Path, outcome: Outcome, *, force: bool) -> None:
     from tactile_bayes.report.trial_html import trial_html
 
     write_text(path, trial_html(outcome.report, outcome.document, text=_text(outcome, methods=True)), force=force)
-
-
-def _refuse_inputs(output: Path, *inputs: Path) -> None:
-    """An output over an input would destroy what it was made from, --force or not."""
-    for one in inputs:
-        if output.exists() and one.exists() and output.samefile(one):
-            raise UsageError(f"{output} is an input of this command; choose another name for the output")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from tactile_bayes.cli import cli
 from tactile_bayes.commands.paths import WRITTEN, FilePath
@@ -145,6 +147,47 @@ def test_an_output_is_never_an_input(case: str, tmp_path: Path, monkeypatch: pyt
     with pytest.raises(UsageError, match="is an input of this command; choose another name for the output"):
         cli.main([*INPUTS[case]], standalone_mode=False)
     assert path.read_text() == "amplitude_sd = 0.5\n"
+
+
+CALIBRATIONS = {
+    "record": ("record", "-o", "s.json", "--head", "/dev/nothing", "--size-calibration", "s.json", "--force"),
+    "replay": ("replay", "scan.mcap", "-o", "s.json", "--size-calibration", "s.json", "--force"),
+    "estimate": ("estimate", "map.nc", "--size-calibration", "s.json", "-o", "s.json", "--force"),
+    "tradeoff": ("tradeoff", "forward", "--size-calibration", "s.json", "--figure", "link.png", "--force"),
+}
+
+
+@pytest.mark.parametrize("case", CALIBRATIONS)
+def test_an_output_is_never_the_size_calibration(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(DEMO / "scan.mcap", tmp_path)
+    (tmp_path / "s.json").write_text("{}")
+    (tmp_path / "link.png").symlink_to(tmp_path / "s.json")
+    with pytest.raises(UsageError, match="is an input of this command; choose another name for the output"):
+        cli.main([*CALIBRATIONS[case]], standalone_mode=False)
+    assert (tmp_path / "s.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("option", ["-o", "--html"])
+def test_an_output_is_never_a_posterior_that_a_trial_table_names(option: str, plain: Path, tmp_path: Path) -> None:
+    for name in ("trial.csv", "excision.csv"):
+        shutil.copy(plain / name, tmp_path)
+    stated = tmp_path / "one.json"
+    stated.write_text(
+        CliRunner().invoke(cli, ["estimate", str(plain / "map.nc"), "--method", "laplace", "--json"]).stdout
+    )
+    before = stated.read_text()
+    found = json.loads(before)["max_size_mm"] is not None
+    lines = (tmp_path / "trial.csv").read_text().splitlines()
+    first = dict(zip(lines[0].split(","), lines[1].split(","), strict=False))
+    row = {name: value if name in ("patient", "mass", "modality", "replicate") else "" for name, value in first.items()}
+    row |= {"status": "detected" if found else "not_detected", "posterior": "one.json"}
+    header = list(dict.fromkeys([*lines[0].split(","), "posterior"]))
+    (tmp_path / "trial.csv").write_text(",".join(header) + "\n" + ",".join(row.get(name, "") for name in header) + "\n")
+    words = ["validate", tmp_path / "trial.csv", "--excision", tmp_path / "excision.csv", option, stated, "--force"]
+    with pytest.raises(UsageError, match="is an input of this command"):
+        cli.main([str(word) for word in words], standalone_mode=False)
+    assert stated.read_text() == before
 
 
 def test_two_outputs_of_one_name_are_refused() -> None:
