@@ -11,21 +11,27 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.estimate_run import Answer, Settings, answer_map, answer_of, run_map
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.number_or import FiniteRange, WholeOrAuto
+from tactile_bayes.commands.moved_options import MovedOptions
+from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
-from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, INTERVAL, METHODS, MOST_FIELD_COSINES, NOISE
+from tactile_bayes.pipeline.one_map import Answer, answer_file, answer_of, estimate_file
+from tactile_bayes.pipeline.settings import FROM_FILE, Settings
+from tactile_bayes.presets import INTERVAL, METHODS
 
 if TYPE_CHECKING:
     from tactile_bayes.batch import Outcome
 
 _FILE = FilePath()
+_MOVED = {f"--{name.replace('_', '-')}": f"give {name} in --settings FILE.toml" for name in FROM_FILE} | {
+    "--prior": "--settings FILE.toml takes the same file",
+    "--rotation": "give --scene ellipse or --scene rotated, or rotation in --settings FILE.toml",
+}
 _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 
 
-@click.command("estimate")
+@click.command("estimate", cls=MovedOptions, moved=_MOVED)
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--size-calibration",
@@ -56,20 +62,6 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="Draw the map with the lump's size, or with the places looked at.",
 )
 @click.option(
-    "--background",
-    type=click.Choice(["fixed", "free"]),
-    help="Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free where the level is "
-    "not known (normalise none).",
-)
-@click.option("--fit-radius-mm", type=FiniteRange(min=0.0, min_open=True), help="As the calibration's, if not given.")
-@click.option(
-    "--rotation",
-    type=click.Choice(["auto", "on", "off"]),
-    default="auto",
-    show_default=True,
-    help="auto: turn the ellipse only where the map asks for it.",
-)
-@click.option(
     "--centre-mm",
     type=(FiniteRange(), FiniteRange()),
     metavar="X Y",
@@ -83,43 +75,17 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="What the window holds; auto: the simplest scene that the map supports.",
 )
 @click.option(
-    "--prior", metavar="PRIOR.toml", type=_FILE, help="Other priors; the report prints those used (prior.schema.json)."
-)
-@click.option(
-    "--checkpoint", metavar="CHAIN.npz", type=_FILE, help="Of the ensemble: keep its state here, go on from it."
-)
-@click.option("--max-steps", type=click.IntRange(min=150), help="Of the ensemble, before it gives up.")
-@click.option(
-    "--noise",
-    type=click.Choice(NOISE),
-    help="independent: least squares, correlation judged after; field: correlated errors in the model. "
-    "As the calibration's, if not given.",
-)
-@click.option(
-    "--field-cosines",
-    type=WholeOrAuto(min=6, max=MOST_FIELD_COSINES),
-    metavar="N|auto",
-    default="auto",
-    show_default=True,
-    help="Of the noise field along each axis: more are slower and see finer correlation; `tradeoff estimate` measures "
-    f"what they change. auto: {FIELD_COSINES}, for a narrow bump up to {FINE_FIELD_COSINES}.",
+    "--settings",
+    "settings_file",
+    metavar="FILE.toml",
+    type=_FILE,
+    help="Priors and rarely used options: background, fit_radius_mm, noise, max_steps... (settings.schema.json).",
 )
 @click.option(
     "--accuracy-sd",
     type=FiniteRange(min=0.001, max=0.5),
     help="Wanted Monte-Carlo error of the interval ends of sizes and map widths, in posterior SDs. Default: 0.02 for "
     "importance, 0.1 for ensemble.",
-)
-@click.option(
-    "--accuracy-mm",
-    type=FiniteRange(min=0.0001, max=10.0),
-    help="The same in mm; the finer of the two holds.",
-)
-@click.option(
-    "--between-map-sd",
-    type=FiniteRange(min=0.0, max=2.0),
-    metavar="SD",
-    help="Spread of ln size between maps of one mass, taken as known; if not given, learned, about the paper's 0.15.",
 )
 @click.option(
     "--known",
@@ -149,19 +115,10 @@ def command(
     as_json: bool,
     figure: Path | None,
     map_figure: Path | None,
-    background: str | None,
-    fit_radius_mm: float | None,
-    rotation: str,
     centre_mm: tuple[float, float] | None,
-    max_steps: int | None,
-    noise: str | None,
-    field_cosines: int | None,
     accuracy_sd: float | None,
-    accuracy_mm: float | None,
     scene: str,
-    prior: Path | None,
-    checkpoint: Path | None,
-    between_map_sd: float | None,
+    settings_file: Path | None,
     known: tuple[tuple[str, float], ...],
     pool: bool,
     workers: int,
@@ -178,28 +135,21 @@ def command(
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """
-    settings = Settings(
-        size_calibration,
-        method,
-        seed,
-        interval,
-        background,
-        fit_radius_mm,
-        rotation,
-        centre_mm,
-        max_steps,
-        noise,
-        accuracy_sd,
-        between_map_sd,
-        known,
-        scene,
-        accuracy_mm,
-        prior,
-        checkpoint,
-        field_cosines,
+    from tactile_bayes.commands.settings_file import settings_of
+
+    settings = settings_of(
+        settings_file,
+        calibration=size_calibration,
+        method=method,
+        seed=seed,
+        interval=interval,
+        centre_mm=centre_mm,
+        accuracy_sd=accuracy_sd,
+        known=known,
+        scene=scene,
     )
-    if checkpoint is not None and len(maps) > 1:
-        raise UsageError("--checkpoint takes one map at a time")
+    if settings.checkpoint is not None and len(maps) > 1:
+        raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")
     if figure is not None and size_calibration == "none":
         raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
     outputs = {"output": output, "figure": figure, "map figure": map_figure}
@@ -255,18 +205,19 @@ def _one_map(
     from tactile_bayes.commands.progress import progress_bar
 
     with progress_bar("effective draws") as progress:
-        tactile_map, estimate, provenance = run_map(path, settings, progress=progress)
+        outcome = estimate_file(path, settings, progress=progress)
+    tactile_map, estimate = outcome.tactile_map, outcome.estimate
     if output and estimate.status == "estimate":
         from tactile_bayes.files.posterior_nc import write_posterior
 
-        write_posterior(output, estimate, provenance=provenance, force=force)
+        write_posterior(output, estimate, provenance=outcome.provenance, force=force)
     if figure or map_figure:
         from tactile_bayes.commands.estimate_figures import draw_figures
 
         draw_figures(
             tactile_map, estimate, figure, map_figure, name=path.stem, probability=settings.interval, force=force
         )
-    return answer_of(tactile_map, estimate, provenance, settings)
+    return answer_of(outcome)
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
@@ -279,7 +230,7 @@ def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, sche
     chosen = cluster_executor(scheduler) if scheduler else local_executor(min(workers, len(maps)))
     with chosen as executor, progress_bar("maps") as progress:
         outcomes = run_batch(
-            partial(answer_map, settings=settings), maps, key=str, executor=executor, progress=progress
+            partial(answer_file, settings=settings), maps, key=str, executor=executor, progress=progress
         )
     return _answers(outcomes)
 

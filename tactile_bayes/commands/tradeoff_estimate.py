@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -10,6 +11,9 @@ from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import FiniteRange
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.lump.bump import BumpPrior
 
 _FILE = FilePath()
 
@@ -24,7 +28,7 @@ _FILE = FilePath()
     show_default=True,
     help="As of `estimate`.",
 )
-@click.option("--prior", metavar="PRIOR.toml", type=_FILE, help="As of `estimate`.")
+@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Priors, as for `estimate`.")
 @click.option(
     "--tolerance-sd",
     type=FiniteRange(min=0.0, min_open=True),
@@ -43,7 +47,7 @@ def command(
     map_file: Path,
     figure: Path | None,
     fit_radius_mm: float,
-    prior: Path | None,
+    settings_file: Path | None,
     tolerance_sd: float,
     runs: int,
     seed: int,
@@ -64,14 +68,13 @@ def command(
     from tactile_bayes.errors import EXIT_NO_ESTIMATE
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.map_nc import read_map
-    from tactile_bayes.files.prior_toml import read_prior
     from tactile_bayes.files.schema import dump_json
     from tactile_bayes.report.tradeoff_estimate import draw_tradeoff, tradeoff_document, tradeoff_text
     from tactile_bayes.studies.estimate_tradeoff import measure
 
     if figure is not None:
         refuse_existing(figure, force=force)
-    tactile_map, priors = read_map(map_file), read_prior(prior)
+    tactile_map, priors = read_map(map_file), _priors(settings_file)
     with progress_bar("settings") as progress:
         found = measure(
             tactile_map,
@@ -101,3 +104,19 @@ def command(
         click.echo(dump_json(tradeoff_document(found, tolerance_sd=tolerance_sd)), nl=False)
     else:
         click.echo(tradeoff_text(found, tolerance_sd=tolerance_sd))
+
+
+def _priors(path: Path | None) -> BumpPrior:
+    """The priors of a settings file; what this command varies itself is refused."""
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.settings_toml import read_settings
+    from tactile_bayes.posterior.lump.bump import BumpPrior
+
+    if path is None:
+        return BumpPrior()
+    found = read_settings(path)
+    prior = found.pop("prior")
+    del found["settings_file"]
+    for key in found:
+        raise UsageError(f"{path}: {key} is not for `tradeoff estimate`, which takes the priors only; leave {key} out")
+    return BumpPrior(**(prior or {}))

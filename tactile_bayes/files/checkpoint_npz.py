@@ -57,7 +57,7 @@ class CheckpointFile:
         if str(found["key"]) != self._bound(key):
             raise BadDataError(
                 "is a checkpoint of another map, calibration or setting",
-                way_out="give the same map and options (only --max-steps may differ), or name another file",
+                way_out="give the same map and options (only max_steps may differ), or name another file",
                 path=str(self.path),
             )
         return ChainState(**{name: found[name] for name in SHAPES})

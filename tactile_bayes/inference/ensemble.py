@@ -118,7 +118,7 @@ def ensemble(
             figures |= {"acceptance": float(np.mean([sampler.acceptance() for sampler in samplers]))}
             return ParameterDraws(_thin(chains, options.keep), "ensemble", figures)
     if not figures:
-        raise NotConvergedError(f"the checkpoint has {samplers[0].steps} steps, more than --max-steps allows")
+        raise NotConvergedError(f"the checkpoint has {samplers[0].steps} steps, more than max_steps allows")
     raise NotConvergedError(_advice(figures, options), diagnostics=figures)
 
 
@@ -223,5 +223,5 @@ def _advice(figures: dict[str, float], options: EnsembleOptions) -> str:
     return (
         f"not converged after {options.max_steps} steps: R-hat {figures['rhat']:.3f} (wanted {options.most_rhat}), "
         f"effective draws {least:.0f} (wanted {options.least_ess:.0f}); "
-        f"run about {factor:.1f} times as long (--max-steps {int(np.ceil(factor * options.max_steps / 100)) * 100})"
+        f"run about {factor:.1f} times as long (max_steps = {int(np.ceil(factor * options.max_steps / 100)) * 100})"
     )

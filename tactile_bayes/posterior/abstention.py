@@ -117,7 +117,9 @@ def fault_code(tactile_map: TactileMap, candidate: Candidate) -> tuple[str, str]
     short = missing_strokes(tactile_map, centre, reach_mm=NEEDED_IN_WIDTHS * wide)
     if wide / narrow > MOST_AXIS_RATIO:
         return "unresolved", "feel whether it is a rib; name the lump's place with --centre-mm"
-    return "window", extend_advice(short) or "fit a larger window (--fit-radius-mm) with a calibration learned so"
+    return "window", extend_advice(
+        short
+    ) or "fit a larger window (fit_radius_mm in --settings FILE.toml) with a calibration learned so"
 
 
 def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:

@@ -79,7 +79,7 @@ def estimate_map(
     except NotConvergedError as error:
         if options.method == "ensemble" or isinstance(seen, Detection):
             raise
-        advice = "give --method ensemble with more --max-steps"
+        advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
         return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection)
     detection, fit, draws, posterior, size = found.detection, found.fit, found.draws, found.posterior, found.size
     if found.fault is not None:

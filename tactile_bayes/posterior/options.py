@@ -104,14 +104,14 @@ def check_options(options: EstimateOptions) -> None:
         asked |= {"checkpoint": options.store is not None}
         for name, given in asked.items():
             if given:
-                raise UsageError(f"a {name} goes with correlated errors; give --noise field")
+                raise UsageError(f'a {name} goes with correlated errors; give noise = "field" in --settings FILE.toml')
         return
     if options.store is not None and options.method != "ensemble":
         raise UsageError("only the ensemble has checkpoints; give --method ensemble")
     if options.method == "optimise":
         raise UsageError("optimise is the paper's least squares and has no noise field; choose another --method")
     if options.fit.background != "free":
-        raise UsageError("a noise field takes level and tilt with it; give --background free")
+        raise UsageError('a noise field takes level and tilt with it; give background = "free" in --settings FILE.toml')
 
 
 def scene_asked(options: EstimateOptions) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tactile_bayes.presets import HELD, RESEARCH_USE
+from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.fat_depth import FatCubic
 from tactile_bayes.size.log_quadratic import QUADRATIC, LogQuadratic
 
@@ -64,6 +65,14 @@ def _fat_lines(cubic: FatCubic) -> list[str]:
         f"between bodies, SD of ln d {fit.get('body_sd', float('nan')):.3f}, "
         f"between exams of a body {fit.get('exam_sd', float('nan')):.3f}; {_left_out_text(fit)}",
     ]
+
+
+def calibration_line(name: str, calibration: Calibration, *, shipped: bool) -> str:
+    """Which calibration gave the size, and what it cannot know."""
+    line = f"Sizes by the {'shipped calibration ' if shipped else 'calibration '}{name}"
+    if isinstance(calibration, LogQuadratic):
+        line += f" ({calibration.source}); {fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
+    return line
 
 
 def fat_text(fat_mm: float | None) -> str:

@@ -43,7 +43,7 @@ def _field_rows(found: Tradeoff) -> list[str]:
     finest = found.fields[-1].cosines
     head = f"{'noise field':<32}{'CPU s':>8}{'':>13}{'moved, SD':>11}{'moved, mm':>11}"
     rows = [
-        f"{f'--field-cosines {one.cosines}':<32}{one.cpu_s:>8.3f}{'':>13}{one.change_sd:>11.3f}{one.change_mm:>11.4f}"
+        f"{f'field_cosines {one.cosines}':<32}{one.cpu_s:>8.3f}{'':>13}{one.change_sd:>11.3f}{one.change_mm:>11.4f}"
         for one in found.fields
     ]
     note = (

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from in_process import run_here
 from posterior_files import write_calibration, write_maps
+from settings_files import settings
 
 from tactile_bayes.files.schema import check_document, load_schema
 from tactile_bayes.size.eq6 import Recipe
@@ -118,21 +119,21 @@ def test_no_lump_is_an_answer_with_its_reason_and_exit_6(folder: Path, tmp_path:
 
 
 def kill_worker_of_b(path: Path, *, settings: Any) -> Any:
-    """`answer_map` in a worker that is killed whenever it has b.nc."""
+    """`answer_file` in a worker that is killed whenever it has b.nc."""
     import os
     import signal
 
-    from tactile_bayes.commands.estimate_run import answer_map
+    from tactile_bayes.pipeline.one_map import answer_file
 
     if path.name == "b.nc":
         os.kill(os.getpid(), signal.SIGKILL)
-    return answer_map(path, settings=settings)
+    return answer_file(path, settings=settings)
 
 
 def test_a_killed_worker_loses_no_other_map(folder: Path, alone: dict[str, str], monkeypatch: Any) -> None:
     from tactile_bayes.commands import estimate
 
-    monkeypatch.setattr(estimate, "answer_map", kill_worker_of_b)
+    monkeypatch.setattr(estimate, "answer_file", kill_worker_of_b)
     words = ("b.nc", "empty.nc", "a.nc", *FAST, "--size-calibration", "size.json", "--json", "--workers", 2)
     done = run_here("estimate", *words, cwd=folder)
     assert done.returncode == 1
@@ -147,10 +148,10 @@ def test_ctrl_c_prints_the_maps_that_are_done(folder: Path, alone: dict[str, str
     def interrupted(path: Path, *, settings: Any) -> Any:
         if path.name == "b.nc":
             raise KeyboardInterrupt
-        return answer_map(path, settings=settings)
+        return answer_file(path, settings=settings)
 
-    answer_map = estimate.answer_map
-    monkeypatch.setattr(estimate, "answer_map", interrupted)
+    answer_file = estimate.answer_file
+    monkeypatch.setattr(estimate, "answer_file", interrupted)
     words = ("a.nc", "b.nc", "empty.nc", *FAST, "--size-calibration", "size.json")
     done = run_here("estimate", *words, "--json", cwd=folder)
     assert done.returncode == 130
@@ -232,10 +233,10 @@ def test_another_recipe_is_refused_with_the_difference(folder: Path) -> None:
 
 
 def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
-    done = run_here("estimate", "a.nc", "--method", "ensemble", "--max-steps", 150, cwd=folder)
+    done = run_here("estimate", "a.nc", "--method", "ensemble", *settings(folder, max_steps=150), cwd=folder)
     assert (done.returncode, done.stdout) == (5, "")
     assert done.stderr.count("\n") == 1
-    assert "--max-steps" in done.stderr
+    assert "max_steps = " in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -253,7 +254,9 @@ def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
         (["none.nc", "--map-figure", "f"], 2, "has the suffix 'none'"),
         (["a.nc", "-o", "no/p.nc"], 2, "not a directory"),
         (["a.nc", "--interval", "1"], 2, "--interval"),
-        (["a.nc", "--fit-radius-mm", "0"], 2, "--fit-radius-mm"),
+        (["a.nc", "--fit-radius-mm", "9"], 2, "--fit-radius-mm has moved; give fit_radius_mm in --settings FILE.toml"),
+        (["a.nc", "--prior", "p.toml"], 2, "--prior has moved; --settings FILE.toml takes the same file"),
+        (["a.nc", "--rotation", "on"], 2, "--rotation has moved; give --scene ellipse or --scene rotated"),
         (["a.nc", "--figure", "f.png", "--size-calibration", "none"], 2, "--size-calibration"),
         ([], 2, "MAP.nc"),
     ],
@@ -284,8 +287,8 @@ def test_a_camera_image_can_be_estimated(shared_data: Path, tmp_path: Path) -> N
     picture = shared_data / "laserbeam" / "laserbeam_astigmatic.tif"
     made = run_here("import", picture, "--as", "map", "--spacing-mm", 0.1, "-o", "beam.nc", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
-    options = ("--background", "free", "--fit-radius-mm", 10, "--rotation", "on", "--json")
-    done = run_here("estimate", "beam.nc", *FAST, *options, cwd=tmp_path)
+    options = settings(tmp_path, background="free", fit_radius_mm=10, rotation="on")
+    done = run_here("estimate", "beam.nc", *FAST, *options, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["sigma_x_mm"]["median"] == pytest.approx(3.30, abs=0.05)
@@ -293,10 +296,10 @@ def test_a_camera_image_can_be_estimated(shared_data: Path, tmp_path: Path) -> N
     assert found["angle_deg"]["median"] == pytest.approx(9.1, abs=2.0)
 
 
-def field(folder: Path, *words: object) -> CompletedProcess[str]:
+def field(folder: Path, *words: object, **more: object) -> CompletedProcess[str]:
     """`estimate a.nc` under correlated errors, without a calibration."""
-    given = ("--noise", "field", "--background", "free", "--size-calibration", "none")
-    return run_here("estimate", "a.nc", *given, *words, cwd=folder)
+    given = settings(folder, noise="field", background="free", **more)
+    return run_here("estimate", "a.nc", *given, "--size-calibration", "none", *words, cwd=folder)
 
 
 def test_the_scene_is_told_and_can_be_given(folder: Path) -> None:
@@ -313,41 +316,41 @@ def test_the_scene_is_told_and_can_be_given(folder: Path) -> None:
 
 
 def test_priors_come_from_a_file_and_are_printed(folder: Path) -> None:
-    (folder / "prior.toml").write_text("width_median_mm = 3.5\n", encoding="utf-8")
-    assert "log-normal about 3.5 mm" in field(folder, "--prior", "prior.toml").stdout
-    document = json.loads(field(folder, "--prior", "prior.toml", "--json").stdout)
+    assert "log-normal about 3.5 mm" in field(folder, width_median_mm=3.5).stdout
+    document = json.loads(field(folder, "--json", width_median_mm=3.5).stdout)
     assert document["prior"]["width_median_mm"] == 3.5
-    assert {one["role"] for one in document["provenance"]["inputs"]} == {"map", "prior"}
+    assert {one["role"] for one in document["provenance"]["inputs"]} == {"map", "settings"}
     assert document["prior_sensitivity"]["width_prior_times"] == 2.0
-    (folder / "prior.toml").write_text("width = 3.5\n", encoding="utf-8")
-    wrong = field(folder, "--prior", "prior.toml")
+    wrong = field(folder, width=3.5)
     assert (wrong.returncode, wrong.stderr.count("\n")) == (3, 1)
     assert "unknown key width" in wrong.stderr
 
 
 def test_a_checkpoint_goes_on_where_it_stopped(folder: Path) -> None:
     words = ("--method", "ensemble", "--accuracy-sd", 0.1, "--json")
-    stopped = field(folder, *words, "--checkpoint", "chain.npz", "--max-steps", 150)
+    stopped = field(folder, *words, checkpoint="chain.npz", max_steps=150)
     assert stopped.returncode == 5
-    resumed, whole = field(folder, *words, "--checkpoint", "chain.npz"), field(folder, *words)
+    resumed, whole = field(folder, *words, checkpoint="chain.npz"), field(folder, *words)
     assert resumed.returncode == 0, resumed.stderr
     found = [json.loads(one.stdout)["sigma_x_mm"] for one in (resumed, whole)]
     assert found[0] == found[1]
-    other = field(folder, *words, "--checkpoint", "chain.npz", "--seed", 2)
+    other = field(folder, *words, "--seed", 2, checkpoint="chain.npz")
     assert other.returncode == 3
     assert "another map, calibration or setting" in other.stderr
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "keys", "message"),
     [
-        (["a.nc", "--scene", "round", "--noise", "independent"], "goes with correlated errors"),
-        (["a.nc", "b.nc", "--checkpoint", "c.npz"], "one map at a time"),
-        (["a.nc", "--noise", "field", "--background", "free", "--checkpoint", "c.npz"], "give --method ensemble"),
+        (["a.nc", "--scene", "round"], {"noise": "independent"}, "goes with correlated errors"),
+        (["a.nc", "b.nc"], {"checkpoint": "c.npz"}, "a checkpoint is of one map"),
+        (["a.nc"], {"noise": "field", "background": "free", "checkpoint": "c.npz"}, "give --method ensemble"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(folder: Path, words: list[str], message: str) -> None:
-    done = run_here("estimate", *words, "--size-calibration", "none", cwd=folder)
+def test_options_that_do_not_go_together_are_refused(
+    folder: Path, words: list[str], keys: dict[str, str], message: str
+) -> None:
+    done = run_here("estimate", *words, *settings(folder, **keys), "--size-calibration", "none", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert message in done.stderr
 
@@ -357,11 +360,7 @@ def test_options_that_do_not_go_together_are_refused(folder: Path, words: list[s
     [
         (("--centre-mm", 300, 2), "off the map, which has x from"),
         (("--centre-mm", "nan", 2), "not a finite number"),
-        (("--fit-radius-mm", "nan"), "not a finite number"),
-        (("--fit-radius-mm", "inf"), "not a finite number"),
         (("--interval", "nan"), "not a finite number"),
-        (("--accuracy-mm", "nan"), "not a finite number"),
-        (("--between-map-sd", "nan"), "not a finite number"),
         (("--known", "depth_mm", "inf"), "not a finite number"),
     ],
 )

@@ -127,9 +127,9 @@ def test_a_long_name_is_one_line_and_a_nearly_too_long_one_is_written(tmp_path: 
 
 
 INPUTS = {
-    "a prior": ("estimate", "map.nc", "--prior", "p.toml", "-o", "p.toml", "--force"),
-    "a prior by a link": ("estimate", "map.nc", "--prior", "p.toml", "--figure", "link.png", "--force"),
-    "a prior by a hard link": ("estimate", "map.nc", "--prior", "p.toml", "-o", "hard.toml", "--force"),
+    "settings": ("estimate", "map.nc", "--settings", "p.toml", "-o", "p.toml", "--force"),
+    "settings by a link": ("estimate", "map.nc", "--settings", "p.toml", "--figure", "link.png", "--force"),
+    "settings by a hard link": ("estimate", "map.nc", "--settings", "p.toml", "-o", "hard.toml", "--force"),
     "a scene": ("simulate", "p.toml", "-o", "p.toml", "--force"),
     "a table": ("calibrate", "size", "p.toml", "-o", "./p.toml", "--force"),
     "a protocol": ("validate", "t.csv", "--excision", "e.csv", "--protocol", "p.toml", "--html", "p.toml", "--force"),

@@ -154,7 +154,7 @@ def test_a_flat_density_has_no_mode() -> None:
 
 def test_an_ensemble_that_has_not_converged_says_how_long_to_run() -> None:
     options = EnsembleOptions(block=20, max_steps=20)
-    with pytest.raises(NotConvergedError, match=r"not converged after 20 steps.*--max-steps \d+") as caught:
+    with pytest.raises(NotConvergedError, match=r"not converged after 20 steps.*max_steps = \d+") as caught:
         ensemble(LINEAR.target(), LINEAR.beta, LINEAR.scale, rng=np.random.default_rng(1), options=options)
     assert caught.value.exit_code == 5
     assert caught.value.diagnostics["ess_bulk"] < 800

@@ -145,7 +145,7 @@ def test_assuming_no_lump_gives_its_probability_only() -> None:
 
 @pytest.mark.parametrize("options", [{"scene": "round"}, {"accuracy_mm": 0.1}])
 def test_what_needs_a_field_is_refused_without(options: dict[str, object]) -> None:
-    with pytest.raises(UsageError, match="give --noise field"):
+    with pytest.raises(UsageError, match='give noise = "field"'):
         estimate_map(
             bump_map(noise=WHITE),
             calibration=None,

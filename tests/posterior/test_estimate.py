@@ -196,7 +196,7 @@ def test_a_level_off_the_background_is_reported() -> None:
 
 def test_too_few_steps_are_not_convergence() -> None:
     options = EstimateOptions("ensemble", OFF, max_steps=150)
-    with pytest.raises(NotConvergedError, match=r"run about .* times as long \(--max-steps"):
+    with pytest.raises(NotConvergedError, match=r"run about .* times as long \(max_steps = "):
         estimate_map(bump_map(noise=WHITE), calibration=None, options=options, rng=np.random.default_rng(1))
 
 

@@ -74,7 +74,7 @@ def test_a_lifted_level_beside_the_lump_does_not_narrow_it() -> None:
     ("options", "message"),
     [
         (replace(FIELD, method="optimise"), "optimise is the paper's least squares"),
-        (replace(FIELD, fit=FitOptions(noise="field")), "give --background free"),
+        (replace(FIELD, fit=FitOptions(noise="field")), 'give background = "free"'),
     ],
 )
 def test_what_does_not_go_with_a_field_is_refused(options: EstimateOptions, message: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from in_process import run_here
 from posterior_maps import bump_values, grid_map
+from settings_files import settings
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import write_map
@@ -47,7 +48,7 @@ def test_without_a_level_the_background_is_free_by_default() -> None:
 
 
 def test_a_level_that_is_not_known_cannot_be_fixed() -> None:
-    words = r"not known \(normalise none\).*give --background free"
+    words = r"not known \(normalise none\).*give background = \"free\""
     with pytest.raises(UsageError, match=words):
         fit_bump(in_other_units(), (0.0, 0.0), options=FitOptions("fixed"))
     with pytest.raises(UsageError, match=words):
@@ -99,17 +100,18 @@ def test_the_way_out_that_is_printed_leads_to_a_size(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (("--background", "fixed"), 2, "give --background free"),
-        (("--background", "fixed", "--noise", "independent"), 2, "give --background free"),
-        (("--size-calibration", "solid"), 3, "solid does not fit: the grid's level is not known"),
-        (("--background", "free"), 0, ""),
+        ({"background": "fixed"}, 2, 'give background = "free"'),
+        ({"background": "fixed", "noise": "independent"}, 2, 'give background = "free"'),
+        ("--size-calibration solid", 3, "solid does not fit: the grid's level is not known"),
+        ({"background": "free"}, 0, ""),
     ],
 )
 def test_what_does_not_go_with_an_unknown_level_is_refused(
-    tmp_path: Path, words: tuple[str, ...], code: int, message: str
+    tmp_path: Path, words: str | dict[str, str], code: int, message: str
 ) -> None:
     name = saved(in_other_units(), tmp_path / "map.nc")
-    done = run_here("estimate", name, "--method", "laplace", *words, cwd=tmp_path)
+    given = words.split() if isinstance(words, str) else settings(tmp_path, **words)
+    done = run_here("estimate", name, "--method", "laplace", *given, cwd=tmp_path)
     assert (done.returncode, message in done.stderr) == (code, True), done.stderr
     if code == 0:
         assert "What would help: if its values were divided by their level already" in done.stdout

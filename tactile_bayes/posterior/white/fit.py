@@ -236,7 +236,7 @@ def check_background(tactile_map: TactileMap, options: FitOptions) -> None:
     if options.background == "fixed" and tactile_map.background is None:
         raise UsageError(
             f"the map's level far from a lump is not known (normalise {tactile_map.recipe.normalise}), so a background "
-            "cannot be fixed at it; give --background free"
+            'cannot be fixed at it; give background = "free"'
         )
 
 

@@ -125,7 +125,7 @@ def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(methods, "importance_draws", heavy)
     with pytest.raises(NotConvergedError, match=r"laplace: .*importance: Pareto shape 0.91$"):
         draw_scene(strong(), "laplace", rng=np.random.default_rng(1))
-    with pytest.raises(NotConvergedError, match=r"importance: Pareto shape 0.91; ensemble: .*--max-steps"):
+    with pytest.raises(NotConvergedError, match=r"importance: Pareto shape 0.91; ensemble: .*max_steps"):
         draw_scene(strong(), "importance", rng=np.random.default_rng(1), options=MethodOptions(max_steps=150))
 
 

@@ -1,55 +1,13 @@
-"""Priors from a file: what is given is used and printed, what is not known or not possible is one line."""
+"""How far an answer leans on its prior, and that every prior is printed."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.prior_toml import read_prior
-from tactile_bayes.files.schema import load_schema
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.sensitivity import prior_sensitivity
 from tactile_bayes.report.scene_text import prior_line, sensitivity_line
-
-
-def test_what_is_left_out_keeps_its_default(tmp_path: Path) -> None:
-    path = tmp_path / "prior.toml"
-    path.write_text("width_median_mm = 4\nlog_width_sd = 0.7\n", encoding="utf-8")
-    assert read_prior(path) == BumpPrior(width_median_mm=4.0, log_width_sd=0.7)
-    assert read_prior(None) == BumpPrior()
-
-
-def test_the_schema_has_the_programs_priors() -> None:
-    properties = load_schema("prior.schema.json")["properties"]
-    assert {name: one["default"] for name, one in properties.items()} == BumpPrior().as_dict()
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("widht_median_mm = 4", "unknown key widht_median_mm"),
-        ("width_median_mm = -4", "width_median_mm must be"),
-        ("width_median_mm = nan", "width_median_mm is nan"),
-        ("tilt_sd = inf", "tilt_sd"),
-        ('amplitude_sd = "2"', "amplitude_sd must be number"),
-        ("amplitude_sd = ", "is not TOML"),
-    ],
-)
-def test_a_bad_prior_is_one_line(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "prior.toml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(BadDataError, match=message) as caught:
-        read_prior(path)
-    assert "\n" not in str(caught.value)
-    assert "prior.toml" in str(caught.value)
-
-
-def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(BadDataError, match=r"nothing\.toml"):
-        read_prior(tmp_path / "nothing.toml")
 
 
 def test_every_prior_is_printed() -> None:

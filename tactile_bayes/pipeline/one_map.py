@@ -1,12 +1,14 @@
-"""One map of `estimate`: the calibration and options that fit it, the estimate, its report."""
+"""One map: the calibration and options that fit it, the estimate, its report."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
+from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.records import dataclass
 
@@ -15,36 +17,10 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.result import Estimate
-    from tactile_bayes.size.eq6 import SizeCalibration
-    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.calibration import Calibration
     from tactile_bayes.size.pooling import ShapeDraws, SizePriors
 
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """The options of one call, as given; picklable, so that a worker can have them.
-
-    `calibration` is as named on the command line, None where nothing was said: then the shipped one, if it fits.
-    """
-
-    calibration: str | None
-    method: str
-    seed: int
-    interval: float
-    background: str | None
-    fit_radius_mm: float | None
-    rotation: str
-    centre_mm: tuple[float, float] | None
-    max_steps: int | None
-    noise: str | None
-    accuracy_sd: float | None
-    between_map_sd: float | None = None
-    known: tuple[tuple[str, float], ...] = ()
-    scene: str = "auto"
-    accuracy_mm: float | None = None
-    prior: Path | None = None
-    checkpoint: Path | None = None
-    field_cosines: int | None = None
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,36 +47,78 @@ class NoSize:
     advice: str = ""
 
 
-def answer_map(path: Path, *, settings: Settings) -> Answer:
-    """One map of several, in whichever process; a fault of this map is its answer."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """One map, its estimate and what made it."""
+
+    tactile_map: TactileMap
+    estimate: Estimate
+    provenance: Provenance
+    settings: Settings
+
+
+def answer_file(path: Path, *, settings: Settings) -> Answer:
+    """The answer for one map of several, in whichever process; an error of this map is its answer."""
     try:
-        tactile_map, estimate, provenance = run_map(path, settings, progress=None)
+        return answer_of(estimate_file(path, settings))
     except TactileBayesError as error:
         text = str(error) if str(path) in str(error) else f"{path}: {error}"
         return Answer(None, f"error: {text}", error.exit_code)
-    return answer_of(tactile_map, estimate, provenance, settings)
 
 
-def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMap, Estimate, Provenance]:
+def estimate_file(path: Path, settings: Settings, *, progress: Progress | None = None) -> Outcome:
     """Read a map and estimate."""
+    from tactile_bayes.files.map_nc import read_map
+
+    tactile_map = read_map(path)
+    try:
+        return estimate_one(tactile_map, settings, inputs={"map": path}, progress=progress)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def estimate_one(
+    tactile_map: TactileMap,
+    settings: Settings,
+    *,
+    inputs: Mapping[str, Path] | None = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Choose the calibration and the options that fit a map, and estimate.
+
+    Parameters
+    ----------
+    inputs
+        Files that the map came from, by role, for the provenance.
+    progress
+        Called with draws done and wanted.
+
+    Raises
+    ------
+    BadDataError
+        When the calibration that was named does not fit the map.
+    UsageError
+        When settings contradict each other, or the map.
+    NotConvergedError
+        When the method asked for does not converge.
+    """
     import numpy as np
 
-    from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.shipped import default_for
+    from tactile_bayes.files.shipped import SHIPPED, default_for
     from tactile_bayes.posterior.drawn import fitting_calibration
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
     from tactile_bayes.posterior.other_rises import other_rises
+    from tactile_bayes.report.quadratic_text import calibration_line
 
-    tactile_map = read_map(path)
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
     options = _options(settings, calibration, tactile_map)
     if calibration is not None:
         calibration = calibration_for(tactile_map, calibration)
-    inputs = {"map": path} | ({"size_calibration": source} if source else {})
-    inputs |= {"prior": settings.prior} if settings.prior else {}
-    digests = hash_inputs(**inputs)
+    files = {**(inputs or {}), **({"size_calibration": source} if source else {})}
+    files |= {"settings": settings.settings_file} if settings.settings_file else {}
+    digests = hash_inputs(**files)
     if settings.checkpoint is not None:
         from tactile_bayes.files.checkpoint_npz import CheckpointFile
 
@@ -108,19 +126,24 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
     # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history
     rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
-    try:
-        estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
-    except BadDataError as error:
-        raise error.at(path) from None
+    estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
     estimate = replace(estimate, other_rises=other_rises(tactile_map, estimate, options))
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     used = None if estimate.map_posterior is None else fitting_calibration(estimate.map_posterior, calibration)
     if used is not None and estimate.size is not None:
-        words = _calibration_words(settings.calibration or shipped, used)
+        name = settings.calibration or shipped
+        words = calibration_line(name, used, shipped=name in SHIPPED)
         estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
-    recorded = {
-        "size_calibration": settings.calibration or (f"{shipped} (shipped)" if calibration is not None else "none"),
+    named = settings.calibration or (f"{shipped} (shipped)" if calibration is not None else "none")
+    recorded = _recorded(settings, options, calibration=named)
+    return Outcome(tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed), settings)
+
+
+def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str) -> dict[str, Any]:
+    """The settings that the provenance of an answer has."""
+    return {
+        "size_calibration": calibration,
         "method": settings.method,
         "interval": settings.interval,
         "background": options.fit.background,
@@ -135,24 +158,11 @@ def run_map(path: Path, settings: Settings, *, progress: Any) -> tuple[TactileMa
         "between_map_sd": settings.between_map_sd,
         "known": dict(settings.known),
     }
-    return tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed)
-
-
-def _calibration_words(name: str, calibration: SizeCalibration | LogQuadratic) -> str:
-    """Which calibration gave the size, and what it cannot know."""
-    from tactile_bayes.files.shipped import SHIPPED
-    from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
-    from tactile_bayes.size.log_quadratic import LogQuadratic
-
-    words = f"Sizes by the {'shipped calibration ' if name in SHIPPED else 'calibration '}{name}"
-    if isinstance(calibration, LogQuadratic):
-        words += f" ({calibration.source}); {fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
-    return words
 
 
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
-) -> tuple[Path | None, SizeCalibration | LogQuadratic | None, NoSize | None]:
+) -> tuple[Path | None, Calibration | None, NoSize | None]:
     """The calibration that was named, or the shipped one where nothing was said and it fits the map and the options.
 
     Returns
@@ -201,14 +211,12 @@ def _level_unknown(tactile_map: TactileMap, fit: FitOptions) -> NoSize:
     return NoSize(reason, f"{declare} (frames divided by their means: mean); otherwise {learn}")
 
 
-def _options(
-    settings: Settings, calibration: SizeCalibration | LogQuadratic | None, tactile_map: TactileMap
-) -> EstimateOptions:
+def _options(settings: Settings, calibration: Calibration | None, tactile_map: TactileMap) -> EstimateOptions:
     """What is not given is as the calibration's maps were fitted, else as the paper printed it.
 
     Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
     """
-    from tactile_bayes.files.prior_toml import read_prior
+    from tactile_bayes.posterior.lump.bump import BumpPrior
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.white.fit import default_errors
 
@@ -229,7 +237,7 @@ def _options(
         max_steps=settings.max_steps,
         accuracy_sd=settings.accuracy_sd,
         size_priors=size_priors(settings),
-        prior=read_prior(settings.prior),
+        prior=BumpPrior(**(settings.prior or {})),
         scene=settings.scene,
         accuracy_mm=settings.accuracy_mm,
     )
@@ -249,20 +257,21 @@ def size_priors(settings: Settings) -> SizePriors:
     return SizePriors(between_maps=between, known=dict(settings.known))
 
 
-def answer_of(tactile_map: TactileMap, estimate: Estimate, provenance: Provenance, settings: Settings) -> Answer:
+def answer_of(outcome: Outcome) -> Answer:
     """The report of one map."""
-    from tactile_bayes.files.prior_toml import read_prior
+    from tactile_bayes.posterior.lump.bump import BumpPrior
     from tactile_bayes.report.estimate_document import estimate_document, estimate_quantities
     from tactile_bayes.report.estimate_text import estimate_text
 
-    prior = read_prior(settings.prior)
+    tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
+    prior = BumpPrior(**(settings.prior or {}))
     quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
     document = estimate_document(
         estimate,
         tactile_map,
         probability=settings.interval,
         prior=prior,
-        provenance=provenance,
+        provenance=outcome.provenance,
         quantities=quantities,
     )
     text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)

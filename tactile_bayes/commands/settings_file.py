@@ -1,0 +1,30 @@
+"""The settings of a call: its options and, where one is given, a settings file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tactile_bayes.commands.paths import also_read, refuse_same
+from tactile_bayes.pipeline.settings import Settings
+
+
+def settings_of(path: Path | None, **options: Any) -> Settings:
+    """Settings from options and a file.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the key, its value and what is allowed.
+    UsageError
+        When the checkpoint that the file names is another file of the call.
+    """
+    if path is None:
+        return Settings(**options)
+    from tactile_bayes.files.settings_toml import read_settings
+
+    settings = Settings(**options, **read_settings(path))
+    also_read(settings.checkpoint)
+    if settings.checkpoint is not None:
+        refuse_same([settings.checkpoint], [path])
+    return settings

@@ -1,0 +1,118 @@
+"""Several maps of one mass: one size from the answers of all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.pipeline.one_map import Answer, size_priors
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.pooling import PooledEstimate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PooledOutcome:
+    """The size of one mass, its JSON object and what made it."""
+
+    pooled: PooledEstimate
+    document: dict[str, Any]
+    provenance: Provenance
+
+
+def pool_answers(
+    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
+) -> PooledOutcome:
+    """Pool the maps of one mass.
+
+    Parameters
+    ----------
+    answers
+        Of each map; none of them an error.
+    names
+        Of the maps, for the report.
+    inputs
+        Files that the maps came from, by role, for the provenance.
+
+    Raises
+    ------
+    BadDataError
+        When the maps were normalised in several ways.
+    UsageError
+        When the calibration cannot pool maps.
+    """
+    import numpy as np
+
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.report.pooled import pooled_document
+    from tactile_bayes.size.pooling import pool_maps
+
+    path = size_calibration_path(settings.calibration or _shipped_for(answers))
+    calibration = _log_quadratic(path)
+    assert path is not None
+    # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
+    words = sorted(answer.fingerprint for answer in answers)
+    pooled = _too_far(answers) or pool_maps(
+        [answer.shape for answer in answers],
+        calibration=calibration,
+        priors=size_priors(settings),
+        rng=np.random.default_rng([settings.seed, *words]),
+    )
+    digests = hash_inputs(**inputs, size_calibration=path)
+    provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed)
+    documents = [answer.document for answer in answers if answer.document is not None]
+    document = pooled_document(
+        pooled, list(names), documents, calibration, probability=settings.interval, provenance=provenance
+    )
+    return PooledOutcome(pooled, document, provenance)
+
+
+def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
+    """No size where a map shows a lump too far outside the calibration's range; None where none does."""
+    from tactile_bayes.size.pooling import PooledEstimate
+
+    for i, answer in enumerate(answers):
+        if answer.document is not None and answer.document["reason_code"] == "extrapolated":
+            return PooledEstimate("no_estimate", f"map {i + 1}: {answer.document['reason']}")
+    return None
+
+
+def _shipped_for(answers: Sequence[Answer]) -> str:
+    """The shipped calibration for maps that were all normalised one way."""
+    from tactile_bayes.files.shipped import default_for
+
+    ways = sorted({answer.normalise for answer in answers})
+    if len(ways) > 1:
+        raise BadDataError(
+            f"the maps were normalised in several ways ({', '.join(ways)})",
+            way_out="pool maps made by one recipe: make the others again with `map`",
+        )
+    return default_for(ways[0])
+
+
+def _log_quadratic(path: Path | None) -> LogQuadratic:
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.size.log_quadratic import LogQuadratic
+
+    if path is None:
+        raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
+    calibration = read_size_calibration(path)
+    if not isinstance(calibration, LogQuadratic):
+        raise UsageError(f"--pool needs a calibration of the log-quadratic form; {path} is of Eq 6: use solid")
+    return calibration
+
+
+def _plain(settings: Settings) -> dict[str, Any]:
+    """The settings as JSON holds them."""
+    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(settings).items()}
+    del plain["seed"], plain["settings_file"]
+    checkpoint = None if settings.checkpoint is None else settings.checkpoint.name
+    return plain | {"known": dict(settings.known), "checkpoint": checkpoint}

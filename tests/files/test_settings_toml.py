@@ -1,0 +1,77 @@
+"""Settings of `estimate` from a file: what is given is used, what is not known or not possible is one line."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.files.settings_toml import PRIORS, read_settings
+from tactile_bayes.pipeline.settings import FROM_FILE, Settings
+from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, MOST_FIELD_COSINES
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "settings.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_missing_key_keeps_its_default(tmp_path: Path) -> None:
+    path = written(tmp_path, 'width_median_mm = 4\nnoise = "field"\ncheckpoint = "c.npz"\nfield_cosines = "auto"\n')
+    found = read_settings(path)
+    assert found == {
+        "prior": {"width_median_mm": 4.0},
+        "noise": "field",
+        "checkpoint": tmp_path / "c.npz",
+        "field_cosines": None,
+        "settings_file": path,
+    }
+    assert Settings(**found).rotation == Settings().rotation == "auto"
+    assert BumpPrior(**found["prior"]) == BumpPrior(width_median_mm=4.0)
+
+
+def test_the_schema_has_every_key_with_the_programs_defaults() -> None:
+    properties = load_schema("settings.schema.json")["properties"]
+    assert {name: properties[name]["default"] for name in PRIORS} == BumpPrior().as_dict()
+    assert set(properties) == {*PRIORS, *FROM_FILE}
+    assert set(FROM_FILE) <= {one.name for one in fields(Settings)}
+    cosines = properties["field_cosines"]
+    assert cosines["anyOf"][0]["maximum"] == MOST_FIELD_COSINES
+    assert f"auto: {FIELD_COSINES}, up to {FINE_FIELD_COSINES}" in cosines["description"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("widht_median_mm = 4", "unknown key widht_median_mm"),
+        ("width_median_mm = -4", "width_median_mm must be"),
+        ("width_median_mm = nan", "width_median_mm is nan"),
+        ("tilt_sd = inf", "tilt_sd"),
+        ('amplitude_sd = "2"', "amplitude_sd must be number"),
+        ("amplitude_sd = ", "is not TOML"),
+        ("fit_radius_mm = 0", "fit_radius_mm must be"),
+        ("fit_radius_mm = inf", "fit_radius_mm is inf"),
+        ("accuracy_mm = nan", "accuracy_mm is nan"),
+        ("between_map_sd = -1", "between_map_sd must be"),
+        ("field_cosines = 5", "field_cosines"),
+        ("max_steps = 149", "max_steps must be"),
+        ('noise = "white"', "noise must be one of"),
+        ('method = "laplace"', "unknown key method"),
+    ],
+)
+def test_a_bad_setting_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(BadDataError, match=message) as caught:
+        read_settings(path)
+    assert "\n" not in str(caught.value)
+    assert "settings.toml" in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(BadDataError, match=r"nothing\.toml"):
+        read_settings(tmp_path / "nothing.toml")
