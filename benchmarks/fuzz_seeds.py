@@ -259,8 +259,9 @@ def _read_wide(path: Path) -> object:
 
 
 def _read_tomls(path: Path) -> object:
-    from tactile_bayes.files.column_map import read_mapping
     from tactile_bayes.files.prior_toml import read_prior
+
+    from tactile_bayes.files.column_map import read_mapping
     from tactile_bayes.files.protocol import read_protocol
     from tactile_bayes.files.scene_toml import read_scene
 

@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.commands.calibrate import size_table
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
@@ -37,6 +36,7 @@ from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.pipeline.size_calibration import size_table
 from tactile_bayes.posterior.estimate import calibration_for, estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.size.eq6 import Recipe, SizeCalibration

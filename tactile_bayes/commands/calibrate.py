@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,13 +12,8 @@ from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from datetime import datetime
 
-    from tactile_bayes.errors import BadDataError
-    from tactile_bayes.files.tables import Table
-    from tactile_bayes.size.eq6 import LeftOutErrors, Recipe
-    from tactile_bayes.size.learn.eq6 import SizeTable, StudyCases
 
 _FILE = FilePath()
 
@@ -103,102 +98,28 @@ def size(
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
-    from dataclasses import replace
-
-    import numpy as np
-
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
+    from tactile_bayes.pipeline.size_calibration import learn_eq6
     from tactile_bayes.report.calibration_text import calibration_text
     from tactile_bayes.size.learn.body_effects import size_terms
-    from tactile_bayes.size.learn.eq6 import learn_size_calibration
 
     refuse_existing(output, force=force)
     if form == "log-quadratic":
         _refuse_declared(ctx)
         click.echo(_log_quadratic(table, output, force=force), nl=False)
         return
-    rows = read_table(table, "size_table.table.json")
     declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
-    recipe = table_recipe(rows, declared)
-    rng = np.random.default_rng(seed)
-    try:
-        lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
-        with progress_bar("effective draws") as progress:
-            calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
-        left_out, silent = _left_out(lumps, least_stiffness_ratio=least_stiffness_ratio)
-        calibration = replace(calibration, left_out=left_out)
-    except BadDataError as error:
-        raise error.at(table) from None
-    settings = {
-        "normalise": recipe.normalise,
-        "background": recipe.background,
-        "fit_radius_mm": recipe.radius_mm,
-        "noise": recipe.noise,
-        "least_stiffness_ratio": least_stiffness_ratio,
-    }
-    provenance = Provenance("calibrate size", settings, hash_inputs(table=table), seed=seed)
-    write_size_calibration(output, calibration, provenance=provenance, force=force)
-    click.echo(calibration_text(calibration, terms=size_terms(lumps), not_left_out=silent), nl=False)
-
-
-def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
-    """How the maps of a size table were made and fitted: what its columns say, else what is declared, else the default.
-
-    Parameters
-    ----------
-    declared
-        The options ``normalise``, ``background``, ``fit_radius_mm`` and ``noise``; None where one was not given.
-
-    Raises
-    ------
-    BadDataError
-        When rows differ in it, or the table says something else than an option.
-    UsageError
-        When a level is to be fixed on maps that have none.
-    """
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.size.eq6 import Recipe
-
-    said = {name: _alike(table, name) for name in (*declared, "flat_field")}
-    for name, value in declared.items():
-        if None not in (value, said[name]) and value != said[name]:
-            raise _contradiction(table, name, said[name], value)
-    found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
-    normalise = found["normalise"] or "mean"
-    background = found["background"] or ("free" if normalise == "none" else "fixed")
-    if normalise == "none" and background == "fixed":
-        raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
-    radius_mm, noise = found["fit_radius_mm"] or FIT_RADIUS_MM, found["noise"] or "independent"
-    by_hand = any(said[name] is None for name in declared)
-    return Recipe(normalise, background, radius_mm, declared=by_hand, noise=noise, flat_field=said["flat_field"])
-
-
-def _alike(table: Table, name: str) -> Any:
-    """The value of a column that must be alike in all rows."""
-    from tactile_bayes.errors import BadDataError
-
-    values = table.columns[name]
-    if len(set(values)) > 1:
-        what = f"{name} differs between rows"
-        raise BadDataError(what, way_out="join tables of maps made alike only", path=str(table.path))
-    return values[0]
-
-
-def _contradiction(table: Table, name: str, said: object, declared: object) -> BadDataError:
-    from tactile_bayes.errors import BadDataError
-
-    option = f"--{name.replace('_', '-')}"
-    way_out = f"leave out {option}"
-    if name == "normalise":
-        way_out += f", and size maps made with `map --normalise {said}`"
-        way_out += "; `population` and --form log-quadratic give a calibration for --normalise gain"
-    what = f"its {name} is {said}, not {declared} as {option} says"
-    return BadDataError(what, way_out=way_out, path=str(table.path))
+    rows = read_table(table, "size_table.table.json")
+    with progress_bar("effective draws") as progress:
+        learned = learn_eq6(rows, declared, least_stiffness_ratio=least_stiffness_ratio, seed=seed, progress=progress)
+    provenance = Provenance("calibrate size", learned.settings, hash_inputs(table=table), seed=seed)
+    write_size_calibration(output, learned.calibration, provenance=provenance, force=force)
+    words = calibration_text(learned.calibration, terms=size_terms(learned.lumps), not_left_out=learned.not_left_out)
+    click.echo(words, nl=False)
 
 
 def _refuse_declared(ctx: click.Context) -> None:
@@ -210,56 +131,17 @@ def _refuse_declared(ctx: click.Context) -> None:
             raise UsageError(f"--{option} is for --form eq6: a table of `population` fixes how its maps were made")
 
 
-def _left_out(lumps: SizeTable, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
-    """Errors on geometries left out, or why Eq 6 has none."""
-    from tactile_bayes.errors import NotConvergedError
-    from tactile_bayes.size.learn.cross_validation import left_out_of_study
-
-    try:
-        return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio), ""
-    except NotConvergedError as error:
-        return None, str(error)
-
-
 def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
-    from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_quadratic_json import write_log_quadratic
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from tactile_bayes.pipeline.size_calibration import learn_quadratic
     from tactile_bayes.report.quadratic_text import log_quadratic_text
-    from tactile_bayes.size.eq6 import Recipe
-    from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
-    from tactile_bayes.studies.population import measuring_options, population_table
 
-    rows = read_table(table, "population.table.json")
-    fit = measuring_options().fit
-    recipe = Recipe(
-        _normalise_of(rows, table), fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False
-    )
-    source = "balls in a population of bodies, scanned by the solid model"
-    try:
-        calibration = learn_log_quadratic(population_table(rows.columns), recipe=recipe, source=source)
-    except BadDataError as error:
-        raise error.at(table) from None
-    settings = {"form": "log-quadratic", **as_settings(BodyPrior(), ExamPrior())}
+    calibration, settings = learn_quadratic(read_table(table, "population.table.json"))
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table))
     write_log_quadratic(output, calibration, provenance=provenance, force=force)
     return log_quadratic_text(calibration)
-
-
-def _normalise_of(rows: Table, path: Path) -> str:
-    """How the maps of a table of `population` were normalised; by the mean in tables that do not say."""
-    from tactile_bayes.errors import BadDataError
-
-    found = {str(value or "mean") for value in rows.columns.get("normalise", ["mean"])}
-    if len(found) > 1:
-        raise BadDataError(
-            f"its maps were normalised in several ways ({', '.join(sorted(found))})",
-            way_out="learn from the rows of one way",
-            path=str(path),
-        )
-    return found.pop()
 
 
 @command.command("array")
@@ -296,70 +178,3 @@ def array(
     refuse_existing(output, force=force)
     measured = day.date() if day else date.today()
     click.echo(calibrate_array(steps, output, head_id=head_id, day=measured, force=force), nl=False)
-
-
-def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:
-    """The columns of a table as arrays, with Delta sigma where the table has depths; softer lumps are left out."""
-    import numpy as np
-
-    from tactile_bayes.errors import BadDataError
-    from tactile_bayes.size.learn.eq6 import SizeTable, width_changes
-
-    # a study says which of its lumps show; the others' fits are fits to a trough
-    shown = [
-        flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
-        for flag, ratio in zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
-    ]
-    columns = {
-        name: [v for v, keep in zip(values, shown, strict=True) if keep] for name, values in table.columns.items()
-    }
-
-    def array(name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
-        values = columns[name]
-        if all(value is None for value in values):
-            return None
-        if any(value is None for value in values):
-            row = table.columns[name].index(None)
-            raise table.error(row, name, "is blank in some rows only", way_out="fill the column or leave it out")
-        return np.asarray(values, dtype=np.float64)
-
-    d_mm, amplitude, sigma_x, sigma_y = (array(n) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))
-    depth = array("depth_ratio")
-    if d_mm is None or amplitude is None or sigma_x is None:
-        raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
-    if depth is None:
-        return SizeTable(d_mm, amplitude, sigma_x, sigma_y)
-    same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]
-    group = list(zip(*same, strict=True))
-    change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
-    change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)
-    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns))
-
-
-def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
-    """Which case each row is; None where a row does not say how stiff its lump is."""
-    import numpy as np
-
-    from tactile_bayes.size.learn.eq6 import StudyCases
-
-    if None in columns["stiffness_ratio"]:
-        return None
-    depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))
-    told = {"seat_number": _seat_numbers(columns["seat"])}
-    told |= {name: columns[name] for name in ("thickness_mm", "head_radius_mm")}
-    others = {name: np.asarray(values, dtype=np.float64) for name, values in told.items() if None not in values}
-    return StudyCases(tuple(columns["seat"]), depth, ratio, others)
-
-
-def _seat_numbers(seats: list[str | None]) -> list[float | None]:
-    """0 for centred, 1 for resting; None for names that are the table's own."""
-    from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.forward.body import parse_seat
-
-    def number(seat: str | None) -> float | None:
-        try:
-            return None if seat is None else parse_seat(seat)
-        except TactileBayesError:
-            return None
-
-    return [number(seat) for seat in seats]

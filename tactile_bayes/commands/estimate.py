@@ -18,12 +18,13 @@ from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.pipeline.one_map import Answer, answer_file, answer_of, estimate_file
 from tactile_bayes.pipeline.settings import FROM_FILE, Settings
-from tactile_bayes.presets import INTERVAL, METHODS
+from tactile_bayes.presets import METHODS
 
 if TYPE_CHECKING:
     from tactile_bayes.batch import Outcome
 
 _FILE = FilePath()
+_DEFAULTS = Settings()
 _MOVED = {f"--{name.replace('_', '-')}": f"give {name} in --settings FILE.toml" for name in FROM_FILE} | {
     "--prior": "--settings FILE.toml takes the same file",
     "--rotation": "give --scene ellipse or --scene rotated, or rotation in --settings FILE.toml",
@@ -42,13 +43,15 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--method",
     type=click.Choice(METHODS),
-    default="importance",
+    default=_DEFAULTS.method,
     show_default=True,
     help="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
 @click.option(
-    "--interval", type=_PROBABILITY, default=INTERVAL, show_default=True, help="Probability of the intervals."
+    "--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True, help="Of the random numbers."
+)
+@click.option(
+    "--interval", type=_PROBABILITY, default=_DEFAULTS.interval, show_default=True, help="Probability of the intervals."
 )
 @click.option("-o", "--output", metavar="POST.nc", type=_FILE, help="Write all draws (netCDF that arviz opens).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
@@ -70,7 +73,7 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--scene",
     type=click.Choice(["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]),
-    default="auto",
+    default=_DEFAULTS.scene,
     show_default=True,
     help="What the window holds; auto: the simplest scene that the map supports.",
 )
@@ -212,7 +215,7 @@ def _one_map(
 
         write_posterior(output, estimate, provenance=outcome.provenance, force=force)
     if figure or map_figure:
-        from tactile_bayes.commands.estimate_figures import draw_figures
+        from tactile_bayes.report.estimate_figures import draw_figures
 
         draw_figures(
             tactile_map, estimate, figure, map_figure, name=path.stem, probability=settings.interval, force=force

@@ -64,7 +64,7 @@ def _write(
 
         write_pooled(output, size, provenance=provenance, force=force)
     if figure is not None:
-        from tactile_bayes.commands.estimate_figures import draw_size
+        from tactile_bayes.report.estimate_figures import draw_size
 
         draws = {"max": size.max_size_mm.ravel(), "min": size.min_size_mm.ravel()}
         draw_size(draws, figure, name=f"{len(maps)} maps pooled", probability=settings.interval, force=force)

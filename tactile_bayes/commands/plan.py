@@ -125,13 +125,15 @@ def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, floa
     """The pilot's errors, but for those that options give."""
     import numpy as np
 
-    from tactile_bayes.commands.trial_inputs import load_trial
+    from tactile_bayes.commands.paths import also_read
     from tactile_bayes.errors import BadDataError
+    from tactile_bayes.pipeline.trial_inputs import load_trial
     from tactile_bayes.trial.planning import assumptions_from
     from tactile_bayes.trial.plausibility import unit_doubts
     from tactile_bayes.trial.readings import gather
 
     inputs = load_trial(pilot, excision, None)
+    also_read(*inputs.files.values())
     sizes = gather(inputs.readings, inputs.ex_vivo_mm)
     for doubt in unit_doubts(sizes, np.array(list(inputs.ex_vivo_mm.values()))):
         click.echo(f"{pilot}: doubtful: {doubt}", err=True)

@@ -40,6 +40,14 @@ _NOT_TEXT = (
 
 
 @dataclass(frozen=True, slots=True)
+class Sheet:
+    """A table that is in no file: CSV text under a name for its errors."""
+
+    name: Path
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Table:
     """A checked table, column by column.
 
@@ -72,7 +80,7 @@ class Table:
         return _fault(self.path, self.line_numbers[row], column, what, way_out=way_out)
 
 
-def read_table(path: Path, schema_name: str) -> Table:
+def read_table(source: Path | Sheet, schema_name: str) -> Table:
     """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME`` (``trial.table.json``...).
 
     Raises
@@ -87,7 +95,8 @@ def read_table(path: Path, schema_name: str) -> Table:
     """
     schema = load_schema(schema_name)
     fields = {field["name"]: field for field in schema["fields"]}
-    rows = _split(path, _decode(path))
+    path, text = (source.name, source.text) if isinstance(source, Sheet) else (source, _decode(source))
+    rows = _split(path, text)
     if not rows:
         raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}", path=str(path))
     (_, header), *body = rows

@@ -55,8 +55,8 @@ def test_processes_make_no_difference(folder: Path, run_cli: Run) -> None:
 
 
 def test_the_table_is_one_that_calibrate_reads(folder: Path) -> None:
-    from tactile_bayes.commands.calibrate import size_table
     from tactile_bayes.files.tables import read_table
+    from tactile_bayes.pipeline.size_calibration import size_table
 
     table = read_table(folder / "study.csv", "size_table.table.json")
     assert table.columns["detectable"] == [True] * 9

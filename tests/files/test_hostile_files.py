@@ -12,6 +12,7 @@ from pathlib import Path
 import hostile
 import numpy as np
 import pytest
+from tactile_bayes.files.prior_toml import read_prior
 
 from tactile_bayes.batch import open_store
 from tactile_bayes.errors import BadDataError, UsageError
@@ -23,7 +24,6 @@ from tactile_bayes.files.grid_import import read_grid
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
-from tactile_bayes.files.prior_toml import read_prior
 from tactile_bayes.files.protocol import read_protocol
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report

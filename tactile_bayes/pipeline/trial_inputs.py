@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tactile_bayes.files.tables import Table
+    from tactile_bayes.files.tables import Sheet, Table
     from tactile_bayes.trial.readings import MassKey, Reading
 
 
@@ -22,26 +22,28 @@ class TrialInputs:
     files: dict[str, Path]
 
 
-def load_trial(trial: Path, excision: Path, columns: Path | None) -> TrialInputs:
-    """Read and check both tables; `columns` maps a wide one."""
-    from tactile_bayes.commands.paths import also_read
+def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None) -> TrialInputs:
+    """Read and check both tables; `columns` maps a wide one, which is a file."""
     from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
     from tactile_bayes.files.size_posterior import fill_from_posteriors
-    from tactile_bayes.files.tables import check_references, read_table
+    from tactile_bayes.files.tables import Sheet, check_references, read_table
     from tactile_bayes.trial.readings import readings_from_columns
 
     wide_excision = columns is not None and "excision" in read_mapping(columns)
     sizes: Table = (
         read_wide_excision(excision, columns)
-        if columns is not None and wide_excision
+        if columns is not None and wide_excision and isinstance(excision, Path)
         else read_table(excision, "excision.table.json")
     )
-    table = read_table(trial, "trial.table.json") if columns is None else read_wide(trial, columns)
+    if columns is None or isinstance(trial, Sheet):
+        table = read_table(trial, "trial.table.json")
+    else:
+        table = read_wide(trial, columns)
     check_references(table, "trial.table.json", targets={"excision": sizes})
-    filled, posteriors = fill_from_posteriors(table.columns, trial.parent, fault=table.error)
-    also_read(*posteriors)
+    filled, posteriors = fill_from_posteriors(table.columns, table.path.parent, fault=table.error)
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
-    files = {"trial": trial, "excision": excision} | ({} if columns is None else {"columns": columns})
+    given = {"trial": trial, "excision": excision, "columns": columns}
+    files = {role: path for role, path in given.items() if isinstance(path, Path)}
     return TrialInputs(
         readings=readings_from_columns(filled, fault=table.error),
         ex_vivo_mm=dict(zip(keys, sizes.columns["ex_vivo_mm"], strict=True)),

@@ -1,0 +1,116 @@
+"""A trial's tables to its report: errors, lines, agreement and calibration of each modality."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from tactile_bayes.pipeline.trial_inputs import TrialInputs
+    from tactile_bayes.trial.bootstrap import Intervals
+    from tactile_bayes.trial.check_intervals import IntervalCheck
+    from tactile_bayes.trial.next_mass import NextMass
+    from tactile_bayes.trial.summary import TrialReport
+
+SCHEMA = "tactile-bayes/validate/1"
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSettings:
+    """How the analysis is made; each enters the provenance."""
+
+    intervals: Literal["corrected", "jackknife", "percentile", "bca"] = "corrected"
+    resamples: int = 2000
+    seed: int = 1999
+    error_ratio: float = 1.0
+    check_intervals: int = 0
+    bayes: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TrialOutcome:
+    """Everything a run found."""
+
+    report: TrialReport
+    document: dict[str, Any]
+    checks: dict[str, IntervalCheck]
+    next_mass: NextMass | None
+
+
+def intervals_of(settings: TrialSettings) -> Intervals:
+    """How the intervals of a report are made."""
+    from tactile_bayes.presets import INTERVAL
+    from tactile_bayes.trial.bootstrap import Intervals
+
+    return Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
+
+
+def analyse(
+    inputs: TrialInputs, settings: TrialSettings, *, protocol: Path | None = None, title: str | None = None
+) -> TrialOutcome:
+    """The report of a trial.
+
+    Parameters
+    ----------
+    protocol, title
+        File and title of the pre-specified analysis, where there is one.
+    """
+    from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.trial.check_intervals import check_all
+    from tactile_bayes.trial.document import as_document, checks_document
+    from tactile_bayes.trial.summary import summarise
+
+    confidence = intervals_of(settings)
+    report = summarise(
+        inputs.readings,
+        inputs.ex_vivo_mm,
+        confidence=confidence,
+        error_ratio=settings.error_ratio,
+        ex_vivo_sd_mm=inputs.ex_vivo_sd_mm,
+        seed=settings.seed,
+    )
+    document = {"schema": SCHEMA, **({} if title is None else {"title": title}), **as_document(report)}
+    checks: dict[str, IntervalCheck] = {}
+    if settings.check_intervals:
+        checks = check_all(report.sizes, confidence=confidence, trials=settings.check_intervals, seed=settings.seed)
+        document["interval_check"] = checks_document(checks)
+    next_mass = _next_mass(inputs, settings) if settings.bayes else None
+    if next_mass is not None:
+        document["next_mass"] = next_mass.as_document()
+    document["provenance"] = _provenance(inputs, settings, protocol)
+    return TrialOutcome(report, {**document, "research_use": RESEARCH_USE}, checks, next_mass)
+
+
+def _next_mass(inputs: TrialInputs, settings: TrialSettings) -> NextMass:
+    """The Bayesian model; the sampler is handed in, because the trial's package imports none."""
+    import numpy as np
+
+    from tactile_bayes.pipeline.trial_sampler import draw
+    from tactile_bayes.presets import INTERVAL
+    from tactile_bayes.trial.next_mass import next_mass
+
+    return next_mass(
+        inputs.readings,
+        inputs.ex_vivo_mm,
+        inputs.ex_vivo_sd_mm,
+        sample=draw,
+        rng=np.random.default_rng(settings.seed),
+        probability=INTERVAL,
+    )
+
+
+def _provenance(inputs: TrialInputs, settings: TrialSettings, protocol: Path | None) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.presets import INTERVAL
+
+    files = inputs.files | ({} if protocol is None else {"protocol": protocol})
+    kept = {name: value for name, value in asdict(settings).items() if name != "seed"}
+    return Provenance(
+        command="validate",
+        settings={"interval_probability": INTERVAL, **kept},
+        inputs=hash_inputs(**files),
+        seed=settings.seed,
+    ).as_dict()
