@@ -64,8 +64,14 @@ calibrations: $(VENV)/.installed
 	$(BIN)/tactile-bayes calibrate size build/paper_grid.csv --fit-radius-mm 48 --least-stiffness-ratio 8 \
 		-o tactile_bayes/calibrations/plane_strain.json --force
 
-docs: $(VENV)/.installed
+$(VENV)/.docs-installed: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	touch $@
+
+# The site, in build/site: a broken link, a page that is in no table of contents or any other warning fails.
+docs: $(VENV)/.docs-installed
 	$(BIN)/python docs/make_reference.py
+	$(BIN)/python -m sphinx --builder html --jobs auto --fail-on-warning --nitpicky --keep-going docs build/site
 
 clean:
 	rm -rf $(VENV) build dist demo-output .mypy_cache .ruff_cache .pytest_cache .hypothesis

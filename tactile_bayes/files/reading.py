@@ -1,17 +1,8 @@
 """Opening files that others wrote: regular files only, up to a stated size, and one line for whatever a decoder raises.
 
 Limits are judged before memory is taken. Each is multiplied by the environment variable ``TACTILE_BAYES_LIMITS`` (a
-number, 1 where it is not set), so that a sound file that is too large for them can still be read.
-
-| what | limit |
-|---|---|
-| TOML | 1 MB, keys of up to 16 parts |
-| JSON | 16 MB, 64 levels deep |
-| CSV and text tables | 32 MB |
-| an image | 128 MB |
-| netCDF | 256 MB |
-| a grid, an image or a map | 2^24 cells |
-| what is packed (MCAP, npz, netCDF) | unpacked 64 MB or 32 times the file, whichever is more |
+number, 1 where it is not set), so that a sound file that is too large for them can still be read. docs/exit-codes.md
+lists them.
 """
 
 from __future__ import annotations

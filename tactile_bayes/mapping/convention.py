@@ -32,7 +32,9 @@ LEAST_SPREAD_MM = 3.0
 
 
 def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, float]:
-    """|sensor normal . normal of the motion| under each of `CONVENTIONS`; below `AGREEMENT` it cannot be the right one.
+    """Absolute inner product of the sensor's and the motion's normal, under each of `CONVENTIONS`.
+
+    Below `AGREEMENT` a convention cannot be the right one.
 
     The motion's normal is that of the places of the head's apex at the used frames, which need the rotation for the
     lever arm; the sensor's normal is the mean of the face's, so that rotations that contradict each other count

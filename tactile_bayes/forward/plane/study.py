@@ -38,7 +38,7 @@ class StudySettings:
     positions_mm
         First and last position of the head and the step between them.
     fit_radius_mm
-        Eq 5 is fitted where |x| is at most this.
+        Eq 5 is fitted where abs(x) is at most this.
     cell_mm, fineness
         Of the contact and of the mesh, see `condense.condense`.
     """
