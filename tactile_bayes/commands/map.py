@@ -12,11 +12,11 @@ import click
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import NumberOr
 from tactile_bayes.commands.paths import FilePath
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
 
 if TYPE_CHECKING:
-    from tactile_bayes.scan import Scan
+    pass
 
 _FILE = FilePath()
 
@@ -89,6 +89,7 @@ def command(
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.mapping import build_map
+    from tactile_bayes.pipeline.scans import load_scans
     from tactile_bayes.report.map_text import map_text
 
     _check_paths(scans, output, figure, force=force)
@@ -102,7 +103,7 @@ def command(
         "register_strokes": register_strokes,
     }
     clock = _Clock(verbose)
-    loaded, lost = _read(scans)
+    loaded, lost = load_scans(scans)
     clock.tell("read")
     with progress_bar("frames") as progress:
         tactile_map = build_map(
@@ -135,20 +136,6 @@ def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, 
         raise UsageError("a scan is given twice; its frames would count twice")
     for path in [output, *([figure] if figure else [])]:
         refuse_existing(path, force=force)
-
-
-def _read(paths: tuple[Path, ...]) -> tuple[list[Scan], list[str]]:
-    """The scans, and what unfinished files had lost or what else speaks against them."""
-    from tactile_bayes.files.scan_mcap import read_scan_report
-
-    scans, lost = [], []
-    for number, path in enumerate(paths, start=1):
-        file = read_scan_report(path)
-        if file.damaged:
-            raise BadDataError(f"is damaged ({file.lost[0]})", way_out="copy it again", path=str(path))
-        scans.append(file.scan)
-        lost += [f"scan {number}: {line}" for line in (*file.lost, *file.cautions())]
-    return scans, lost
 
 
 class _Clock:

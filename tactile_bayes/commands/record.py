@@ -89,38 +89,50 @@ def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
 
     Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
     """
-    from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.report.record_text import record_text
 
-    refuse_existing(output, force=bool(options["force"]))
     request = Request(output=output, **options)
     also_read(size_calibration_path(request.size_calibration))
-    if request.tracker_rom is not None and (request.tracker_protocol != "ndi" or not request.tracker_rom.is_file()):
-        raise UsageError(
-            f"--tracker-rom {request.tracker_rom} is "
-            + ("not a file" if request.tracker_protocol == "ndi" else f"not for {request.tracker_protocol}")
-            + "; give a wireless NDI tool's .rom file with --tracker-protocol ndi"
-        )
-    report, interrupted = _record(request)
+    report, interrupted = make_recording(request)
     click.echo(record_text(report, output=str(output)), nl=False)
     if report.fault:
         raise DeviceError(report.fault)
     ctx.exit(EXIT_INTERRUPTED if interrupted and request.duration_s is not None else 0)
 
 
-def _record(request: Request) -> tuple[Report, bool]:
-    """Check everything, record, close the file; the account, and whether somebody interrupted."""
+def _check_rom(request: Request) -> None:
+    if request.tracker_rom is not None and (request.tracker_protocol != "ndi" or not request.tracker_rom.is_file()):
+        raise UsageError(
+            f"--tracker-rom {request.tracker_rom} is "
+            + ("not a file" if request.tracker_protocol == "ndi" else f"not for {request.tracker_protocol}")
+            + "; give a wireless NDI tool's .rom file with --tracker-protocol ndi"
+        )
+
+
+def make_recording(request: Request) -> tuple[Report, bool]:
+    """Check everything, record, close the file; the account, and whether somebody interrupted.
+
+    Raises
+    ------
+    UsageError
+        When the options contradict each other, the files or the head.
+    DeviceError
+        When a port cannot be opened, or another device answers on it.
+    """
     from dataclasses import asdict
     from datetime import date
 
     from tactile_bayes.commands.record_keys import Stopper
     from tactile_bayes.commands.record_parts import instrument_of, provenance_of, refuse_calibration
+    from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
     from tactile_bayes.files.schema import check_document
     from tactile_bayes.files.session_toml import SCHEMA
     from tactile_bayes.hardware.recorder import Recorder
 
+    _check_rom(request)
+    refuse_existing(request.output, force=request.force)
     head, calibration, landmarks = instrument_of(request)
     facts = request.facts()
     with ExitStack() as stack:

@@ -1,8 +1,10 @@
-"""The one door to arviz: chain diagnostics."""
+"""The one door to arviz: chain diagnostics, and draws as arviz has them."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -30,3 +32,14 @@ def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
         "ess_bulk": float(min(arviz.ess(column, method="bulk") for column in columns)),
         "ess_tail": float(min(arviz.ess(column, method="tail") for column in columns)),
     }
+
+
+def inference_data(draws: Mapping[str, FloatArray]) -> Any:
+    """Draws as `arviz.InferenceData` with one group, ``posterior``.
+
+    Parameters
+    ----------
+    draws
+        (chain, draw) arrays by name.
+    """
+    return arviz.from_dict(posterior=dict(draws))

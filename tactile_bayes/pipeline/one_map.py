@@ -132,10 +132,10 @@ def estimate_one(
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     used = None if estimate.map_posterior is None else fitting_calibration(estimate.map_posterior, calibration)
     if used is not None and estimate.size is not None:
-        name = settings.calibration or shipped
+        name = settings.calibration_name or shipped
         words = calibration_line(name, used, shipped=name in SHIPPED)
         estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
-    named = settings.calibration or (f"{shipped} (shipped)" if calibration is not None else "none")
+    named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     recorded = _recorded(settings, options, calibration=named)
     return Outcome(tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed), settings)
 
@@ -176,15 +176,18 @@ def choose_calibration(
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.posterior.estimate import recipe_differences
 
-    path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
-    if path is None:
-        return None, None, None
-    calibration = read_size_calibration(path)
+    if settings.calibration is None or isinstance(settings.calibration, str):
+        path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
+        if path is None:
+            return None, None, None
+        calibration = read_size_calibration(path)
+    else:
+        path, calibration = None, settings.calibration
     if tactile_map.background is None and calibration.recipe.normalise != tactile_map.recipe.normalise:
         why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map).fit)
         if settings.calibration is None:
             return None, None, replace(why_none, reason=f"{why_none.reason}; widths only")
-        raise BadDataError(f"{settings.calibration} does not fit: {why_none.reason}", way_out=why_none.advice)
+        raise BadDataError(f"{settings.calibration_name} does not fit: {why_none.reason}", way_out=why_none.advice)
     if settings.calibration is not None:
         return path, calibration, None
     fit = _options(settings, calibration, tactile_map).fit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,13 +51,10 @@ def pool_answers(
     import numpy as np
 
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.report.pooled import pooled_document
     from tactile_bayes.size.pooling import pool_maps
 
-    path = size_calibration_path(settings.calibration or _shipped_for(answers))
-    calibration = _log_quadratic(path)
-    assert path is not None
+    path, calibration = _calibration(answers, settings)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
     pooled = _too_far(answers) or pool_maps(
@@ -66,7 +63,7 @@ def pool_answers(
         priors=size_priors(settings),
         rng=np.random.default_rng([settings.seed, *words]),
     )
-    digests = hash_inputs(**inputs, size_calibration=path)
+    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {}))
     provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed)
     documents = [answer.document for answer in answers if answer.document is not None]
     document = pooled_document(
@@ -98,21 +95,28 @@ def _shipped_for(answers: Sequence[Answer]) -> str:
     return default_for(ways[0])
 
 
-def _log_quadratic(path: Path | None) -> LogQuadratic:
+def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | None, LogQuadratic]:
+    """The calibration that pools, and its file if it is in one."""
+    from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.size.log_quadratic import LogQuadratic
 
-    if path is None:
-        raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
-    calibration = read_size_calibration(path)
+    path, calibration = None, settings.calibration
+    if calibration is None or isinstance(calibration, str):
+        path = size_calibration_path(calibration or _shipped_for(answers))
+        if path is None:
+            raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
+        calibration = read_size_calibration(path)
     if not isinstance(calibration, LogQuadratic):
-        raise UsageError(f"--pool needs a calibration of the log-quadratic form; {path} is of Eq 6: use solid")
-    return calibration
+        what = path or settings.calibration_name
+        raise UsageError(f"--pool needs a calibration of the log-quadratic form; {what} is of Eq 6: use solid")
+    return path, calibration
 
 
 def _plain(settings: Settings) -> dict[str, Any]:
     """The settings as JSON holds them."""
-    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(settings).items()}
+    plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
+    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in plain.items()}
     del plain["seed"], plain["settings_file"]
     checkpoint = None if settings.checkpoint is None else settings.checkpoint.name
-    return plain | {"known": dict(settings.known), "checkpoint": checkpoint}
+    return plain | {"calibration": settings.calibration_name, "known": dict(settings.known), "checkpoint": checkpoint}

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
 
+if TYPE_CHECKING:
+    from tactile_bayes.size.calibration import Calibration
+
+GIVEN: Final = "given in Python"
+"""Name of a calibration that is in no file."""
 FROM_FILE: Final = (
     "background",
     "fit_radius_mm",
@@ -30,7 +35,7 @@ class Settings:
     Parameters
     ----------
     calibration
-        Name or path; None takes the shipped one, if it fits.
+        Name or path, or the calibration itself; None takes the shipped one, if it fits.
     method
         One of `presets.METHODS`.
     seed
@@ -53,7 +58,7 @@ class Settings:
         Where some of these were read from, for the provenance.
     """
 
-    calibration: str | None = None
+    calibration: str | Calibration | None = None
     method: str = "importance"
     seed: int = 1
     interval: float = INTERVAL
@@ -72,3 +77,8 @@ class Settings:
     checkpoint: Path | None = None
     field_cosines: int | None = None
     settings_file: Path | None = None
+
+    @property
+    def calibration_name(self) -> str | None:
+        """The calibration's name or path; None where none was named."""
+        return self.calibration if self.calibration is None or isinstance(self.calibration, str) else GIVEN

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.result import Estimate
@@ -42,18 +44,18 @@ def draw_figures(
     if tactile_map.covered.any():
         for path in (figure, map_figure):
             if path is not None:
-                _draw_map(tactile_map, estimate, path, name=name, force=force)
+                draw_map(tactile_map, estimate, path, name=name, force=force)
 
 
 def draw_size(
     draws_mm: Mapping[str, FloatArray],
-    path: Path,
+    path: Path | None,
     *,
     name: str,
     probability: float,
     effective_draws: float | None = None,
     force: bool,
-) -> None:
+) -> Figure:
     """The posterior of the largest (``max``) and the smallest (``min``) size with their intervals."""
     from tactile_bayes.inference.summary import summarise
     from tactile_bayes.report.size_figure import SizeInterval, size_figure
@@ -64,10 +66,11 @@ def draw_size(
     }
     intervals = {which: SizeInterval(q.low, q.high, q.probability, q.kind) for which, q in quantities.items()}
     title = f"Size of the lump: {name}"
-    size_figure(draws_mm["max"], draws_mm["min"], path, intervals=intervals, title=title, force=force)
+    return size_figure(draws_mm["max"], draws_mm["min"], path, intervals=intervals, title=title, force=force)
 
 
-def _draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path, *, name: str, force: bool) -> None:
+def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
+    """The map with the lump's ellipse and size, or with the places looked at and why there is no number."""
     from tactile_bayes.report.estimate_text import no_estimate_line
     from tactile_bayes.report.map_figure import Place, map_figure
 
@@ -76,7 +79,7 @@ def _draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path, *, name: 
     if estimate.reason and estimate.size is None:
         gone = estimate.status == "no_estimate"
         note = no_estimate_line(estimate.reason) if gone else f"No size: {estimate.reason}."
-    map_figure(
+    return map_figure(
         tactile_map,
         path,
         fit=_contour(estimate),

@@ -37,13 +37,13 @@ def check_suffix(path: Path) -> None:
 
 
 @contextmanager
-def figure_file(path: Path, *, size_in: tuple[float, float], force: bool) -> Iterator[Figure]:
+def figure_file(path: Path | None, *, size_in: tuple[float, float], force: bool) -> Iterator[Figure]:
     """A figure that is written when the block ends; the user's own matplotlib settings do not reach it.
 
     Parameters
     ----------
     path
-        Its suffix says the format.
+        Its suffix says the format; None writes nothing, the figure is for a notebook.
     size_in
         Width and height in inches.
     force
@@ -54,17 +54,20 @@ def figure_file(path: Path, *, size_in: tuple[float, float], force: bool) -> Ite
     UsageError
         When the suffix is unknown, or `path` exists and `force` is false.
     """
-    check_suffix(path)
     import matplotlib
     from matplotlib.figure import Figure
 
-    refuse_existing(path, force=force)
+    if path is not None:
+        check_suffix(path)
+        refuse_existing(path, force=force)
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
         figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
         figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))  # type: ignore[union-attr,call-arg]
         yield figure
+        if path is None:
+            return
         suffix = path.suffix.lower()
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix.removeprefix("."), dpi=DPI, metadata=FORMATS[suffix])

@@ -18,6 +18,7 @@ from tactile_bayes.report.figure_file import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _SCALE_BAR_MM = 10.0
 # Lines of hatching across the longer side of the map.
@@ -68,14 +69,14 @@ class Place:
 
 def map_figure(
     tactile_map: TactileMap,
-    path: Path,
+    path: Path | None,
     *,
     fit: FitContour | None = None,
     looked_at: Sequence[Place] = (),
     title: str = "",
     note: str = "",
     force: bool = False,
-) -> None:
+) -> Figure:
     """Draw a map in mm beside its coverage, and write it as PNG, PDF or SVG by the suffix.
 
     It is shown as `orientation_of` says, with the patient's sides or the plane's axes named at its edges. Cells with
@@ -121,6 +122,7 @@ def map_figure(
         if note:
             figure.suptitle(textwrap.fill(note, 130), x=0.01, ha="left", fontsize=9.5)
         figure.text(0.01, 0.01, _caption(tactile_map, view), fontsize=7.5, color="0.3")
+    return figure
 
 
 def _pair(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:

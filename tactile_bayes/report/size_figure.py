@@ -16,6 +16,7 @@ from tactile_bayes.report.figure_file import figure_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _MAX_COLOUR, _MIN_COLOUR = "#1f3b73", "#c8641e"  # tell apart in greyscale too
 # The axis ends at these quantiles of the draws, or at an interval's end where that lies farther out.
@@ -36,14 +37,14 @@ class SizeInterval:
 def size_figure(
     draws_max_mm: FloatArray,
     draws_min_mm: FloatArray,
-    path: Path,
+    path: Path | None,
     *,
     intervals: Mapping[str, SizeInterval],
     truth: tuple[float, float] | None = None,
     title: str = "",
     force: bool = False,
-) -> None:
-    """Draw the posterior of a lump's largest and smallest size, and write it as PNG, PDF or SVG by the suffix.
+) -> Figure:
+    """Draw the posterior of a lump's largest and smallest size; with a path write it, by its suffix as PNG, PDF or SVG.
 
     Parameters
     ----------
@@ -77,6 +78,7 @@ def size_figure(
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals, truth or ()))
         _finish_size(axes)
         figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")
+    return figure
 
 
 def _span(

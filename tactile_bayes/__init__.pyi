@@ -1,0 +1,20 @@
+from tactile_bayes import errors as errors
+from tactile_bayes.api.draws import Draws as Draws
+from tactile_bayes.api.estimates import PooledSize as PooledSize
+from tactile_bayes.api.estimates import SizeEstimate as SizeEstimate
+from tactile_bayes.api.estimates import estimate as estimate
+from tactile_bayes.api.estimates import pool as pool
+from tactile_bayes.api.maps import Map as Map
+from tactile_bayes.api.maps import build_map as build_map
+from tactile_bayes.api.maps import demo_map as demo_map
+from tactile_bayes.api.maps import demo_scan as demo_scan
+from tactile_bayes.api.maps import read_map as read_map
+from tactile_bayes.api.maps import read_scan as read_scan
+from tactile_bayes.api.maps import simulate as simulate
+from tactile_bayes.api.recording import record as record
+from tactile_bayes.api.trials import TrialResult as TrialResult
+from tactile_bayes.api.trials import calibrate_size as calibrate_size
+from tactile_bayes.api.trials import validate as validate
+
+__version__: str
+__all__: list[str]

@@ -1,0 +1,406 @@
+"""Estimates of a lump's size: from one map, or from several maps of one mass."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tactile_bayes.api.draws import Draws
+from tactile_bayes.api.maps import Map, map_of
+from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.errors import UsageError
+from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+    from tactile_bayes.pipeline.pooled import PooledOutcome
+    from tactile_bayes.size.posterior import SizePosterior
+
+_SIZES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
+_SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
+
+
+class _Sized:
+    """What the estimates of one map and of several share."""
+
+    name: str
+    probability: float
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        raise NotImplementedError
+
+    @property
+    def why(self) -> str:
+        """Why there is no size, or no estimate at all; empty where there is a size."""
+        raise NotImplementedError
+
+    def _of_size(self, name: str) -> Draws | None:
+        size = self._size
+        if size is None:
+            return None
+        return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
+
+    @property
+    def max_size_mm(self) -> Draws | None:
+        """Largest diameter; None without a size."""
+        return self._of_size("max_size_mm")
+
+    @property
+    def min_size_mm(self) -> Draws | None:
+        """Smallest diameter; None without a size."""
+        return self._of_size("min_size_mm")
+
+    def _columns(self) -> dict[str, Draws]:
+        found = {name: self._of_size(name) for name in _SIZES}
+        return {name: draws for name, draws in found.items() if draws is not None}
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row for each draw: chain, draw and a column for each quantity; no rows without an estimate."""
+        import pandas
+
+        columns = self._columns()
+        shape = next(iter(columns.values())).values.shape if columns else (0, 0)
+        chain, draw = (index.ravel() for index in np.indices(shape))
+        values = {name: draws.values.ravel() for name, draws in columns.items()}
+        return pandas.DataFrame({"chain": chain, "draw": draw, **values})
+
+    def to_arviz(self) -> Any:
+        """The draws as arviz has them, one group ``posterior``.
+
+        Raises
+        ------
+        UsageError
+            Without an estimate: there are no draws.
+        """
+        from tactile_bayes.inference.arviz_data import inference_data
+
+        columns = self._columns()
+        if not columns:
+            raise UsageError(f"there are no draws: {self.why}")
+        return inference_data({name: draws.values for name, draws in columns.items()})
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self._words()}>"
+
+    def _words(self) -> str:
+        return f"no size: {self.why}" if self.max_size_mm is None else f"largest size {self.max_size_mm}"
+
+    def _repr_html_(self) -> str:
+        rows = [("largest size", self.max_size_mm), ("smallest size", self.min_size_mm)]
+        cells = [f"<tr><th>{name}</th><td>{escape(repr(draws))}</td></tr>" for name, draws in rows if draws is not None]
+        table = f"<table>{''.join(cells)}</table>" if cells else f"<p>No size: {escape(self.why)}</p>"
+        return f"{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SizeEstimate(_Sized):
+    """The estimate of one map.
+
+    Parameters
+    ----------
+    outcome
+        Map, posterior, settings and provenance.
+    name
+        Of the map, for figures.
+    """
+
+    outcome: Outcome
+    name: str = ""
+
+    @property
+    def probability(self) -> float:  # type: ignore[override]
+        """Of the intervals that are shown where none is asked for."""
+        return self.outcome.settings.interval
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        return self.outcome.estimate.size
+
+    @property
+    def status(self) -> str:
+        """``"estimate"`` or ``"no_estimate"``."""
+        return self.outcome.estimate.status
+
+    @property
+    def why(self) -> str:
+        """Why there is no size, or no estimate at all; empty where there is a size."""
+        return "" if self._size is not None else self.outcome.estimate.reason
+
+    @property
+    def advice(self) -> str:
+        """What would help where there is no size."""
+        return self.outcome.estimate.advice
+
+    @property
+    def detected_probability(self) -> float | None:
+        """Posterior probability that the map shows a lump; None where nothing could be tested."""
+        detection = self.outcome.estimate.detection
+        return None if detection is None else detection.probability
+
+    @property
+    def amplitude(self) -> Draws | None:
+        """Height of the map's Gaussian over its level; None without an estimate."""
+        return self._of_shape("amplitude")
+
+    @property
+    def sigma_x_mm(self) -> Draws | None:
+        """Width of the map's Gaussian along its first axis; None without an estimate."""
+        return self._of_shape("sigma_x_mm")
+
+    @property
+    def sigma_y_mm(self) -> Draws | None:
+        """Width of the map's Gaussian along its second axis; None without an estimate."""
+        return self._of_shape("sigma_y_mm")
+
+    @property
+    def x_mm(self) -> Draws | None:
+        """Centre of the lump on the map, across the head; None without an estimate."""
+        return self._of_shape("x_mm")
+
+    @property
+    def y_mm(self) -> Draws | None:
+        """Centre of the lump on the map, along the head; None without an estimate."""
+        return self._of_shape("y_mm")
+
+    def _of_shape(self, name: str) -> Draws | None:
+        found = self.outcome.estimate
+        if found.map_posterior is None or found.draws is None:
+            return None
+        unit = "mm" if name.endswith("_mm") else "rad" if name.endswith("_rad") else ""
+        values = getattr(found.map_posterior, name)
+        return Draws(values, unit, self.probability, found.draws.labels, found.draws.effective_draws)
+
+    def _columns(self) -> dict[str, Draws]:
+        shapes = {name: draws for name in _SHAPES if (draws := self._of_shape(name)) is not None}
+        return {**super()._columns(), **shapes}
+
+    @cached_property
+    def answer(self) -> Answer:
+        """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""
+        return answer_of(self.outcome)
+
+    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the posterior of the size; without a size the map with the places looked at.
+
+        Parameters
+        ----------
+        path
+            Also write it there, as PNG, PDF or SVG.
+        """
+        from tactile_bayes.report.estimate_figures import draw_size
+
+        found = self.outcome.estimate
+        if found.size is None or found.draws is None:
+            return self.plot_map(path, force=force)
+        draws = {"max": found.size.max_size_mm.ravel(), "min": found.size.min_size_mm.ravel()}
+        return draw_size(
+            draws,
+            path_of(path),
+            name=self.name,
+            probability=self.probability,
+            effective_draws=found.draws.effective_draws,
+            force=force,
+        )
+
+    def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the map with the lump's ellipse and size, or with the places looked at."""
+        from tactile_bayes.report.estimate_figures import draw_map
+
+        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self.name, force=force)
+
+    def save(self, path: PathLike, *, force: bool = False) -> None:
+        """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
+
+        Raises
+        ------
+        UsageError
+            Without an estimate, or when the file exists and `force` is false.
+        """
+        from tactile_bayes.files.posterior_nc import write_posterior
+
+        if self.status != "estimate":
+            raise UsageError(f"there are no draws to write: {self.why}")
+        write_posterior(path_of(path), self.outcome.estimate, provenance=self.outcome.provenance, force=force)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PooledSize(_Sized):
+    """One size from several maps of one mass.
+
+    Parameters
+    ----------
+    outcome
+        The pooled size, its JSON object, its provenance.
+    maps
+        The estimates of the maps alone.
+    probability
+        Of the intervals that are shown where none is asked for.
+    """
+
+    outcome: PooledOutcome
+    maps: tuple[SizeEstimate, ...]
+    probability: float
+    name: str = field(default="")
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        return self.outcome.pooled.size
+
+    @property
+    def why(self) -> str:
+        """Why there is no size; empty where there is one."""
+        return "" if self._size is not None else self.outcome.pooled.reason
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``estimate --pool --json`` prints."""
+        return self.outcome.document
+
+    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the posterior of the size; with a path also write it.
+
+        Raises
+        ------
+        UsageError
+            Without a size.
+        """
+        from tactile_bayes.report.estimate_figures import draw_size
+
+        size = self._size
+        if size is None:
+            raise UsageError(f"there is no size to draw: {self.why}")
+        draws = {"max": size.max_size_mm.ravel(), "min": size.min_size_mm.ravel()}
+        name = self.name or f"{len(self.maps)} maps pooled"
+        return draw_size(draws, path_of(path), name=name, probability=self.probability, force=force)
+
+
+def settings_of(options: Mapping[str, Any]) -> Settings:
+    """Settings from keywords; what is not given is as on the command line.
+
+    Raises
+    ------
+    TypeError
+        Naming a keyword that is none, and those that are.
+    """
+    known = _keywords()
+    for name in options:
+        if name not in known:
+            raise TypeError(f"estimate has no setting {name!r}; the settings are {', '.join(known)}")
+    given = {known[name]: value for name, value in options.items()}
+    calibration = given.get("calibration")
+    if isinstance(calibration, Path):
+        given["calibration"] = str(calibration.expanduser())
+    if isinstance(given.get("known"), Mapping):
+        given["known"] = tuple((name, float(value)) for name, value in given["known"].items())
+    if given.get("checkpoint") is not None:
+        given["checkpoint"] = path_of(given["checkpoint"])
+    return Settings(**given)
+
+
+def _keywords() -> dict[str, str]:
+    """Keywords of `estimate`, and the settings that they are."""
+    renamed = {"calibration": "size_calibration"}
+    names = [one.name for one in fields(Settings) if one.name != "settings_file"]
+    return {renamed.get(name, name): name for name in names}
+
+
+def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = None, **settings: Any) -> SizeEstimate:
+    """Estimate a lump's size from one map.
+
+    Parameters
+    ----------
+    tactile_map
+        A map, or the path of one.
+    progress
+        Called with effective draws done and wanted.
+    **settings
+        As of `tactile_bayes.pipeline.settings.Settings`, by default as on the command line; `size_calibration` is a
+        name, a path or a calibration from `calibrate_size`, `known` a mapping such as ``{"seat": 1.2}``.
+
+    Returns
+    -------
+    SizeEstimate
+        Without a number where the map shows no lump that can be measured: `why` says the reason.
+
+    Raises
+    ------
+    BadDataError
+        When a file is not what it must be, or the calibration does not fit the map.
+    UsageError
+        When settings contradict each other.
+    NotConvergedError
+        When the method asked for does not converge.
+
+    Examples
+    --------
+    >>> import tactile_bayes as tb
+    >>> found = tb.estimate(tb.demo_map())
+    >>> low, high = found.max_size_mm.interval(0.9)
+    >>> bool(low < 15.0 < high)
+    True
+    """
+    given = map_of(tactile_map)
+    inputs = {} if given.path is None else {"map": given.path}
+    outcome = estimate_one(given.tactile_map, settings_of(settings), inputs=inputs, progress=progress)
+    return SizeEstimate(outcome, "" if given.path is None else given.path.stem)
+
+
+def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
+    """Estimate one size from several maps of one mass, whose spread is learned.
+
+    Parameters
+    ----------
+    maps
+        Maps, paths or estimates; each map once, in any order.
+    **settings
+        As of `estimate`; estimates that are given keep their own.
+
+    Raises
+    ------
+    UsageError
+        When there is no map, one is given twice, or the calibration cannot pool.
+    BadDataError
+        As of `estimate`, and when the maps were normalised in several ways.
+    """
+    from tactile_bayes.pipeline.pooled import pool_answers
+
+    used = settings_of(settings)
+    found = tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in _several(maps))
+    if not found:
+        raise UsageError("there is no map to pool; give at least one")
+    prints = [one.outcome.tactile_map.fingerprint for one in found]
+    if len(set(prints)) < len(prints):
+        raise UsageError("a map is given twice; give each map once")
+    names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
+    outcome = pool_answers([one.answer for one in found], used, names=names, inputs={})
+    return PooledSize(outcome, found, used.interval)
+
+
+def _several(maps: Iterable[Any]) -> list[Any]:
+    if isinstance(maps, str | Path | Map):
+        raise UsageError("pool takes several maps; give a list")
+    return list(maps)
+
+
+def _signature() -> inspect.Signature:
+    """The signature of `estimate` with every setting and its default, for help and completion."""
+    kind = inspect.Parameter.KEYWORD_ONLY
+    defaults, known = Settings(), _keywords()
+    first = [one for one in inspect.signature(estimate).parameters.values() if one.kind is not one.VAR_KEYWORD]
+    more = [inspect.Parameter(name, kind, default=getattr(defaults, known[name])) for name in known]
+    return inspect.Signature([*first, *more])
+
+
+estimate.__signature__ = _signature()  # type: ignore[attr-defined]

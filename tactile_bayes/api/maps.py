@@ -1,0 +1,226 @@
+"""Scans and tactile maps: read, simulate, build, show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.errors import UsageError
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.forward.instrument import SimulatedScan
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.scan import Scan
+
+_DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Map:
+    """A tactile map: mean normalised pressure in square cells of the best-fit plane.
+
+    Parameters
+    ----------
+    tactile_map
+        Arrays, recipe and quality, see `tactile_bayes.mapping.TactileMap`.
+    path
+        The file that it was read from; None for a map that is in none.
+    notes
+        What the scans lost, or what else speaks against them.
+    """
+
+    tactile_map: TactileMap
+    path: Path | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def mean(self) -> FloatArray:
+        """(ny, nx) mean normalised pressure; NaN where no frame has been."""
+        return np.where(self.tactile_map.covered, self.tactile_map.mean, np.nan)
+
+    @property
+    def x_mm(self) -> FloatArray:
+        """(nx,) centres of the cells across the head."""
+        return self.tactile_map.x_mm
+
+    @property
+    def y_mm(self) -> FloatArray:
+        """(ny,) centres of the cells along the head."""
+        return self.tactile_map.y_mm
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row for each cell with data: x_mm, y_mm, mean, variance, count."""
+        import pandas
+
+        found = self.tactile_map
+        rows, columns = np.nonzero(found.covered)
+        return pandas.DataFrame(
+            {
+                "x_mm": found.x_mm[columns],
+                "y_mm": found.y_mm[rows],
+                "mean": found.mean[rows, columns],
+                "variance": found.variance[rows, columns],
+                "count": found.count[rows, columns],
+            }
+        )
+
+    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the map beside its coverage; with a path also write it as PNG, PDF or SVG."""
+        from tactile_bayes.report.map_figure import map_figure
+
+        return map_figure(self.tactile_map, path_of(path), force=force)
+
+    def save(self, path: PathLike, *, force: bool = False) -> None:
+        """Write the map as `tactile-bayes map` does, for `estimate` and other programs.
+
+        Raises
+        ------
+        UsageError
+            When the file exists and `force` is false.
+        """
+        from tactile_bayes.files.map_nc import write_map
+
+        write_map(path_of(path), self.tactile_map, provenance=_provenance("map", self.tactile_map), force=force)
+
+    def __repr__(self) -> str:
+        found = self.tactile_map
+        ny, nx = found.mean.shape
+        covered = int(found.covered.sum())
+        return (
+            f"<Map {nx} x {ny} cells of {found.recipe.cell_mm:g} mm, {covered} with data, {found.recipe.value_words}>"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p><p><small>{escape(RESEARCH_USE)}</small></p>"
+
+
+def read_scan(path: PathLike) -> Scan:
+    """Read a scan file (``.mcap``).
+
+    Raises
+    ------
+    BadDataError
+        When the file is no scan, or is damaged.
+    """
+    from tactile_bayes.files.scan_mcap import read_scan as read
+
+    return read(path_of(path))
+
+
+def read_map(path: PathLike) -> Map:
+    """Read a map (``.nc``).
+
+    Raises
+    ------
+    BadDataError
+        When the file is no map, or is damaged.
+    """
+    from tactile_bayes.files.map_nc import read_map as read
+
+    return Map(read(path_of(path)), path_of(path))
+
+
+def build_map(scans: Any, **options: Any) -> Map:
+    """Build one map from a scan, or from several scans of one examination.
+
+    Parameters
+    ----------
+    scans
+        A scan, a simulated scan, a path, or a sequence of them.
+    **options
+        As of `tactile_bayes.mapping.build_map`: cell_mm, pressure_window_kpa, normalise...
+
+    Raises
+    ------
+    BadDataError
+        When a file is no scan, or no frame is left.
+    """
+    from tactile_bayes.mapping import build_map as build
+    from tactile_bayes.pipeline.scans import load_scans
+
+    given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
+    loaded, notes = [], []
+    for one in given:
+        if isinstance(one, str | Path):
+            (scan,), lost = load_scans([path_of(one)])
+            loaded.append(scan)
+            notes += lost
+        else:
+            loaded.append(getattr(one, "scan", one))
+    return Map(build(loaded, **options), notes=tuple(notes))
+
+
+def simulate(
+    scene: PathLike, *, seed: int | None = None, fidelity: str | None = None, head: str | None = None
+) -> SimulatedScan:
+    """Make a scan with known truth from a scene.
+
+    Parameters
+    ----------
+    scene
+        Path of a TOML file.
+    seed
+        Of the random numbers. Default: the scene's.
+    fidelity, head
+        As of `tactile-bayes simulate`.
+
+    Returns
+    -------
+    SimulatedScan
+        `scan`, and `truth` as plain data.
+    """
+    from tactile_bayes.files.scene_toml import read_scene
+    from tactile_bayes.forward.simulate import simulate as run
+
+    read = read_scene(path_of(scene))
+    used = read.seed if seed is None else seed
+    return run(read, rng=np.random.default_rng(used), fidelity=fidelity, head=head)
+
+
+def demo_scan() -> Scan:
+    """The scan that comes with the program: a simulated lump of 15 mm."""
+    return read_scan(_DEMO)
+
+
+def demo_map() -> Map:
+    """The map of `demo_scan`."""
+    return build_map(_DEMO)
+
+
+def map_of(given: Any) -> Map:
+    """A map, whatever of it was given: a map, a path, or a `TactileMap`.
+
+    Raises
+    ------
+    UsageError
+        When it is none of them.
+    """
+    from tactile_bayes.mapping.tactile_map import TactileMap
+
+    if isinstance(given, Map):
+        return given
+    if isinstance(given, str | Path):
+        return read_map(given)
+    if isinstance(given, TactileMap):
+        return Map(given)
+    raise UsageError(f"a map is wanted, not {type(given).__name__}; build one with build_map, or give a path")
+
+
+def _provenance(command: str, tactile_map: TactileMap) -> Provenance:
+    from dataclasses import asdict
+
+    from tactile_bayes.files.provenance import Provenance
+
+    return Provenance(command, {"called_from": "Python", **asdict(tactile_map.recipe)})

@@ -1,0 +1,22 @@
+"""Paths as Python callers give them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import overload
+
+PathLike = str | os.PathLike[str]
+
+
+@overload
+def path_of(given: PathLike) -> Path: ...
+
+
+@overload
+def path_of(given: None) -> None: ...
+
+
+def path_of(given: PathLike | None) -> Path | None:
+    """A path, with ``~`` as the home folder; None stays None."""
+    return None if given is None else Path(given).expanduser()

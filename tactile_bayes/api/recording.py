@@ -1,0 +1,62 @@
+"""Recordings from scripts: the same recorder as `tactile-bayes record`, started at once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.errors import DeviceError
+
+if TYPE_CHECKING:
+    from tactile_bayes.hardware.account import Report
+
+_PATHS = ("like", "head_geometry", "array_calibration", "landmarks", "tracker_rom", "session_file")
+_RENAMED = {"head": "head_url", "tracker": "tracker_url", "session": "session_file"}
+
+
+def record(output: PathLike, *, head: str, duration_s: float, **options: Any) -> Report:
+    """Record a scan head and a tracker into a scan file, from now on for some seconds.
+
+    Call it from the main thread: Ctrl-C ends the recording in order.
+
+    Parameters
+    ----------
+    output
+        Scan file to write (``.mcap``).
+    head
+        Port of the scan head.
+    duration_s
+        By the head's clock.
+    **options
+        As of `tactile-bayes record`, by default as there: tracker, tracker_protocol, like, head_geometry,
+        array_calibration, session, side, subject, force...
+
+    Returns
+    -------
+    Report
+        Frames, poses, what was lost, and cautions.
+
+    Raises
+    ------
+    DeviceError
+        When a port cannot be opened, or a device stopped answering; what came before is in the file.
+    UsageError
+        When options contradict each other, or the file exists and `force` is false.
+    """
+    from tactile_bayes.commands.record import command, make_recording
+    from tactile_bayes.commands.record_request import Request
+
+    words = ["-o", str(path_of(output)), "--head", head]
+    defaults = command.make_context("record", words).params
+    given = {_RENAMED.get(name, name): value for name, value in options.items()}
+    for name in given:
+        if name not in defaults:
+            known = ", ".join(sorted(set(defaults) - {"output", "head_url", "duration_s"}))
+            raise TypeError(f"record has no option {name!r}; the options are {known}")
+    given |= {name: path_of(given[name]) for name in _PATHS if name in given}
+    given |= {"output": path_of(output), "head_url": head, "duration_s": duration_s, "at_once": True}
+    arguments: dict[str, Any] = {**defaults, **given}
+    report, _ = make_recording(Request(**arguments))
+    if report.fault:
+        raise DeviceError(report.fault)
+    return report

@@ -1,0 +1,175 @@
+"""Tables in, results out: a size calibration from lumps of known size, a trial's report from readings and excision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    import pandas
+
+    from tactile_bayes.files.tables import Sheet
+    from tactile_bayes.pipeline.trial import TrialOutcome
+    from tactile_bayes.size.calibration import Calibration
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrialResult:
+    """How each modality's sizes compare with excision.
+
+    Parameters
+    ----------
+    outcome
+        The report and its JSON object.
+    """
+
+    outcome: TrialOutcome
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``validate --json`` prints."""
+        return self.outcome.document
+
+    @property
+    def text(self) -> str:
+        """What ``validate --methods`` prints."""
+        from tactile_bayes.report.trial_text import trial_text
+
+        more = [] if self.outcome.next_mass is None else self.outcome.next_mass.lines()
+        return trial_text(self.outcome.report, methods=True, checks=self.outcome.checks, more=more)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row for each modality and figure: value, and the ends of its interval (NaN where it has none)."""
+        import pandas
+
+        rows = []
+        for modality, figures in self.document["modalities"].items():
+            for name, value in figures.items():
+                if isinstance(value, int | float):
+                    counted = name == "detected"  # the interval beside it is of the share
+                    low, high = (None, None) if counted else figures.get(f"{name}_interval") or (None, None)
+                    rows.append((modality, name, value, low, high))
+        found = pandas.DataFrame(rows, columns=["modality", "figure", "value", "low", "high"])
+        return found.astype({"value": float, "low": float, "high": float})
+
+    def __repr__(self) -> str:
+        counts = self.document["counts"]
+        names = ", ".join(self.document["modalities"])
+        return f"<TrialResult {counts['masses']} masses of {counts['patients']} patients: {names}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
+
+
+def validate(
+    trial: PathLike | pandas.DataFrame,
+    excision: PathLike | pandas.DataFrame,
+    *,
+    columns: PathLike | None = None,
+    **settings: Any,
+) -> TrialResult:
+    """Compare sizes with excision.
+
+    Parameters
+    ----------
+    trial
+        Readings: patient, mass, modality, replicate, size_mm, status..., a CSV file or a DataFrame.
+    excision
+        Sizes after excision: patient, mass, ex_vivo_mm...
+    columns
+        For a wide CSV file: a TOML file that says which column holds which reading.
+    **settings
+        As of `tactile_bayes.pipeline.trial.TrialSettings`, by default as on the command line.
+
+    Raises
+    ------
+    BadDataError
+        Naming the table, the line (1 is the header), the column, the value and the way out.
+    """
+    from tactile_bayes.pipeline.trial import TrialSettings, analyse
+    from tactile_bayes.pipeline.trial_inputs import load_trial
+
+    inputs = load_trial(_table(trial, "trial"), _table(excision, "excision"), path_of(columns))
+    return TrialResult(analyse(inputs, TrialSettings(**settings)))
+
+
+def calibrate_size(
+    table: PathLike | pandas.DataFrame,
+    *,
+    form: str = "eq6",
+    least_stiffness_ratio: float = 0.0,
+    seed: int = 1,
+    path: PathLike | None = None,
+    force: bool = False,
+    **declared: Any,
+) -> Calibration:
+    """Learn a size calibration from lumps of known size.
+
+    Parameters
+    ----------
+    table
+        A row for each lump: d_mm, amplitude, sigma_x_mm...; a table of `population` for ``form="log-quadratic"``.
+    form
+        ``"eq6"`` as printed, or ``"log-quadratic"``.
+    least_stiffness_ratio
+        Eq 6: softer lumps take no part.
+    seed
+        Of the random numbers.
+    path
+        Also write the calibration there.
+    **declared
+        Eq 6: normalise, background, fit_radius_mm, noise of the table's maps, where it does not say.
+
+    Returns
+    -------
+    calibration
+        For ``estimate(..., size_calibration=...)``.
+
+    Raises
+    ------
+    BadDataError
+        Naming the table, the line, the column, the value and the way out.
+    TypeError
+        When a keyword is none of these.
+    """
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.size_json import write_size_calibration
+    from tactile_bayes.files.size_quadratic_json import write_log_quadratic
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.pipeline.size_calibration import learn_eq6, learn_quadratic
+
+    names = ("normalise", "background", "fit_radius_mm", "noise")
+    for name in declared:
+        if name not in names or form != "eq6":
+            raise TypeError(f"calibrate_size has no setting {name!r} for form {form!r}; Eq 6 has {', '.join(names)}")
+    if form not in ("eq6", "log-quadratic"):
+        raise TypeError(f"form is {form!r}; it is 'eq6' or 'log-quadratic'")
+    source = _table(table, "table")
+    inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
+    if form == "log-quadratic":
+        quadratic, settings = learn_quadratic(read_table(source, "population.table.json"))
+        if path is not None:
+            provenance = Provenance("calibrate size", settings, inputs)
+            write_log_quadratic(path_of(path), quadratic, provenance=provenance, force=force)
+        return quadratic
+    rows = read_table(source, "size_table.table.json")
+    given = {name: declared.get(name) for name in names}
+    learned = learn_eq6(rows, given, least_stiffness_ratio=least_stiffness_ratio, seed=seed)
+    if path is not None:
+        provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)
+        write_size_calibration(path_of(path), learned.calibration, provenance=provenance, force=force)
+    return learned.calibration
+
+
+def _table(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
+    """A path, or a DataFrame as the CSV text that its file would hold."""
+    from tactile_bayes.files.tables import Sheet
+
+    if hasattr(given, "to_csv"):
+        return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
+    return path_of(given)

@@ -1,0 +1,242 @@
+"""What `import tactile_bayes as tb` offers: lazily, with the command line's defaults and numbers."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import json
+import pickle
+import threading
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pandas
+import pytest
+from emulated_devices import head_and_tracker, short_scan
+from in_process import run_here
+
+import tactile_bayes as tb
+from tactile_bayes.cli import cli
+from tactile_bayes.errors import BadDataError, DeviceError, UsageError
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_mcap import write_scan
+from tactile_bayes.mapping import build_map
+from tactile_bayes.pipeline.settings import FROM_FILE
+from tactile_bayes.pipeline.trial import TrialSettings
+from tactile_bayes.presets import RESEARCH_USE
+
+DEMO = Path(tb.__file__).parent / "demo"
+FAST = {"method": "laplace"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the map of the packaged scan."""
+    made = tmp_path_factory.mktemp("door")
+    assert run_here("map", DEMO / "scan.mcap", "-o", "map.nc", cwd=made).returncode == 0
+    return made
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path) -> tb.SizeEstimate:
+    return tb.estimate(folder / "map.nc", **FAST)
+
+
+def test_the_import_alone_loads_nothing_heavy(run_python: Any) -> None:
+    done = run_python("-c", "import sys, tactile_bayes as tb; print(*sys.modules)")
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.split())
+    assert not loaded & {"numpy", "scipy", "pandas", "click", "matplotlib", "arviz", "typing"}
+    assert not {name for name in loaded if name.startswith("tactile_bayes.")}
+
+
+def test_every_name_is_there_and_typed() -> None:
+    stub = (Path(tb.__file__).parent / "__init__.pyi").read_text()
+    for name in tb.__all__:
+        assert getattr(tb, name) is not None
+        assert f" as {name}\n" in stub
+    assert set(tb.__all__) <= set(dir(tb))
+    with pytest.raises(AttributeError, match="no_such"):
+        getattr(tb, "no_such")  # noqa: B009
+    assert (Path(tb.__file__).parent / "py.typed").exists()
+
+
+def defaults_of(command: str, *words: str) -> dict[str, Any]:
+    found = cli.get_command(click.Context(cli), command)
+    assert found is not None
+    return found.make_context(command, list(words)).params
+
+
+def test_the_defaults_are_the_command_lines() -> None:
+    given = {name: one.default for name, one in inspect.signature(tb.estimate).parameters.items()}
+    shown = defaults_of("estimate", "map.nc")
+    shared = set(given) & set(shown)
+    assert shared >= {"size_calibration", "method", "seed", "interval", "centre_mm", "scene", "accuracy_sd", "known"}
+    assert {name: given[name] for name in shared} == {name: shown[name] for name in shared}
+    assert set(given) - shared == {"tactile_map", "progress", "prior", *FROM_FILE}
+    trial, shown = TrialSettings(), defaults_of("validate", "t.csv", "--excision", "e.csv")
+    for name in ("intervals", "resamples", "seed", "error_ratio", "check_intervals", "bayes"):
+        assert getattr(trial, name) == shown[name]
+    by_hand = {name: one.default for name, one in inspect.signature(build_map).parameters.items()}
+    shown = defaults_of("map", "s.mcap", "-o", "m.nc")
+    for name in ("cell_mm", "pressure_window_kpa", "normalise", "latency_ms", "flat_field", "register_strokes"):
+        assert by_hand[name] == shown[name], name
+
+
+def test_either_way_gives_the_same_numbers(folder: Path, found: tb.SizeEstimate) -> None:
+    told = json.loads(run_here("estimate", "map.nc", "--method", "laplace", "--json", cwd=folder).stdout)
+    assert json.loads(json.dumps(found.answer.document)) == told
+    direct = tb.estimate(tb.build_map(DEMO / "scan.mcap"), **FAST).answer.document
+    assert {**direct, "provenance": None} == {**told, "provenance": None}
+    assert found.max_size_mm is not None
+    low, high = found.max_size_mm.interval()
+    assert (low, high) == pytest.approx((told["max_size_mm"]["low"], told["max_size_mm"]["high"]), rel=1e-8)
+    ninety = json.loads(
+        run_here("estimate", "map.nc", "--method", "laplace", "--interval", 0.9, "--json", cwd=folder).stdout
+    )
+    assert found.max_size_mm.interval(0.9)[1] == pytest.approx(ninety["max_size_mm"]["high"], rel=1e-8)
+
+
+def test_a_result_has_its_draws_in_every_form(found: tb.SizeEstimate, tmp_path: Path) -> None:
+    size = found.max_size_mm
+    assert size is not None
+    frame = found.to_dataframe()
+    assert len(frame) == size.values.size
+    np.testing.assert_array_equal(frame.max_size_mm, np.asarray(size).ravel())
+    np.testing.assert_array_equal(found.to_arviz().posterior["max_size_mm"], size.values)
+    assert size.median == pytest.approx(frame.max_size_mm.median(), rel=2e-3)
+    assert size.sd == pytest.approx(frame.max_size_mm.std(), rel=1e-2)
+    found.save(tmp_path / "posterior.nc")
+    with pytest.raises(UsageError, match="exists"):
+        found.save(str(tmp_path / "posterior.nc"))
+    for draw in (found.plot, found.plot_map):
+        assert draw().axes
+        draw(tmp_path / f"{draw.__name__}.svg")
+        assert (tmp_path / f"{draw.__name__}.svg").stat().st_size > 1000
+    with pytest.raises(ValueError, match="it must lie between 0 and 1"):
+        size.interval(95)
+
+
+def test_what_is_shown_is_short_and_says_research(found: tb.SizeEstimate, folder: Path) -> None:
+    for one in (found, tb.read_map(folder / "map.nc")):
+        assert len(repr(one)) < 120
+        assert RESEARCH_USE in one._repr_html_()
+    assert "largest size" in repr(found)
+    assert "<script>" not in tb.SizeEstimate(found.outcome, "<script>")._repr_html_()
+
+
+def test_no_lump_is_a_result(folder: Path) -> None:
+    empty = tb.estimate(folder / "map.nc", centre_mm=(-25.0, 20.0), **FAST)
+    assert (empty.status, empty.max_size_mm, empty.amplitude) == ("no_estimate", None, None)
+    assert empty.why in repr(empty)
+    assert len(empty.to_dataframe()) == 0
+    assert empty.plot().axes
+    for act in (empty.to_arviz, lambda: empty.save("x.nc")):
+        with pytest.raises(UsageError, match="there are no draws"):
+            act()
+
+
+def test_a_result_can_be_copied_pickled_and_made_in_a_thread(found: tb.SizeEstimate, folder: Path) -> None:
+    made: list[tb.SizeEstimate] = []
+    thread = threading.Thread(target=lambda: made.append(tb.estimate(folder / "map.nc", **FAST)))
+    thread.start()
+    thread.join()
+    for one in (made[0], copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        assert repr(one) == repr(found)
+
+
+def test_maps_are_pooled_as_on_the_command_line(folder: Path) -> None:
+    run_here("map", DEMO / "scan.mcap", "-o", "other.nc", "--pressure-window-kpa", 6, 14, cwd=folder)
+    words = ("estimate", "map.nc", "other.nc", "--pool", "--method", "laplace", "--json")
+    told = json.loads(run_here(*words, cwd=folder).stdout)
+    pooled = tb.pool([folder / "other.nc", str(folder / "map.nc")], **FAST)
+    assert pooled.document["max_size_mm"] == told["max_size_mm"]
+    assert pooled.max_size_mm is not None
+    assert pooled.plot().axes
+    assert "largest size" in repr(pooled)
+
+
+BAD: dict[str, tuple[Any, type[Exception], str]] = {
+    "a path that is not there": (lambda f: tb.estimate(f / "no.nc"), BadDataError, "no.nc"),
+    "a scan for a map": (lambda _: tb.read_map(DEMO / "scan.mcap"), BadDataError, "map"),
+    "a map for a scan": (lambda f: tb.build_map(f / "map.nc"), BadDataError, "map.nc"),
+    "an array": (lambda _: tb.estimate(np.zeros((3, 3))), UsageError, "a map is wanted, not ndarray"),
+    "an unknown setting": (lambda f: tb.estimate(f / "map.nc", metod="laplace"), TypeError, "no setting 'metod'"),
+    "settings that contradict": (
+        lambda f: tb.estimate(f / "map.nc", noise="independent", scene="round", size_calibration="none"),
+        UsageError,
+        "goes with correlated errors",
+    ),
+    "a map to pool": (lambda f: tb.pool(f / "map.nc"), UsageError, "give a list"),
+    "no map to pool": (lambda _: tb.pool([]), UsageError, "no map to pool"),
+    "a map twice": (lambda f: tb.pool([f / "map.nc"] * 2, **FAST), UsageError, "given twice"),
+    "a table without a column": (
+        lambda _: tb.validate(pandas.DataFrame({"patient": ["P1"]}), DEMO / "excision.csv"),
+        BadDataError,
+        r"trial \(DataFrame\).*mass",
+    ),
+    "a table with a wrong cell": (
+        lambda _: tb.calibrate_size(pandas.DataFrame({"d_mm": [-1.0], "amplitude": [1.0], "sigma_x_mm": [3.0]})),
+        BadDataError,
+        r"table \(DataFrame\): line 2",
+    ),
+    "a form that is none": (lambda _: tb.calibrate_size(DEMO / "phantoms.csv", form="eq7"), TypeError, "eq7"),
+    "an option of no recording": (
+        lambda f: tb.record(f / "s.mcap", head="/dev/nothing", duration_s=1, sid="left"),
+        TypeError,
+        "no option 'sid'",
+    ),
+    "no head": (
+        lambda f: tb.record(f / "s.mcap", head="/dev/nothing", duration_s=1, like=DEMO / "scan.mcap"),
+        DeviceError,
+        "cannot be opened",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_error(case: str, folder: Path) -> None:
+    act, kind, words = BAD[case]
+    before = sorted(folder.iterdir())
+    with pytest.raises(kind, match=words) as caught:
+        act(folder)
+    assert "\n" not in str(caught.value)
+    assert sorted(folder.iterdir()) == before
+
+
+def test_tables_come_as_files_or_frames(tmp_path: Path) -> None:
+    files = [DEMO / "trial.csv", DEMO / "excision.csv"]
+    one, other = tb.validate(*files), tb.validate(*map(pandas.read_csv, files))
+    assert {**one.document, "provenance": None} == {**other.document, "provenance": None}
+    figures = one.to_dataframe().set_index(["modality", "figure"])
+    error = figures.loc[("tactile", "mape_percent")]
+    assert error.low < error.value < error.high
+    assert "<TrialResult" in repr(one)
+    learned = tb.calibrate_size(pandas.read_csv(DEMO / "phantoms.csv"), path=tmp_path / "size.json")
+    assert (tmp_path / "size.json").stat().st_mode & 0o777 == 0o600
+    by_mean = tb.build_map(DEMO / "scan.mcap", normalise="mean")
+    given = tb.estimate(by_mean, size_calibration=learned, **FAST).answer.document
+    by_path = tb.estimate(by_mean, size_calibration=tmp_path / "size.json", **FAST).answer.document
+    assert given["max_size_mm"]["median"] == pytest.approx(by_path["max_size_mm"]["median"], rel=1e-6)
+
+
+def test_simulate_keeps_the_truth(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text("[scene]\nduration_s = 1.0\nseed = 3\n[[lump]]\namplitude = 0.4\n")
+    simulated = tb.simulate(tmp_path / "scene.toml")
+    assert simulated.truth["lumps"]
+    np.testing.assert_array_equal(
+        tb.build_map([simulated]).tactile_map.mean, tb.build_map(simulated.scan).tactile_map.mean
+    )
+
+
+def test_a_script_records(tmp_path: Path) -> None:
+    scan = short_scan()
+    write_scan(tmp_path / "last.mcap", scan, provenance=Provenance("test", {}))
+    with head_and_tracker(scan, speed=5.0) as words:
+        ports = dict(zip(words[::2], words[1::2], strict=True))
+        given = {name.removeprefix("--").replace("-", "_"): value for name, value in ports.items()}
+        report = tb.record(tmp_path / "s.mcap", duration_s=0.5, like=tmp_path / "last.mcap", side="phantom", **given)
+    assert report.frames >= 100
+    assert tb.read_scan(tmp_path / "s.mcap").session["side"] == "phantom"
