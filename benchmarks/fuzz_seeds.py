@@ -30,7 +30,10 @@ WIDE = "record_id,ex_mm,map1,map1_low,map1_high\nP1,10,11,9,14\nP2,20,NV,,\n"
 PROTOCOL = (
     '[analysis]\nintervals = "bca"\nresamples = 999\nseed = 3\nerror_ratio = 1.5\n[promise]\ntext = "all masses"\n'
 )
-PRIOR = "amplitude_sd = 0.5\nwidth_median_mm = 5.0\n"
+SETTINGS = (
+    'amplitude_sd = 0.5\nwidth_median_mm = 5.0\nnoise = "field"\nfield_cosines = 20\ncheckpoint = "state.npz"\n'
+    'background = "free"\nfit_radius_mm = 20.0\nrotation = "on"\nmax_steps = 2000\n'
+)
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ def _tiffs() -> list[bytes]:
 
 def _tomls() -> list[bytes]:
     scenes = [(PACKAGE / "demo" / "scene.toml").read_bytes()]
-    return [PRIOR.encode(), PROTOCOL.encode(), MAPPING.encode(), *scenes]
+    return [SETTINGS.encode(), PROTOCOL.encode(), MAPPING.encode(), *scenes]
 
 
 def _jsons(folder: Path) -> list[bytes]:
@@ -259,13 +262,12 @@ def _read_wide(path: Path) -> object:
 
 
 def _read_tomls(path: Path) -> object:
-    from tactile_bayes.files.prior_toml import read_prior
-
     from tactile_bayes.files.column_map import read_mapping
     from tactile_bayes.files.protocol import read_protocol
     from tactile_bayes.files.scene_toml import read_scene
+    from tactile_bayes.files.settings_toml import read_settings
 
-    return _first([lambda read=read: read(path) for read in (read_prior, read_protocol, read_mapping, read_scene)])
+    return _first([lambda read=read: read(path) for read in (read_settings, read_protocol, read_mapping, read_scene)])
 
 
 def _read_jsons(path: Path) -> object:

@@ -12,7 +12,6 @@ from pathlib import Path
 import hostile
 import numpy as np
 import pytest
-from tactile_bayes.files.prior_toml import read_prior
 
 from tactile_bayes.batch import open_store
 from tactile_bayes.errors import BadDataError, UsageError
@@ -28,6 +27,7 @@ from tactile_bayes.files.protocol import read_protocol
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.files.scene_toml import read_scene
+from tactile_bayes.files.settings_toml import read_settings
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_posterior import read_stated_size
 from tactile_bayes.files.tables import read_table
@@ -112,15 +112,15 @@ def test_a_limit_can_be_raised_and_says_how(tmp_path: Path, monkeypatch) -> None
     path = tmp_path / "prior.toml"
     path.write_text("#" * 1_500_000)
     with pytest.raises(BadDataError, match=r"1,500,000 bytes, over the limit of 1,000,000; .*TACTILE_BAYES_LIMITS=2"):
-        read_prior(path)
+        read_settings(path)
     monkeypatch.setenv("TACTILE_BAYES_LIMITS", "2")
-    read_prior(path)
+    read_settings(path)
     monkeypatch.setenv("TACTILE_BAYES_LIMITS", "much")
     with pytest.raises(UsageError, match="'much'; give a number above 0"):
-        read_prior(path)
+        read_settings(path)
 
 
-TOML_READERS = (read_prior, read_scene, read_protocol, read_mapping)
+TOML_READERS = (read_settings, read_scene, read_protocol, read_mapping)
 JSON_READERS = (read_size_calibration, read_stated_size, describe)
 TEXTS: dict[str, tuple[str, tuple[Read, ...], str]] = {
     "deep JSON": ('{"schema": ' + hostile.deep_json() + "}", JSON_READERS, "recursion|nested"),
@@ -211,7 +211,7 @@ READERS: tuple[tuple[str, Read], ...] = (
     (".nc", read_map),
     (".json", read_size_calibration),
     (".json", read_stated_size),
-    (".toml", read_prior),
+    (".toml", read_settings),
     (".toml", read_scene),
     (".x", describe),
     (".npz", lambda path: CheckpointFile(path).load("key")),
