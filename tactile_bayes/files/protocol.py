@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
 
@@ -30,8 +28,4 @@ def read_protocol(path: Path) -> Protocol:
     """
     document = load_toml(path, way_out="give the analysis as TOML")
     check_document(document, "protocol.schema.json", path=path)
-    analysis: dict[str, Any] = document.get("analysis", {})
-    for name, value in analysis.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise BadDataError(f"analysis.{name} is {value}", way_out="give a finite number", path=str(path))
-    return Protocol(analysis, document.get("title"))
+    return Protocol(document.get("analysis", {}), document.get("title"))
