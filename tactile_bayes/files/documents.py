@@ -1,10 +1,10 @@
-"""JSON and TOML from files: of limited size and depth, with finite numbers and whole characters only."""
+"""JSON and TOML from files: of limited size and depth, with finite numbers and whole characters only, none of them NUL."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +15,7 @@ from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, read_t
 
 MOST_LEVELS: Final = 64
 MOST_KEY_PARTS: Final = 16
+_LARGEST: Final = sys.float_info.max
 # the parser's time grows with the square of a key's parts
 _LONG_KEY: Final = re.compile(
     rf"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*(?:\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*){{{MOST_KEY_PARTS}}}"""
@@ -27,7 +28,7 @@ def load_json(path: Path, *, way_out: str = "give a file this program wrote") ->
     Raises
     ------
     BadDataError
-        When it cannot be read or is not JSON, is too large or too deep, or holds a number that is not finite.
+        When it cannot be read or is not JSON, is too large or too deep, or holds a number that no double holds.
     """
     try:
         return parse_json(read_text(path, most=JSON_BYTES, way_out=way_out), way_out=way_out)
@@ -58,7 +59,7 @@ def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
     Raises
     ------
     BadDataError
-        When it cannot be read or is not TOML, is too large or too deep, or holds a number that is not finite.
+        When it cannot be read or is not TOML, is too large or too deep, or holds a number that no double holds.
     """
     try:
         return parse_toml(read_text(path, most=TOML_BYTES, way_out=way_out), way_out=way_out)
@@ -81,7 +82,7 @@ def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
 
 
 def check_plain(document: object, *, way_out: str, name: str = "") -> None:
-    """Refuse what cannot go on into a report: depth, numbers that are not finite, halves of characters.
+    """Refuse what cannot go on into a report: depth, infinities, NaN, numbers beyond 1.8e308, half characters, NUL.
 
     Raises
     ------
@@ -104,7 +105,17 @@ def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, obj
             yield (f"{where}.{key}" if where else str(key)), value
     elif isinstance(item, list):
         yield from ((f"{where}[{i}]", value) for i, value in enumerate(item))
-    elif isinstance(item, float) and not math.isfinite(item):
-        raise BadDataError(f"{where or 'the document'} is {item}", way_out="give a finite number")
-    elif isinstance(item, str) and not item.isascii() and any("\ud800" <= letter <= "\udfff" for letter in item):
-        raise BadDataError(f"{where or 'a key'} holds half a character: {item[:40]!a}", way_out=way_out)
+    elif isinstance(item, int | float) and not -_LARGEST <= item <= _LARGEST:
+        value = str(item) if isinstance(item, float) else f"a whole number of {len(str(abs(item)))} digits"
+        raise BadDataError(
+            f"{where or 'the document'} is {value}", way_out=f"give a finite number of at most {_LARGEST:.3g}"
+        )
+    elif isinstance(item, str):
+        _check_text(where, item, way_out=way_out)
+
+
+def _check_text(where: str, text: str, *, way_out: str) -> None:
+    if not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text):
+        raise BadDataError(f"{where or 'a key'} holds half a character: {text[:40]!a}", way_out=way_out)
+    if "\0" in text:  # the system takes no file name with one
+        raise BadDataError(f"{where or 'a key'} holds the character U+0000: {text[:40]!a}", way_out=way_out)

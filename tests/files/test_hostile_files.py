@@ -126,13 +126,21 @@ TEXTS: dict[str, tuple[str, tuple[Read, ...], str]] = {
     "deep JSON": ('{"schema": ' + hostile.deep_json() + "}", JSON_READERS, "recursion|nested"),
     "a number of 5,000 digits": ('{"schema": ' + "9" * 5000 + "}", JSON_READERS, "not JSON|not a JSON file"),
     "infinity": ('{"schema": "tactile-bayes/estimate/1", "x": [1e999]}', JSON_READERS, r"x\[0\] is inf; give a finite"),
+    "a whole number that no double holds": (
+        '{"schema": "tactile-bayes/size-calibration/1", "x": [' + "9" * 400 + "]}",
+        JSON_READERS,
+        r"x\[0\] is a whole number of 400 digits; give a finite number of at most 1.8e\+308",
+    ),
     "half a character": (
         '{"schema": "tactile-bayes/estimate/1", "x": "\\ud800"}',
         JSON_READERS,
         "x holds half a character",
     ),
+    "NUL": ('{"schema": "tactile-bayes/estimate/1", "x": "a\\u0000b"}', JSON_READERS, r"x holds the character U\+0000"),
+    "NUL in TOML": ('checkpoint = "a\\u0000b"', TOML_READERS, r"checkpoint holds the character U\+0000"),
     "a key of 20,000 parts": (hostile.dotted_toml(), TOML_READERS, "line 1: a key of more than 16 parts"),
     "deep TOML": ("x = " + hostile.deep_json(), TOML_READERS, "is not TOML"),
+    "TOML of 400 digits": ("[analysis]\nseed = " + "9" * 400, TOML_READERS, "seed is a whole number of 400 digits"),
     "TOML of 5,000 digits": ("x = " + "9" * 5000, TOML_READERS, "is not TOML"),
 }
 
