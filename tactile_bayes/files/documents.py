@@ -1,4 +1,4 @@
-"""JSON and TOML from files: of limited size and depth, with finite numbers and whole characters only, none of them NUL."""
+"""JSON and TOML from files: of limited size and depth, with finite numbers and whole characters only, and no NUL."""
 
 from __future__ import annotations
 
