@@ -38,6 +38,10 @@ def read_until(port: Port, parser, done) -> list:
     return found
 
 
+def poses_of(found) -> list[PoseReading]:
+    return [one for one in found if isinstance(one, PoseReading)]
+
+
 def ended(found) -> bool:
     return bool(found) and isinstance(found[-1], EndReading)
 
@@ -64,7 +68,8 @@ def test_a_tracker_plays_from_each_start(protocol):
         port = Port(emulator._link.url, baud=9600, role="tracker")
         for _ in range(2):
             port.write(driver.start)
-            found = read_until(port, driver.parser(), lambda found: len(found) >= number)
+            # the first play's END may still be in the line when the second starts
+            found = poses_of(read_until(port, driver.parser(), lambda found: len(poses_of(found)) >= number))
             np.testing.assert_allclose(found[0].position_mm, SCAN.poses.position_mm[0], atol=0.2)
             np.testing.assert_allclose(found[number - 1].position_mm, SCAN.poses.position_mm[-1], atol=0.2)
         port.close()
