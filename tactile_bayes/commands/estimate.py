@@ -104,7 +104,9 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Send several maps to a dask scheduler (extra [cluster]).")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
-@click.option("-v", "--verbose", is_flag=True, help="Say on stderr how long it took.")
+@click.option(
+    "-v", "--verbose", is_flag=True, help="Print the whole report, not its 12 lines; say on stderr how long it took."
+)
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -165,15 +167,16 @@ def command(
         if map_figure:
             raise UsageError("--map-figure draws one map; leave out --pool")
         answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
-        ctx.exit(estimate_pool(maps, answers, settings, output, figure, as_json=as_json, force=force))
+        printed = {"as_json": as_json, "verbose": verbose}
+        ctx.exit(estimate_pool(maps, answers, settings, output, figure, **printed, force=force))
     if len(maps) == 1:
         answers = [_one_map(maps[0], settings, output, figure, map_figure, force=force)]
     else:
-        with _printed_if_interrupted(maps, as_json=as_json):
+        with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
     if verbose:
         print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
-    _print(maps, answers, as_json=as_json, listed=len(maps) > 1)
+    _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
     ctx.exit(_exit_code(answers))
 
 
@@ -252,7 +255,7 @@ def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
 
 
 @contextmanager
-def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool) -> Iterator[None]:
+def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: bool) -> Iterator[None]:
     """On Ctrl-C print the answers of the maps that are done, and go on up."""
     from tactile_bayes.batch import BatchInterrupted
 
@@ -260,12 +263,13 @@ def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool) -> Iterato
         yield
     except BatchInterrupted as stop:
         done = {one.key for one in stop.outcomes}
-        _print([path for path in maps if str(path) in done], _answers(stop.outcomes), as_json=as_json, listed=True)
+        finished = [path for path in maps if str(path) in done]
+        _print(finished, _answers(stop.outcomes), as_json=as_json, verbose=verbose, listed=True)
         raise
 
 
-def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, listed: bool) -> None:
-    """Errors on stderr, answers on stdout; `listed` where several maps were given."""
+def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbose: bool, listed: bool) -> None:
+    """Errors on stderr, answers on stdout: whole with `verbose`; `listed` where several maps were given."""
     from tactile_bayes.files.schema import check_document, dump_json
 
     for answer in answers:
@@ -279,7 +283,7 @@ def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, listed
         return
     for path, answer in zip(maps, answers, strict=True):
         if answer.document is not None:
-            click.echo((f"{path}\n" if listed else "") + answer.text, nl=listed)
+            click.echo((f"{path}\n" if listed else "") + (answer.full_text if verbose else answer.text), nl=listed)
 
 
 def _exit_code(answers: list[Answer]) -> int:

@@ -23,6 +23,7 @@ def estimate_pool(
     figure: Path | None,
     *,
     as_json: bool,
+    verbose: bool,
     force: bool,
 ) -> int:
     """Print, and write where asked, the size of the mass; return the exit code.
@@ -31,7 +32,7 @@ def estimate_pool(
     """
     from tactile_bayes.files.schema import check_document, dump_json
     from tactile_bayes.pipeline.pooled import pool_answers
-    from tactile_bayes.report.pooled import pooled_text
+    from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
     failed = [answer for answer in answers if answer.document is None]
     for answer in failed:
@@ -43,7 +44,8 @@ def estimate_pool(
     check_document(found.document, "pooled.schema.json", path=Path("the report"))
     if found.pooled.size is not None:
         _write(found.pooled, maps, settings, output, figure, provenance=found.provenance, force=force)
-    click.echo(dump_json(found.document) if as_json else pooled_text(found.document), nl=False)
+    text_of = dump_json if as_json else pooled_text if verbose else pooled_summary
+    click.echo(text_of(found.document), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
 
 

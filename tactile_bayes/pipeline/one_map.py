@@ -27,8 +27,9 @@ Progress = Callable[[int, int], None]
 class Answer:
     """What one map came to: its JSON object and its text, or an error with its exit code.
 
-    `shape` holds what pooling needs of a map on which a lump was found, `normalise` how the map's frames were,
-    `fingerprint` what its values seed random numbers with.
+    `text` is the report in at most 12 lines, `full_text` all of it. `shape` holds what pooling
+    needs of a map on which a lump was found, `normalise` how the map's frames were, `fingerprint` what its values seed
+    random numbers with.
     """
 
     document: dict[str, Any] | None
@@ -37,6 +38,7 @@ class Answer:
     shape: ShapeDraws | None = None
     normalise: str = ""
     fingerprint: int = 0
+    full_text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,6 +266,7 @@ def answer_of(outcome: Outcome) -> Answer:
     """The report of one map."""
     from tactile_bayes.posterior.lump.bump import BumpPrior
     from tactile_bayes.report.estimate_document import estimate_document, estimate_quantities
+    from tactile_bayes.report.estimate_summary import estimate_summary
     from tactile_bayes.report.estimate_text import estimate_text
 
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
@@ -277,10 +280,11 @@ def answer_of(outcome: Outcome) -> Answer:
         provenance=outcome.provenance,
         quantities=quantities,
     )
-    text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
+    text = estimate_summary(estimate, quantities, probability=settings.interval)
+    full_text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     shape, normalise = _shape(tactile_map, estimate), tactile_map.recipe.normalise
-    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint)
+    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text)
 
 
 def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:

@@ -11,9 +11,10 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import SIZES, estimate_quantities
+from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.rise_text import rise_lines
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
-from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text, variance_text
+from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text
 
 ROWS = (
     ("max_size_mm", "largest size", "mm"),
@@ -32,6 +33,8 @@ ROWS = (
 NEAR_LEVEL = 0.02
 """An offset of the background of this size and more is mentioned."""
 MOST_PASSED_OVER = 4
+LEAST_SHARE = 0.005
+"""Of the width variance, below which the tracker's share is not worth a line."""
 
 
 def size_decimals(sizes: Iterable[Quantity]) -> int:
@@ -53,13 +56,13 @@ def estimate_text(
     """
     if estimate.status == "no_estimate":
         first = [no_estimate_line(estimate.reason), *_advice(estimate)]
-        return "\n".join([*first, *rise_lines(estimate.other_rises), *_looked_at(estimate), RESEARCH_USE]) + "\n"
+        return "\n".join([*first, *rise_lines(estimate.other_rises), *passed_over(estimate), RESEARCH_USE]) + "\n"
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
-    lines = [*_cautions(estimate), _table(quantities, probability), ""]
+    lines = [*_cautions(estimate), *size_table(quantities, probability), ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
-    lines += [*_findings(estimate, quantities), *_scene(estimate), *_warnings(estimate), *_left_out(estimate)]
+    lines += [*_findings(estimate, quantities), *_scene(estimate), *warnings(estimate), *_left_out(estimate)]
     lines += [] if prior is None else [prior_line(prior, field=estimate.diagnostics.get("noise") == "field")]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
@@ -73,7 +76,8 @@ def _advice(estimate: Estimate) -> list[str]:
     return [f"What would help: {estimate.advice}."] if estimate.advice else []
 
 
-def _table(quantities: Mapping[str, Quantity], probability: float) -> str:
+def size_table(quantities: Mapping[str, Quantity], probability: float) -> list[str]:
+    """A head and a row for each quantity; all sizes with the digits that the least certain one supports."""
     head = f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
     rows = [head]
     of_sizes = size_decimals([quantities[name] for name in SIZES if name in quantities])
@@ -83,7 +87,7 @@ def _table(quantities: Mapping[str, Quantity], probability: float) -> str:
             places = of_sizes if name in SIZES else decimals(q.mc_error)
             interval = f"{q.low:.{places}f} to {q.high:.{places}f} {unit}".rstrip()
             rows.append(f"{label:28}{q.median:>9.{places}f}   {interval}")
-    return "\n".join(rows)
+    return rows
 
 
 def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
@@ -92,16 +96,17 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
         lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
     lines += rise_lines(estimate.other_rises)
     if estimate.size is not None:
-        lines.append(variance_text(estimate.size.variance_share))
+        lines += width_lines(estimate.size.variance_share)
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
         if words := estimate.diagnostics.get("size_calibration"):
             lines.append(f"{words}.")
         if estimate.size.invalid:
             lines.append(f"{estimate.size.invalid} draws gave no size and were left out.")
-    if isinstance(share := estimate.diagnostics.get("places_share"), float):
-        lines.append(f"Of the variance of the widths {100 * share:.0f} % is errors of the frames' places.")
-    lines += [f"Passed over: {text}." for text in _texts(estimate.diagnostics.get("passed_over"))]
+    share = estimate.diagnostics.get("places_share")
+    if isinstance(share, float) and share >= LEAST_SHARE:
+        lines.append(f"{100 * share:.0f} % of the width variance is tracker position error.")
+    lines += [f"Passed over: {text}." for text in texts(estimate.diagnostics.get("passed_over"))]
     return [*lines, method_line(estimate.draws, quantities)] if estimate.draws is not None else lines
 
 
@@ -109,7 +114,7 @@ def method_line(draws: ParameterDraws, quantities: Mapping[str, Quantity]) -> st
     """The method, the Monte-Carlo error of the intervals' ends as they are printed, and the method's diagnostics."""
     parts = [_ends("sizes", ("max_size_mm", "min_size_mm"), quantities)] if "max_size_mm" in quantities else []
     parts.append(_ends("widths", ("sigma_x_mm", "sigma_y_mm"), quantities))
-    ends = "interval ends of the " + ", of the ".join(parts)
+    ends = "Monte-Carlo error of the interval ends: " + ", ".join(parts)
     found = draws.diagnostics
     if draws.method == "ensemble":
         ess = min(found["ess_bulk"], found["ess_tail"])
@@ -133,10 +138,11 @@ def _scene(estimate: Estimate) -> list[str]:
 
 def _cautions(estimate: Estimate) -> list[str]:
     """What must be read before any number: that the map lies outside the calibration's range."""
-    return range_cautions(_texts(estimate.diagnostics.get("outside_calibration")))
+    return range_cautions(texts(estimate.diagnostics.get("outside_calibration")))
 
 
-def _warnings(estimate: Estimate) -> list[str]:
+def warnings(estimate: Estimate) -> list[str]:
+    """What a reader should check: the cells, the level about the lump, other places that were passed over."""
     found = estimate.diagnostics
     lines = []
     if found.get("coarse_cells"):
@@ -147,14 +153,15 @@ def _warnings(estimate: Estimate) -> list[str]:
             f"The level about the bump is {offset:+.3f} off the fixed background: something else bears on the head "
             "(a rib, a second mass), or the lump is large for it; the size is less certain than the interval says."
         )
-    return lines + _looked_at(estimate)
+    return lines + passed_over(estimate)
 
 
-def _texts(value: object) -> list[str]:
+def texts(value: object) -> list[str]:
+    """The strings of a list among the diagnostics; none where it is not there."""
     return [str(item) for item in value] if isinstance(value, list) else []
 
 
-def _looked_at(estimate: Estimate) -> list[str]:
+def passed_over(estimate: Estimate) -> list[str]:
     """The places passed over and why; the many of an empty map are counted."""
     faulty = [candidate for candidate in estimate.candidates if candidate.fault]
     lines = [f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}." for c in faulty]

@@ -9,14 +9,16 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.narrowing import MORE, joined, width_lines
 from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
-from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text, variance_text
+from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text
 from tactile_bayes.size import omissions
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import PooledEstimate
 
 SCHEMA = "tactile-bayes/pooled/1"
 SIZES = ("max_size_mm", "min_size_mm")
+MOST_NAMED = 4
 
 
 def pooled_document(
@@ -69,30 +71,69 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
     }
 
 
+def pooled_summary(document: Mapping[str, Any]) -> str:
+    """The report of a mass in at most 12 lines; `pooled_text` has the rest."""
+    outside = document["outside_calibration"]
+    lines = [*_bodies(document), *joined(outside, most=2, lead="CAUTION: outside the calibration's range: ")]
+    lines += _maps_lines(document["maps"])
+    if document["status"] == "no_estimate":
+        lines.append(f"No estimate: {document['reason']}.")
+    else:
+        largest, spread = document["max_size_mm"], document["figures"]["between_map_sd"]
+        lines += _table(document) + width_lines(document["variance_share"])
+        ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
+        lines.append(f"Quality: {ends}the maps of this mass differ by {100 * spread:.0f} % (median).")
+    return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
+
+
+def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The maps' sizes in a line, the doubtful ones by name, the other rises."""
+    found = [one for one in maps if one["log_size"] is not None]
+    sizes = ", ".join(f"{np.exp(one['log_size']):.1f}" for one in found[:MOST_NAMED])
+    more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
+    lines = [f"A lump was found on {len(found)} of {len(maps)} maps, alone sized at {sizes}{more} mm."] if found else []
+    apart = [one["map"] for one in maps if one["outlying"]]
+    lines += joined(apart, most=2, lead="Apart from the others, look at these maps: ")
+    rises = [_rise_line(one["map"], rise).rstrip(".") for one in maps for rise in one["other_rises"]]
+    return lines + joined(rises, most=1, lead="")
+
+
 def pooled_text(document: Mapping[str, Any]) -> str:
-    """The report of a mass for people."""
+    """The whole report of a mass for people."""
     lines = [*_bodies(document), *range_cautions(document["outside_calibration"]), *map(_map_line, document["maps"])]
     lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
-    largest = document["max_size_mm"]
-    lines += ["", f"{'':28}{'median':>9}   {100 * largest['probability']:g} % interval (equal-tailed)"]
-    worst = max((document[name] for name in SIZES), key=lambda q: q["mc_error"])
-    places = decimals(worst["mc_error"], most=SIZE_DECIMALS)
-    for name, label in zip(SIZES, ("largest size", "smallest size"), strict=True):
-        q = document[name]
-        lines.append(f"{label:28}{q['median']:>9.{places}f}   {q['low']:.{places}f} to {q['high']:.{places}f} mm")
-    figures = document["figures"]
-    lines += ["", variance_text(document["variance_share"])]
+    lines += ["", *_table(document)]
+    worst, figures = _worst(document), document["figures"]
+    lines += ["", *width_lines(document["variance_share"])]
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} % (median).")
     lines.append(shape_text(figures))
-    lines.append(f"Interval ends of the {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
+    lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
     lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
     if document["left_out"]:
         lines.append(f"Left out: {'; '.join(document['left_out'])}.")
     if document["reason"]:
         lines.append(f"{document['reason']}.")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _worst(document: Mapping[str, Any]) -> Mapping[str, float]:
+    """The summary of the size whose interval's ends are the less certain."""
+    return max((document[name] for name in SIZES), key=lambda q: q["mc_error"])
+
+
+def _table(document: Mapping[str, Any]) -> list[str]:
+    """Both sizes with their intervals under a head."""
+    probability, places = (
+        document["max_size_mm"]["probability"],
+        decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS),
+    )
+    lines = [f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"]
+    for name, label in zip(SIZES, ("largest size", "smallest size"), strict=True):
+        q = document[name]
+        lines.append(f"{label:28}{q['median']:>9.{places}f}   {q['low']:.{places}f} to {q['high']:.{places}f} mm")
+    return lines
 
 
 def _bodies(document: Mapping[str, Any]) -> list[str]:

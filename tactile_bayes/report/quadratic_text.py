@@ -12,12 +12,12 @@ from tactile_bayes.size.fat_depth import FatCubic
 from tactile_bayes.size.log_quadratic import QUADRATIC, LogQuadratic
 
 UNKNOWN_NAMES = {
-    "depth_mm": "the depth",
+    "depth_mm": "depth",
     "stiffness_ratio": "the lump's stiffness",
-    "seat": "the seat",
-    "fat_kpa": "the modulus of fat",
-    "gland_ratio": "that of gland",
-    "thickness_mm": "the thickness",
+    "seat": "seat",
+    "fat_kpa": "modulus of fat",
+    "gland_ratio": "modulus of gland",
+    "thickness_mm": "thickness of the tissue",
 }
 
 
@@ -49,7 +49,7 @@ def _left_out_text(fit: Mapping[str, float]) -> str:
     if "left_out_held_percent" in fit:
         held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD:g} % interval"
     return (
-        "each body left out in turn: "
+        "cross-validated by body: "
         f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
         f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %{held}"
     )
@@ -60,7 +60,7 @@ def _fat_lines(cubic: FatCubic) -> list[str]:
     low, high = cubic.fat_mm
     fit = cubic.fit
     return [
-        f"for maps that tell the depth of the fat, {low:.3g} to {high:.3g} mm, to {100 * cubic.depth.log_sd:.1f} %: "
+        f"for maps that give the depth of the fat, {low:.3g} to {high:.3g} mm, to {100 * cubic.depth.log_sd:.1f} %: "
         "ln d as a cubic in u, v and its logarithm",
         f"between bodies, SD of ln d {fit.get('body_sd', float('nan')):.3f}, "
         f"between exams of a body {fit.get('exam_sd', float('nan')):.3f}; {_left_out_text(fit)}",
@@ -79,11 +79,11 @@ def fat_text(fat_mm: float | None) -> str:
     """The depth of fat that the sizes are for, as the beginning of `unknowns_text`; nothing where it is not used."""
     if fat_mm is None:
         return ""
-    return f"{fat_mm:.1f} mm of fat under the head, by how its pressure is spread where it feels no lump; "
+    return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; "
 
 
 def unknowns_text(unknowns: Mapping[str, float]) -> str:
-    """What of the spread between bodies would go if an unknown were known, largest first."""
+    """The share of the variance between bodies that knowing each property would remove, largest first."""
     ranked = sorted(unknowns.items(), key=lambda pair: -pair[1])
     parts = [f"{UNKNOWN_NAMES.get(name, name)} {100 * share:.0f} %" for name, share in ranked if share >= 0.005]
-    return "of the variance between bodies, knowing this alone would take away: " + (", ".join(parts) or "nothing")
+    return "share of the variance between bodies that knowing one property removes: " + (", ".join(parts) or "none")

@@ -20,6 +20,9 @@ ASKED = {
 }
 BUMP = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a rotated ellipse"}
 LEAST_SHIFT_SD = 0.005
+"""A shift by a wider prior below this is not given in figures."""
+LEAST_CHANGE_SD = 0.05
+"""A change of a width by one more structure below this rounds to none."""
 
 
 def scene_lines(choice: SceneChoice) -> list[str]:
@@ -31,11 +34,19 @@ def scene_lines(choice: SceneChoice) -> list[str]:
     for one in used:
         lines.append(f"{_sentence(ASKED[one.name])} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")
     kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
-    lines += [f"Kept open: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]
+    lines += [f"Also in the model: {ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'without')}." for one in kept]
     out = [
         f"{ASKED[one.name]} (odds {odds_text(one)}){_change(one, 'with')}" for one in choice.structures if not one.used
     ]
     return [*lines, f"Not in the model: {'; '.join(out)}."] if out else lines
+
+
+def scene_line(choice: SceneChoice) -> str:
+    """The fit window's scene in one line: what the model holds and what the map does not call for."""
+    used = [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
+    names = [BUMP[choice.supported], *(ASKED[one.name] for one in used)]
+    out = [ASKED[one.name].removesuffix(" in this window") for one in choice.structures if not one.used]
+    return f"The map supports {' and '.join(names)}" + (f"; not needed: {', '.join(out)}." if out else ".")
 
 
 def _sentence(text: str) -> str:
@@ -54,7 +65,9 @@ def odds_text(one: Structure) -> str:
 def _change(one: Structure, word: str) -> str:
     if one.change_x_sd is None or one.change_y_sd is None:
         return ""
-    return f": {word} it sigma_x would change by {one.change_x_sd:+.1f} SD and sigma_y by {one.change_y_sd:+.1f} SD"
+    changes = {"sigma_x": one.change_x_sd, "sigma_y": one.change_y_sd}
+    told = [f"{name} would change by {by:+.1f} SD" for name, by in changes.items() if abs(by) >= LEAST_CHANGE_SD]
+    return f": {word} it {' and '.join(told) or 'the widths would not change'}"
 
 
 def sensitivity_line(found: Sensitivity) -> str:
@@ -65,12 +78,10 @@ def sensitivity_line(found: Sensitivity) -> str:
         return ""
     median, ends = found.median[name], found.ends[name]
     if max(abs(median), abs(ends)) < LEAST_SHIFT_SD:
-        return (
-            f"With a width prior twice as wide {names[name]} would stay where it is, to {LEAST_SHIFT_SD:g} of its SD."
-        )
+        return f"A width prior twice as wide would move {names[name]} by less than {LEAST_SHIFT_SD:g} SD."
     return (
-        f"With a width prior twice as wide the median of {names[name]} would move by {median:+.2f} "
-        f"and an interval's end by up to {ends:+.2f} of its SD."
+        f"A width prior twice as wide would move the median of {names[name]} by {round(median, 2) + 0.0:+.2f} SD "
+        f"and its interval's ends by up to {round(ends, 2) + 0.0:+.2f} SD."
     )
 
 

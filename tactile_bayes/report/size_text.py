@@ -9,11 +9,11 @@ SIZE_DECIMALS = 1
 """At most, whatever the Monte-Carlo error: sizes are compared with excisions, which are measured in mm."""
 SOURCES = {
     "map": "the map",
-    "between_maps": "spread between maps of a mass",
+    "between_maps": "spread between maps of one mass",
     "calibration": "the calibration's coefficients",
     "residual": "the scatter about Eq 6",
-    "body": "what no map shows of a body",
-    "shape": "round or oval",
+    "body": "properties of the body that no map shows",
+    "shape": "whether the lump is round or oval",
 }
 
 
@@ -31,14 +31,7 @@ def decimals(mc_error: float, *, most: int = 3) -> int:
 
 def ends_text(name: str, mc_error: float, sd: float) -> str:
     """Monte-Carlo error of the ends of intervals, in SDs and mm."""
-    share = f"{mc_error / sd:.3f} SD, " if sd > 0 else ""
-    return f"{name} to {share}{mc_error:.2g} mm"
-
-
-def variance_text(share: Mapping[str, float]) -> str:
-    """Where the variance of the largest size comes from."""
-    parts = [f"{value:.0f} % {SOURCES.get(name, name)}" for name, value in share.items() if value >= 0.5]
-    return f"Variance of the largest size: {', '.join(parts)}."
+    return f"{name} {mc_error / sd:.3f} SD ({mc_error:.2g} mm)" if sd > 0 else f"{name} {mc_error:.2g} mm"
 
 
 def shape_text(figures: Mapping[str, float]) -> str:
@@ -46,5 +39,5 @@ def shape_text(figures: Mapping[str, float]) -> str:
     probability = figures["oval_probability"]
     longer = 100 * math.expm1(figures["oval_half_log_ratio"])
     if probability < 0.5:
-        return f"Taken as round; an oval lump (probability {probability:.2f}) would be {longer:.0f} % longer."
-    return f"An oval lump (probability {probability:.2f}): {longer:.0f} % longer than a round one of its mean size."
+        return f"Sized as round; an oval lump (probability {probability:.2f}) would be {longer:.0f} % longer."
+    return f"Oval (probability {probability:.2f}): {longer:.0f} % longer than a round lump of the same mean size."

@@ -80,7 +80,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_text_json_and_pool_name_it(folder: Path) -> None:
-    text = run_here("estimate", "two.nc", cwd=folder).stdout
+    short = run_here("estimate", "two.nc", cwd=folder).stdout
+    assert "Another rise (measure it by estimate --centre-mm X Y): (1" in short
+    text = run_here("estimate", "two.nc", "-v", cwd=folder).stdout
     assert "Another rise stands at (15." in text or "Another rise stands at (14." in text
     assert "To measure it: --centre-mm" in text
     assert "a second lump in this window (odds" in text

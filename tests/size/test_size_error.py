@@ -224,11 +224,11 @@ def test_the_fingerprint_is_of_values_and_cells_and_of_nothing_else() -> None:
 
 
 def test_the_report_says_how_exact_the_sizes_ends_are(folder: Path) -> None:
-    text = run_here("estimate", "map0.nc", "--method", "laplace", cwd=folder).stdout
+    text = run_here("estimate", "map0.nc", "--method", "laplace", "-v", cwd=folder).stdout
     (line,) = [one for one in text.splitlines() if one.startswith("Method laplace")]
     document = json.loads(run_here("estimate", "map0.nc", "--method", "laplace", "--json", cwd=folder).stdout)
     worst = max((document[name] for name in ("max_size_mm", "min_size_mm")), key=lambda one: one["mc_error"])
-    assert f"interval ends of the sizes to {worst['mc_error'] / worst['sd']:.3f} SD" in line
-    assert ", of the widths to 0.0" in line
+    assert f"interval ends: sizes {worst['mc_error'] / worst['sd']:.3f} SD" in line
+    assert ", widths 0.0" in line
     pooled = run_here("estimate", "map0.nc", "map1.nc", "--pool", "--method", "laplace", cwd=folder).stdout
-    assert "Interval ends of the sizes to 0.0" in pooled
+    assert "Quality: interval ends to 0.0" in pooled

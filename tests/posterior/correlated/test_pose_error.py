@@ -210,7 +210,9 @@ def test_the_report_says_what_they_make_of_the_widths_or_that_they_are_left_out(
     spread = np.var([np.log(posterior.sigma_x_mm), np.log(posterior.sigma_y_mm)], axis=(1, 2)).sum()
     added = np.diag(pose_covariance(fit_of(found)))[:2].sum()
     assert share == pytest.approx(added / spread, rel=0.15)
-    assert f"{100 * share:.0f} % is errors of the frames' places" in estimate_text(found, tactile_map, probability=0.95)
+    assert f"{100 * share:.0f} % of the width variance is tracker position error" in estimate_text(
+        found, tactile_map, probability=0.95
+    )
     untold = {name: value for name, value in tactile_map.quality.items() if name not in POSE_NOISE}
     without = replace(tactile_map, quality=untold)
     text = estimate_text(estimated(without), without, probability=0.95)

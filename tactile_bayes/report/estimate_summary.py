@@ -1,0 +1,114 @@
+"""An estimate in at most 12 lines: the size, what makes its interval wide, what would narrow it, its quality."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.posterior.result import Estimate, Rise
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_text import LEAST_SHARE, no_estimate_line, size_table, texts, warnings
+from tactile_bayes.report.narrowing import MORE, joined, width_lines
+from tactile_bayes.report.scene_text import scene_line
+
+MOST_LINES = 12
+SIZES = ("max_size_mm", "min_size_mm")
+WIDTHS = ("sigma_x_mm", "sigma_y_mm")
+MOST_CAUTIONS = 3
+MOST_RISES = 3
+
+
+def estimate_summary(estimate: Estimate, quantities: Mapping[str, Quantity], *, probability: float) -> str:
+    """The report of one map in at most `MOST_LINES` lines; `estimate_text` has the rest.
+
+    Parameters
+    ----------
+    quantities
+        As `estimate_quantities` gives them; empty without an estimate.
+    probability
+        Of the intervals.
+    """
+    body = _nothing(estimate) if estimate.status == "no_estimate" else _something(estimate, quantities, probability)
+    return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
+
+
+def _nothing(estimate: Estimate) -> list[str]:
+    return [no_estimate_line(estimate.reason), *_advice(estimate), *_rises(estimate.other_rises)]
+
+
+def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probability: float) -> list[str]:
+    outside = texts(estimate.diagnostics.get("outside_calibration"))
+    lines = joined(outside, most=MOST_CAUTIONS, lead="CAUTION: outside the calibration's range: ")
+    shown = [name for name in SIZES if name in quantities] or [name for name in WIDTHS if name in quantities]
+    lines += size_table({name: quantities[name] for name in shown}, probability)
+    lines += _lump(estimate, quantities)
+    lines += _rises(estimate.other_rises)
+    if estimate.reason:
+        lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
+    if estimate.size is not None:
+        lines += width_lines(estimate.size.variance_share)
+    lines += _quality(estimate, {name: quantities[name] for name in shown})
+    doubts = [text.rstrip(".") for text in warnings(estimate)]
+    return [*lines, *joined(doubts, most=2, lead="Check: ")]
+
+
+def _advice(estimate: Estimate) -> list[str]:
+    return [f"What would help: {estimate.advice}."] if estimate.advice else []
+
+
+def _lump(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
+    """How likely there is a lump, and where it is."""
+    parts = [] if estimate.detection is None else [f"Probability of a lump {estimate.detection.probability:.3f}"]
+    if "amplitude" in quantities:
+        parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
+    if "centre_patient_mm.x" in quantities:
+        x, y = (quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")
+        parts.append(
+            f"{abs(x):.0f} mm {'right' if x >= 0 else 'left'} of the xiphoid and "
+            f"{abs(y):.0f} mm {'above' if y >= 0 else 'below'} it"
+        )
+    if "centre_mm.x" in quantities:
+        parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*(quantities[f"centre_mm.{a}"].median for a in "xy")))
+    return [f"{', '.join(parts)}."] if parts else []
+
+
+def _rises(rises: tuple[Rise, ...]) -> list[str]:
+    places = [
+        f"({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm"
+        + ("" if rise.distance_mm is None else f", {rise.distance_mm:.0f} mm from this lump")
+        + f" (probability of a lump {rise.probability:.3f})"
+        for rise in rises
+    ]
+    lead = "Another rise (measure it by estimate --centre-mm X Y): "
+    return joined(
+        places, most=MOST_RISES, lead=lead if len(places) == 1 else lead.replace("Another rise", "Other rises")
+    )
+
+
+def _model(estimate: Estimate) -> str:
+    """What the model holds and what was left out, as the beginning of a line."""
+    if estimate.scene is not None:
+        return f"{scene_line(estimate.scene)} "
+    return "".join(f"{line} " for line in joined(estimate.left_out, most=2, lead="Left out: "))
+
+
+def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:
+    """Monte-Carlo error of the printed ends, the method's own measure, the tracker's share, draws without a size."""
+    if estimate.draws is None or not shown:
+        return []
+    worst = max(shown.values(), key=lambda one: one.mc_error / one.sd if one.sd > 0 else 0.0)
+    ends = f"interval ends to {worst.mc_error / worst.sd:.3f} SD" if worst.sd > 0 else "interval ends exact"
+    found = estimate.draws.diagnostics
+    parts = [f"method {estimate.draws.method}, {ends}"]
+    if isinstance(words := estimate.diagnostics.get("size_calibration"), str):
+        parts.insert(0, words.split(" (", 1)[0].replace("Sizes by", "sizes by", 1))  # what it is made of is in the text
+    if estimate.draws.method == "ensemble":
+        parts.append(f"R-hat {found['rhat']:.3f}")
+    elif estimate.draws.method == "importance":
+        parts.append(f"Pareto shape {found['pareto_k']:.2f}")
+    share = estimate.diagnostics.get("places_share")
+    if isinstance(share, float) and share >= LEAST_SHARE:
+        parts.append(f"{100 * share:.0f} % of the width variance is tracker position error")
+    if estimate.size is not None and estimate.size.invalid:
+        parts.append(f"{estimate.size.invalid} draws gave no size and were left out")
+    return [f"Quality: {'; '.join(parts)}."]

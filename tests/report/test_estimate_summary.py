@@ -1,0 +1,154 @@
+"""The short report of an estimate: 12 lines at most, and nothing in it that the whole report lacks."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run_here
+from posterior_maps import bump_values, correlated_field, grid_map
+
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.inference.summary import summarise
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.correlated.selection import Structure
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate, Rise
+from tactile_bayes.posterior.sensitivity import Sensitivity
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_document import estimate_quantities
+from tactile_bayes.report.estimate_summary import MOST_LINES, estimate_summary
+from tactile_bayes.report.estimate_text import estimate_text
+from tactile_bayes.report.narrowing import joined, width_lines
+from tactile_bayes.report.scene_text import _change, sensitivity_line
+from tactile_bayes.report.size_text import decimals
+
+
+def mass(seed: int, *, amplitude: float = 0.4, second: float = 0.0, **made) -> TactileMap:
+    """A map of a lump at (-10, 2) mm, and of a second one where it is given an amplitude."""
+    rng = np.random.default_rng(seed)
+    values = bump_values(half_mm=35.0, x=-10.0, y=2.0, sigma_x=5.0, sigma_y=5.0, amplitude=amplitude)
+    values += bump_values(half_mm=35.0, x=22.0, y=2.0, sigma_x=4.0, sigma_y=4.0, amplitude=second, level=0.0)
+    values += 0.005 * correlated_field(rng, len(values), length_cells=3.0)
+    return grid_map(values + 0.005 * rng.standard_normal(values.shape), **({"normalise": "gain"} | made))
+
+
+MAPS = {
+    "clear.nc": mass(1),
+    "again.nc": mass(2),
+    "two.nc": mass(3, second=0.2),
+    "empty.nc": mass(4, amplitude=0.0),
+    "outside.nc": mass(5, amplitude=8.0),
+    "level.nc": mass(6, normalise="none", background=None),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("summary")
+    for name, one in MAPS.items():
+        write_map(place / name, one, provenance=Provenance("import", {}))
+    return place
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "first", "also"),
+    [
+        (["clear.nc"], 0, " ", "What makes the interval wide: "),
+        (["two.nc"], 0, " ", "Another rise (measure it by estimate --centre-mm X Y): (2"),
+        (["empty.nc"], 6, "No lump found", "What would help: "),
+        (["outside.nc"], 0, "CAUTION: outside the calibration's range: ", "What would narrow it: "),
+        (["level.nc"], 0, " ", "No size: the "),
+        (["clear.nc", "--size-calibration", "none"], 0, " ", "No size: no size calibration"),
+        (["clear.nc", "again.nc", "--pool"], 0, "A lump was found on 2 of 2 maps", "the maps of this mass differ by"),
+        (["empty.nc", "--pool"], 6, "No estimate: a lump was found on 0 of 1", ""),
+    ],
+    ids=["clear", "two masses", "empty", "outside", "level unknown", "no calibration", "pooled", "pooled nothing"],
+)
+def test_an_answer_takes_at_most_12_lines(folder: Path, words: list[str], code: int, first: str, also: str) -> None:
+    done = run_here("estimate", *words, "--method", "laplace", cwd=folder)
+    assert done.returncode == code, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) <= MOST_LINES == 12
+    assert lines[0].startswith(first)
+    assert any(line.startswith(also) or also in line for line in lines)
+    assert lines[-1] == RESEARCH_USE
+    assert lines[-2].endswith("estimate -v.")
+
+
+def test_the_whole_report_has_every_figure_of_the_short_one(folder: Path) -> None:
+    short, whole = (
+        run_here("estimate", "clear.nc", "--method", "laplace", *more, cwd=folder).stdout for more in ((), ("-v",))
+    )
+    rows = [line for line in short.splitlines() if line.startswith(("largest", "smallest", " "))]
+    assert len(rows) == 3
+    assert set(rows) <= set(whole.splitlines())
+    for words in ("What makes the interval wide", "Scene in the fit window", "Priors: ", "map width sigma_x"):
+        assert words in whole
+    assert len(whole.splitlines()) > MOST_LINES
+    size = json.loads(run_here("estimate", "clear.nc", "--method", "laplace", "--json", cwd=folder).stdout)[
+        "max_size_mm"
+    ]
+    places = decimals(size["mc_error"], most=1)
+    assert f"{size['median']:.{places}f}   {size['low']:.{places}f} to {size['high']:.{places}f} mm" in short
+
+
+def crowded() -> tuple[Estimate, dict]:
+    """An estimate with everything there is to say about it."""
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    found = estimate_map(MAPS["clear.nc"], calibration=None, options=options, rng=np.random.default_rng(1))
+    rise = Rise(10.0, 1.0, 30.0, amplitude=0.1, sigma_x_mm=4.0, sigma_y_mm=4.0, probability=0.97)
+    odd = {
+        "outside_calibration": [f"reason {i}" for i in range(9)],
+        "coarse_cells": True,
+        "level_offset": 0.2,
+        "places_share": 0.4,
+    }
+    full = replace(
+        found, other_rises=(rise,) * 9, diagnostics=found.diagnostics | odd, reason="of a reason", advice="advice"
+    )
+    return full, estimate_quantities(full, MAPS["clear.nc"], probability=0.9)
+
+
+def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show() -> None:
+    full, quantities = crowded()
+    size = {name: summarise(np.linspace(10.0, 20.0, 99), probability=0.9) for name in ("max_size_mm", "min_size_mm")}
+    for shown in (quantities, quantities | size):
+        text = estimate_summary(full, shown, probability=0.9)
+        assert len(text.splitlines()) <= MOST_LINES
+        assert "(and 6 more)" in text
+        assert "40 % of the width variance is tracker position error" in text
+    whole = estimate_text(full, MAPS["clear.nc"], probability=0.9)
+    assert whole.count("CAUTION") == 9  # the control: there is more than 12 lines can hold
+    assert whole.count("Another rise stands at") == 9
+
+
+def test_no_report_says_that_something_changed_by_nothing(folder: Path) -> None:
+    """The control is the number that was printed so: minus 0.04 SD."""
+    assert f"{-0.04:+.1f}" == "-0.0"
+    for words in (["clear.nc"], ["two.nc"], ["clear.nc", "again.nc", "--pool"]):
+        text = run_here("estimate", *words, "-v", cwd=folder).stdout
+        assert not re.search(r"[-+]0\.0+ (of|SD)", text)
+    still = Structure("tilt", odds=0.1, bound=False, supported=False, used=False, change_x_sd=-0.04, change_y_sd=0.03)
+    assert _change(still, "with") == ": with it the widths would not change"
+    moved = replace(still, change_x_sd=-0.04, change_y_sd=0.3)
+    assert _change(moved, "with") == ": with it sigma_y would change by +0.3 SD"
+    shifted = sensitivity_line(Sensitivity(median={"sigma_x_mm": -0.001}, ends={"sigma_x_mm": 0.02}, pareto_k=0.1))
+    assert "-0.00" not in shifted
+
+
+def test_sources_of_variance_are_ranked_and_only_large_ones_have_a_remedy() -> None:
+    lines = width_lines({"map": 9.0, "between_maps": 60.0, "body": 30.8, "shape": 0.2})
+    assert lines[0].startswith("What makes the interval wide: 60 % spread between maps of one mass, 31 % properties")
+    assert lines[0].endswith("9 % the map.")
+    assert lines[1].startswith("What would narrow it: more exams of this mass")
+    assert "--known" in lines[1]
+    assert "strokes" not in lines[1]
+    assert width_lines({"map": 100.0})[1] == "What would narrow it: a slower scan with more strokes over the lump."
+    assert joined([], most=2, lead="Check: ") == []
