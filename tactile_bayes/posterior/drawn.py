@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +28,6 @@ from tactile_bayes.size.posterior import SizePosterior
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.estimate import FieldAnswer
     from tactile_bayes.posterior.correlated.selection import SceneChoice
-    from tactile_bayes.posterior.options import EstimateOptions
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 """Of interval ends of sizes, where none is given; the methods have the same for the widths."""
@@ -65,14 +65,15 @@ def draw_sized(
     The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
     more finely the last draws stand, with their error.
     """
-    found = _drawn(tactile_map, fit, seen, calibration, options, rng=rng, progress=progress)
+    draw = partial(_drawn, tactile_map, fit, seen, calibration, rng=rng, progress=progress)
+    found = draw(options)
     for _ in range(MOST_REFINEMENTS):
         finer = _finer(found, options)
         if finer is None:
             break
         options = replace(options, accuracy_sd=finer)
         try:
-            found = _drawn(tactile_map, fit, seen, calibration, options, rng=rng, progress=progress)
+            found = draw(options)
         except NotConvergedError:
             break
     return found
