@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,20 +13,14 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import shape_fault
+from tactile_bayes.posterior.assessment import Assessment, MapDraws
 from tactile_bayes.posterior.lump.posterior import MapPosterior
-from tactile_bayes.posterior.options import EstimateOptions, scene_asked
-from tactile_bayes.posterior.white.detection import Detection
-from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_independent, judged_noise
-from tactile_bayes.posterior.white.fit import BumpFit
+from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.calibration import Calibration, draw_sizes
 from tactile_bayes.size.pooling import SizePriors
 from tactile_bayes.size.posterior import SizePosterior
-
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.correlated.estimate import FieldAnswer
-    from tactile_bayes.posterior.correlated.selection import SceneChoice
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 """Of interval ends of sizes, where none is given; the methods have the same for the widths."""
@@ -38,12 +31,7 @@ MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 class Drawn:
     """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none."""
 
-    detection: Detection
-    fit: BumpFit
-    draws: ParameterDraws
-    posterior: MapPosterior
-    figures: Mapping[str, object]
-    scene: SceneChoice | None
+    made: MapDraws
     size: SizePosterior | None
     fault: Abstention | None
     calibration: Calibration | None
@@ -52,8 +40,7 @@ class Drawn:
 
 def draw_sized(
     tactile_map: TactileMap,
-    fit: BumpFit,
-    seen: Detection | FieldAnswer,
+    seen: Assessment,
     calibration: Calibration | None,
     options: EstimateOptions,
     *,
@@ -65,7 +52,7 @@ def draw_sized(
     The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
     more finely the last draws stand, with their error.
     """
-    draw = partial(_drawn, tactile_map, fit, seen, calibration, rng=rng, progress=progress)
+    draw = partial(_drawn, tactile_map, seen, calibration, rng=rng, progress=progress)
     found = draw(options)
     for _ in range(MOST_REFINEMENTS):
         finer = _finer(found, options)
@@ -81,7 +68,7 @@ def draw_sized(
 
 def _finer(found: Drawn, options: EstimateOptions) -> float | None:
     """The accuracy in SDs to draw with for a size as exact as asked for; None where it is, or none is asked for."""
-    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(found.draws.method)
+    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(found.made.draws.method)
     if found.size is None or wanted is None:
         return None
     ends = [found.size.summarise(name, probability=INTERVAL) for name in ("max_size_mm", "min_size_mm")]
@@ -93,33 +80,22 @@ def _finer(found: Drawn, options: EstimateOptions) -> float | None:
 
 def _drawn(
     tactile_map: TactileMap,
-    fit: BumpFit,
-    seen: Detection | FieldAnswer,
+    seen: Assessment,
     calibration: Calibration | None,
     options: EstimateOptions,
     *,
     rng: np.random.Generator,
     progress: Callable[[int, int], None] | None,
 ) -> Drawn:
-    scene: SceneChoice | None = None
-    if isinstance(seen, Detection):
-        detection = seen
-        fit, odds = chosen_rotation(tactile_map, fit, options=options.fit, prior=options.prior)
-        draws, by_name = draw_independent(fit, options, rng=rng, progress=progress)
-        figures = judged_noise(fit, odds)
-    else:
-        answer = _draw_under_field(seen, tactile_map, options, rng=rng, progress=progress)
-        assert answer.draws is not None
-        detection, draws, scene = answer.detection, answer.draws, answer.choice
-        by_name, figures = dict(answer.posterior), dict(answer.diagnostics)
-    posterior = MapPosterior(**by_name)
+    made = seen.draw(options, rng=rng, progress=progress)
+    posterior = made.posterior
     fault = shape_fault(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
     calibration = fitting_calibration(posterior, calibration)
     far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
-    size = None if fault or far else _size(posterior, draws, calibration, options.size_priors, rng=rng)
-    return Drawn(detection, fit, draws, posterior, figures, scene, size, fault, calibration, far)
+    size = None if fault or far else _size(posterior, made.draws, calibration, options.size_priors, rng=rng)
+    return Drawn(made, size, fault, calibration, far)
 
 
 def _size(
@@ -141,30 +117,6 @@ def _size(
         priors=priors,
         replicates=draws.replicates,
         rng=rng,
-    )
-
-
-def _draw_under_field(
-    seen: FieldAnswer,
-    tactile_map: TactileMap,
-    options: EstimateOptions,
-    *,
-    rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None,
-) -> FieldAnswer:
-    from tactile_bayes.posterior.correlated.draw import MethodOptions
-    from tactile_bayes.posterior.correlated.estimate import draw
-
-    return draw(
-        seen,
-        tactile_map,
-        options.method,
-        rng=rng,
-        scene=scene_asked(options),
-        options=MethodOptions(
-            options.accuracy_sd, options.accuracy_mm, options.max_steps, options.store, options.draws
-        ),
-        progress=progress,
     )
 
 

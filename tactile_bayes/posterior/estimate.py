@@ -68,24 +68,25 @@ def estimate_map(
         likeliest = best_chance(tactile_map, candidates, options)
         why = no_bump(tactile_map, candidates, likeliest, where=where)
         return _none(why, candidates, None if likeliest is None else likeliest[1])
-    detection = seen if isinstance(seen, Detection) else seen.detection
+    detection = seen.detection
     if detection.probability < options.least_probability:
         return _none(undetected(detection, options.least_probability, where=where), candidates, detection)
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)
     try:
-        found = draw_sized(tactile_map, fit, seen, calibration, options, rng=rng, progress=progress)
+        found = draw_sized(tactile_map, seen, calibration, options, rng=rng, progress=progress)
     except NotConvergedError as error:
-        if options.method == "ensemble" or isinstance(seen, Detection):
+        if options.method == "ensemble" or not options.fit.correlated:
             raise
         advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
         return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection)
-    detection, fit, draws, posterior, size = found.detection, found.fit, found.draws, found.posterior, found.size
+    made, size = found.made, found.size
+    detection, fit, draws, posterior = made.detection, made.fit, made.draws, made.posterior
     if found.fault is not None:
         return _none(found.fault, candidates, detection)
     calibration = found.calibration
-    diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | dict(found.figures)
+    diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | dict(made.figures)
     diagnostics["method"] = draws.method
     if found.too_far:
         return _none(extrapolated(list(found.too_far)), candidates, detection, diagnostics)
@@ -105,7 +106,7 @@ def estimate_map(
         candidates=candidates,
         diagnostics=diagnostics,
         left_out=_left_out(tactile_map, options, calibration, diagnostics),
-        scene=found.scene,
+        scene=made.scene,
         sensitivity=_sensitivity(posterior, size, options),
     )
 
@@ -186,7 +187,7 @@ def _left_out(
     if tactile_map.recipe.source == "scan" and diagnostics.get("places_share") is None:
         notes.append("errors of the frames' places and their blur")
     odds = diagnostics["rotation_odds"]
-    if odds is not None and not diagnostics["rotated"] and options.fit.noise != "field":
+    if odds is not None and not diagnostics["rotated"] and not options.fit.correlated:
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
     if options.fit.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")

@@ -52,6 +52,11 @@ class FitOptions:
     start_width_mm: float | None = None
     field_cosines: int | None = None
 
+    @property
+    def correlated(self) -> bool:
+        """Whether errors are correlated in the model; least squares then only finds the place."""
+        return self.noise == "field"
+
 
 @dataclass(frozen=True, slots=True)
 class EstimateOptions:
@@ -99,7 +104,7 @@ class EstimateOptions:
 
 def check_options(options: EstimateOptions) -> None:
     """Refuse options that contradict each other."""
-    if options.fit.noise != "field":
+    if not options.fit.correlated:
         asked = {"scene": options.scene not in ("auto", "none"), "accuracy in mm": options.accuracy_mm is not None}
         asked |= {"checkpoint": options.store is not None}
         for name, given in asked.items():

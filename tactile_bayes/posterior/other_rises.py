@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.assessment import Assessment
 from tactile_bayes.posterior.correlated.neighbour import LEAST_RISE
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, candidate_centres, levelled, smoothed_excess
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.result import Estimate, Rise
 from tactile_bayes.posterior.search import search
-from tactile_bayes.posterior.white.detection import Detection
-from tactile_bayes.posterior.white.fit import BumpFit
-
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.correlated.estimate import FieldAnswer
 
 BESIDE_IN_WIDTHS = 2.5
 """Nearer to the lump than this many of its larger width, what a lump that is no Gaussian leaves looks like a rise."""
@@ -43,8 +38,7 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOp
     for centre in _places(rest, estimate):
         given = replace(options, fit=replace(options.fit, centre_mm=centre, start_width_mm=None), scene="auto")
         candidates, seen = search(rest, given)
-        fit = candidates[-1].fit if candidates else None
-        found = None if seen is None or fit is None else _rise(seen, fit, estimate)
+        found = None if seen is None or not candidates else _rise(seen, estimate)
         if found is None or found.probability < LEAST_PROBABILITY or _is_known(found, rises, estimate):
             misses += 1
         else:
@@ -105,22 +99,19 @@ def _in_scene(x: float, y: float, estimate: Estimate) -> bool:
     return bool(away < BESIDE_IN_WIDTHS * np.exp(log_width))
 
 
-def _rise(seen: Detection | FieldAnswer, fit: BumpFit, estimate: Estimate) -> Rise:
+def _rise(seen: Assessment, estimate: Estimate) -> Rise:
     """What was seen at a place, as a rise."""
-    if isinstance(seen, Detection):
-        amplitude, x, y = (float(value) for value in fit.theta[:3])
-        sigma_x, sigma_y, _ = fit.widths()
-        probability = seen.probability
-    else:
-        from tactile_bayes.posterior.correlated.fit import shape_draws
-
-        chosen, probability = seen.choice.fit, seen.detection.probability
-        sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(chosen, chosen.mode[None]))
-        x, y = (float(chosen.scene.column(chosen.mode, name)) for name in "xy")
-        amplitude = chosen.target.amplitude_at(chosen.mode)
-    lump = estimate.map_posterior
-    distance = None if lump is None else float(np.hypot(x - _median(lump, "x_mm"), y - _median(lump, "y_mm")))
-    return Rise(x, y, distance, amplitude, sigma_x, sigma_y, probability)
+    bump, lump = seen.bump(), estimate.map_posterior
+    away = None if lump is None else (bump.x_mm - _median(lump, "x_mm"), bump.y_mm - _median(lump, "y_mm"))
+    return Rise(
+        bump.x_mm,
+        bump.y_mm,
+        None if away is None else float(np.hypot(*away)),
+        bump.amplitude,
+        bump.sigma_x_mm,
+        bump.sigma_y_mm,
+        seen.detection.probability,
+    )
 
 
 def _is_known(rise: Rise, rises: list[Rise], estimate: Estimate) -> bool:

@@ -14,7 +14,6 @@ from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.optimise import optimise
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
-from tactile_bayes.posterior.correlated.estimate import FieldAnswer
 from tactile_bayes.posterior.correlated.fit import FieldFit, laplace_mixture, shape_draws
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
@@ -122,11 +121,11 @@ def map_case(
     if not candidates:
         return "nothing rises above the background"
     found = candidates[-1]
-    if not isinstance(seen, FieldAnswer) or found.fit is None:
+    if seen is None or seen.scene is None or found.fit is None:
         return f"no bump can be measured: {found.fault}"
     printed = FitOptions("free" if tactile_map.background is None else "fixed", radius_mm, "off")
     judged, _ = fit_bump(tactile_map, found.centre_mm, options=printed)
-    return MapCase(judged or found.fit, seen.choice.fit)
+    return MapCase(judged or found.fit, seen.scene.fit)
 
 
 @dataclass(frozen=True, slots=True)

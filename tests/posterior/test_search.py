@@ -57,13 +57,13 @@ def test_a_lower_lump_is_found_behind_a_rise_at_the_edge():
 def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hills 6 mm wide that are no lump: seven weighings, two of them repeated, before a place kept its own."""
     hills = gaussian_filter(np.random.default_rng(5).standard_normal((81, 81)), 6.0, mode="wrap")
-    weigh, places = search._look, []
+    weigh, places = search.assess, []
 
     def counted(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> object:
         places.append(tuple(fit.theta[1:3]))
         return weigh(tactile_map, fit, options)
 
-    monkeypatch.setattr(search, "_look", counted)
+    monkeypatch.setattr(search, "assess", counted)
     found = look(grid_map(1.0 + 0.05 * hills / hills.std() + noise(104)))
     assert found.status == "no_estimate"
     assert len(places) == len(set(places)) == 4

@@ -20,6 +20,8 @@ from tactile_bayes.inference.normal import normal_cdf
 from tactile_bayes.inference.paired import evened, paired_points
 from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.posterior import drawn
+from tactile_bayes.posterior.assessment import MapDraws
+from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
 from tactile_bayes.size.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.posterior import push_sizes
@@ -152,20 +154,18 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
     """With a method that draws as finely as it is told; the size's error is then what ends it."""
     asked = []
 
-    def once(_map, _fit, _seen, _calibration, options, *, rng, progress):  # noqa: ARG001
+    def once(_map, _seen, _calibration, options, *, rng, progress):  # noqa: ARG001
         asked.append(options.accuracy_sd)
         number = 2000 if options.accuracy_sd is None else int(2000 * (0.02 / options.accuracy_sd) ** 2)
         size = pooled_size([shape(2.7, noise=0.02, seed=9)], calibration=calibration(), priors=SizePriors(),
                            rng=rng, number=number)  # fmt: skip
         draws = ParameterDraws(np.zeros((1, number, 1)), "importance")
-        return drawn.Drawn(None, None, draws, None, {}, None, size, None, None)
+        return drawn.Drawn(MapDraws(None, None, draws, None, {}), size, None, None)
 
     monkeypatch.setattr(drawn, "_drawn", once)
-    from tactile_bayes.posterior.options import EstimateOptions
-
     for options in (EstimateOptions(), EstimateOptions(accuracy_sd=0.01), EstimateOptions(accuracy_mm=0.02)):
         asked.clear()
-        found = drawn.draw_sized(None, None, None, None, options, rng=np.random.default_rng(2), progress=None)
+        found = drawn.draw_sized(None, None, None, options, rng=np.random.default_rng(2), progress=None)
         size = found.size.summarise("max_size_mm", probability=PROBABILITY)
         if options.accuracy_mm is not None:
             assert size.mc_error <= options.accuracy_mm

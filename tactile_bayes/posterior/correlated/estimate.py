@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from tactile_bayes.posterior.correlated.selection import ASKING, SceneChoice, ch
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import trusted
+from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.white.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.white.fit import BumpFit
 from tactile_bayes.presets import FIELD_COSINES
@@ -46,19 +47,21 @@ class FieldAnswer:
         Whether there is a lump.
     choice
         The scene.
-    draws
-        Of the scene's parameters; None where they were not asked for.
-    posterior
-        Joint draws by the names of `MapPosterior`, each (chain, draw).
-    diagnostics
-        Figures of the fit and the noise.
     """
 
     detection: Detection
     choice: SceneChoice
-    draws: ParameterDraws | None = None
-    posterior: Mapping[str, FloatArray] = field(default_factory=dict)
-    diagnostics: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldDraws:
+    """Draws under correlated errors: of the scene's parameters, by name, and figures of the fit and the noise."""
+
+    detection: Detection
+    choice: SceneChoice
+    draws: ParameterDraws
+    posterior: MapPosterior
+    figures: Mapping[str, object]
 
 
 def look(
@@ -156,8 +159,8 @@ def draw(
     scene: str = "auto",
     options: MethodOptions | None = None,
     progress: Progress | None = None,
-) -> FieldAnswer:
-    """The same with draws.
+) -> FieldDraws:
+    """Draws of what was found.
 
     Raises
     ------
@@ -175,27 +178,27 @@ def draw(
     places = pose_covariance(choice.fit)
     figures = _diagnostics(choice) | ({"passed_over": list(passed_over)} if passed_over else {})
     figures["places_share"] = _places_share(choice.fit, places)
-    return FieldAnswer(detection, choice, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
+    return FieldDraws(detection, choice, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
 
 
 def _posterior(
     fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved, places: FloatArray
-) -> dict[str, FloatArray]:
+) -> MapPosterior:
     """Draws by name, with what errors of the frames' places add to them."""
     shape = draws.theta.shape[:2]
     theta = draws.theta + _displaced(fit, draws, places, rng).reshape(draws.theta.shape)
     sigma_x, sigma_y, angle = shape_draws(fit, theta)
     amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
-    return {
-        "amplitude": amplitude[:, 0].reshape(shape),
-        "sigma_x_mm": sigma_x,
-        "sigma_y_mm": sigma_y,
-        "x_mm": fit.scene.column(theta, "x"),
-        "y_mm": fit.scene.column(theta, "y"),
-        "angle_rad": angle,
-        "background": level.reshape(shape),
-        "noise_sd": noise_sd.reshape(shape),
-    }
+    return MapPosterior(
+        amplitude=amplitude[:, 0].reshape(shape),
+        sigma_x_mm=sigma_x,
+        sigma_y_mm=sigma_y,
+        x_mm=fit.scene.column(theta, "x"),
+        y_mm=fit.scene.column(theta, "y"),
+        angle_rad=angle,
+        background=level.reshape(shape),
+        noise_sd=noise_sd.reshape(shape),
+    )
 
 
 def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np.random.Generator) -> FloatArray:

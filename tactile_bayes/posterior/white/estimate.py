@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.cache import Solved
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.fit import BumpFit, rotation_odds
 from tactile_bayes.posterior.white.residuals import level_offset
@@ -37,8 +37,8 @@ def chosen_rotation(
 
 def draw_independent(
     fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None
-) -> tuple[ParameterDraws, dict[str, FloatArray]]:
-    """Draws by the method asked for, and the joint draws by the names of `MapPosterior`."""
+) -> tuple[ParameterDraws, MapPosterior]:
+    """Draws by the method asked for, and the joint draws by name."""
     target = fit.target(options.prior)
     solved = Solved(lambda theta: (target.excess(theta),))
     draws = _draw(fit, target, solved, options, rng=rng, progress=progress)
@@ -47,16 +47,16 @@ def draw_independent(
     # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
     exact = draws.method in ("ensemble", "importance")
     excess = solved(draws.flat)[0] if exact else fit.linear_excess(draws.flat)
-    return draws, {
-        "amplitude": theta[..., 0],
-        "sigma_x_mm": sigma_x,
-        "sigma_y_mm": sigma_y,
-        "x_mm": theta[..., 1],
-        "y_mm": theta[..., 2],
-        "angle_rad": angle,
-        "background": fit.bump.level(theta),
-        "noise_sd": target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
-    }
+    return draws, MapPosterior(
+        amplitude=theta[..., 0],
+        sigma_x_mm=sigma_x,
+        sigma_y_mm=sigma_y,
+        x_mm=theta[..., 1],
+        y_mm=theta[..., 2],
+        angle_rad=angle,
+        background=fit.bump.level(theta),
+        noise_sd=target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
+    )
 
 
 def _draw(

@@ -189,7 +189,7 @@ def fit_bump(
         weight_variance = float(np.mean(fit.residual**2))
         if settled:
             break
-    if options.noise == "field":
+    if options.correlated:
         errors = independent_errors(jacobian=fit.jacobian, residual=fit.residual, weight=weight)
     else:
         errors = error_model(cells, jacobian=fit.jacobian, residual=fit.residual, weight=weight)
@@ -261,7 +261,7 @@ def _best_fit(
     a noise field least squares only finds the place: it need not dwell on a rise that is hardly one, nor look for
     another minimum beside one that is `CLEAR`.
     """
-    radius_mm, place_only = options.radius_mm, options.noise == "field"
+    radius_mm, place_only = options.radius_mm, options.correlated
     fits: list[LeastSquaresFit] = []
 
     def joins(theta: FloatArray, other: LeastSquaresFit) -> bool:

@@ -1,0 +1,204 @@
+"""The two verbs of a noise model, to assess a place on a map and to draw from it, and the choice between the models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.abstention import rim_fault
+from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, scene_asked
+from tactile_bayes.posterior.white.detection import Detection, detect
+from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_independent, judged_noise
+from tactile_bayes.posterior.white.fit import BumpFit
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.posterior.correlated.estimate import FieldAnswer
+    from tactile_bayes.posterior.correlated.selection import SceneChoice
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapDraws:
+    """Draws of one lump under a noise model.
+
+    Parameters
+    ----------
+    detection
+        The odds of a lump, as the draws left them.
+    fit
+        The least-squares fit that the draws started from.
+    draws
+        Of the model's own parameters.
+    posterior
+        The joint draws by name.
+    figures
+        Of the fit and the noise, for the report.
+    scene
+        What the window holds, under correlated errors.
+    """
+
+    detection: Detection
+    fit: BumpFit
+    draws: ParameterDraws
+    posterior: MapPosterior
+    figures: Mapping[str, object]
+    scene: SceneChoice | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ModalBump:
+    """The bump at the mode: its amplitude, its centre and its widths along the ellipse's axes."""
+
+    amplitude: float
+    x_mm: float
+    y_mm: float
+    sigma_x_mm: float
+    sigma_y_mm: float
+
+
+class Assessment(Protocol):
+    """A place on a map under one noise model."""
+
+    @property
+    def fit(self) -> BumpFit:
+        """The least-squares fit."""
+
+    @property
+    def detection(self) -> Detection:
+        """The odds of a lump against none."""
+
+    @property
+    def fault(self) -> str:
+        """Why it can be no lump whatever the odds; empty where nothing speaks against it."""
+
+    @property
+    def scene(self) -> SceneChoice | None:
+        """What the window holds; None under independent errors, and where the density has no mode."""
+
+    def bump(self) -> ModalBump:
+        """The bump at the mode."""
+
+    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+        """Draws from the posterior of this place.
+
+        Raises
+        ------
+        NotConvergedError
+            When no method converges.
+        """
+
+
+def assess(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Assessment:
+    """Whether there is a lump at a fitted place, under the noise model of the options."""
+    if not options.fit.correlated:
+        detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
+        return _White(tactile_map, fit, detection)
+    return _correlated(tactile_map, fit, options)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _White:
+    """An assessment under independent errors."""
+
+    tactile_map: TactileMap
+    fit: BumpFit
+    detection: Detection
+    fault: str = ""
+    scene: None = None
+
+    def bump(self) -> ModalBump:
+        sigma_x, sigma_y, _ = self.fit.widths()
+        amplitude, x, y = (float(value) for value in self.fit.theta[:3])
+        return ModalBump(amplitude, x, y, sigma_x, sigma_y)
+
+    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+        fit, odds = chosen_rotation(self.tactile_map, self.fit, options=options.fit, prior=options.prior)
+        draws, posterior = draw_independent(fit, options, rng=rng, progress=progress)
+        return MapDraws(self.detection, fit, draws, posterior, judged_noise(fit, odds))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Correlated:
+    """An assessment under correlated errors; `answer` is None where the density has no mode."""
+
+    tactile_map: TactileMap
+    fit: BumpFit
+    detection: Detection
+    answer: FieldAnswer | None
+    fault: str = ""
+
+    @property
+    def scene(self) -> SceneChoice | None:
+        return None if self.answer is None else self.answer.choice
+
+    def bump(self) -> ModalBump:
+        from tactile_bayes.posterior.correlated.fit import shape_draws
+
+        fit = self._answer.choice.fit
+        sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(fit, fit.mode[None]))
+        x, y = (float(fit.scene.column(fit.mode, name)) for name in "xy")
+        return ModalBump(fit.target.amplitude_at(fit.mode), x, y, sigma_x, sigma_y)
+
+    def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
+        from tactile_bayes.posterior.correlated.draw import MethodOptions
+        from tactile_bayes.posterior.correlated.estimate import draw
+
+        given = MethodOptions(options.accuracy_sd, options.accuracy_mm, options.max_steps, options.store, options.draws)
+        found = draw(
+            self._answer,
+            self.tactile_map,
+            options.method,
+            rng=rng,
+            scene=scene_asked(options),
+            options=given,
+            progress=progress,
+        )
+        return MapDraws(found.detection, self.fit, found.draws, found.posterior, found.figures, found.choice)
+
+    @property
+    def _answer(self) -> FieldAnswer:
+        if self.answer is None:
+            raise NotConvergedError("under correlated errors nothing stands out at this place that could be drawn")
+        return self.answer
+
+
+def _correlated(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> _Correlated:
+    """The fit under correlated errors, with what lies beside it where it is a lump by the evidence."""
+    from tactile_bayes.posterior.correlated.estimate import look, with_neighbours
+
+    scene = scene_asked(options)
+    try:
+        seen = look(
+            tactile_map,
+            fit,
+            prior=options.prior,
+            radius_mm=options.fit.radius_mm,
+            scene=scene,
+            least_odds=ROTATION_ODDS,
+            cosines=options.fit.field_cosines,
+        )
+    except NotConvergedError:
+        # no mode: under these errors nothing stands out that could be weighed
+        return _Correlated(tactile_map, fit, Detection(0.0, -np.inf), None)
+    fault = _field_fault(tactile_map, seen)
+    if not fault and seen.detection.probability >= options.least_probability:
+        seen = with_neighbours(seen, tactile_map, scene=scene)
+    return _Correlated(tactile_map, fit, seen.detection, seen, fault)
+
+
+def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
+    """Under correlated errors a rise at the map's edge can grow to lie mostly beyond it, or shrink to a single cell."""
+    from tactile_bayes.posterior.correlated.fit import shape_draws
+
+    plain = seen.choice.plain
+    sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
+    x, y = (float(plain.scene.column(plain.mode[None], name)[0]) for name in ("x", "y"))
+    return rim_fault(tactile_map, (x, y), (sigma_x, sigma_y), radius_mm=plain.target.radius_mm)
