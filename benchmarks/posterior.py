@@ -39,6 +39,7 @@ def simulated_fit() -> Any:
     from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
     from tactile_bayes.posterior.correlated.fit import fit_scene
     from tactile_bayes.posterior.correlated.marginal import independent_variance
+    from tactile_bayes.posterior.correlated.problem import Problem
     from tactile_bayes.posterior.correlated.scene import Scene
     from tactile_bayes.posterior.correlated.window import Window
     from tactile_bayes.posterior.lump.bump import BumpPrior
@@ -59,7 +60,7 @@ def simulated_fit() -> Any:
     cells = window_cells(tactile_map, (0.0, 0.0), radius_mm=RADIUS_MM)
     window = Window(cells, independent_variance(cells))
     start = np.array([np.log(6.0), np.log(4.5), 0.0, 0.0])
-    return fit_scene(window, Scene(), start, prior=BumpPrior(), radius_mm=RADIUS_MM)
+    return fit_scene(Problem(window, BumpPrior(), RADIUS_MM), Scene(), start)
 
 
 def importance(fit: Any) -> Draw:
@@ -79,8 +80,9 @@ def laplace(fit: Any) -> Draw:
 def ensemble(fit: Any) -> Draw:
     """The program's MCMC with its own stopping rule."""
     from tactile_bayes.posterior.correlated.draw import Sampled, ensemble_draws
+    from tactile_bayes.posterior.options import EstimateOptions
 
-    return lambda rng: ensemble_draws(Sampled.of(fit), rng=rng).flat
+    return lambda rng: ensemble_draws(Sampled.of(fit), rng=rng, options=EstimateOptions("ensemble")).flat
 
 
 def emcee_plain(fit: Any) -> Draw:

@@ -148,19 +148,9 @@ class _Correlated:
         return ModalBump(fit.target.amplitude_at(fit.mode), x, y, sigma_x, sigma_y)
 
     def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
-        from tactile_bayes.posterior.correlated.draw import MethodOptions
         from tactile_bayes.posterior.correlated.estimate import draw
 
-        given = MethodOptions(options.accuracy_sd, options.accuracy_mm, options.max_steps, options.store, options.draws)
-        found = draw(
-            self._answer,
-            self.tactile_map,
-            options.method,
-            rng=rng,
-            scene=scene_asked(options),
-            options=given,
-            progress=progress,
-        )
+        found = draw(self._answer, self.tactile_map, options, rng=rng, progress=progress)
         return MapDraws(found.detection, self.fit, found.draws, found.posterior, found.figures, found.choice)
 
     @property
@@ -201,4 +191,4 @@ def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
     plain = seen.choice.plain
     sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
     x, y = (float(plain.scene.column(plain.mode[None], name)[0]) for name in ("x", "y"))
-    return rim_fault(tactile_map, (x, y), (sigma_x, sigma_y), radius_mm=plain.target.radius_mm)
+    return rim_fault(tactile_map, (x, y), (sigma_x, sigma_y), radius_mm=plain.target.problem.radius_mm)

@@ -29,7 +29,7 @@ def scene_lines(choice: SceneChoice) -> list[str]:
     """The fit window's scene with its odds, what was kept in it all the same, and what was left out."""
     used = [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
     names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}".rstrip() for one in used)]
-    window = f"the fit window of {choice.fit.target.radius_mm:g} mm about the lump"
+    window = f"the fit window of {choice.fit.target.problem.radius_mm:g} mm about the lump"
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
     for one in used:
         lines.append(f"{_sentence(ASKED[one.name])} is in the model (odds {odds_text(one)}){_change(one, 'without')}.")

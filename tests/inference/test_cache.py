@@ -14,7 +14,7 @@ from tactile_bayes.posterior.correlated.draw import draw_scene
 from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.lump.bump import Bump, BumpPrior
 from tactile_bayes.posterior.lump.cells import window_cells
-from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.fit import find_bump
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 
@@ -35,7 +35,7 @@ def drawn(method: str) -> tuple[Counting, list[np.ndarray], list[np.ndarray], li
     fit = fitted(cells_of(noise(5, field=0.01)))
     counting = Counting(fit)
     solved = Solved(counting)
-    draws, _ = draw_scene(fit, method, rng=np.random.default_rng(1), solved=solved)
+    draws, _ = draw_scene(fit, EstimateOptions(method), rng=np.random.default_rng(1), solved=solved)
     kept = fit.target.draw_linear(draws.flat, np.random.default_rng(2), solved=solved)
     again, other = (fit.target.draw_linear(draws.flat, np.random.default_rng(seed)) for seed in (2, 3))
     return counting, list(kept), list(again), list(other)

@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +16,8 @@ from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, Paramete
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.correlated.fit import FieldFit, laplace_mixture
+from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.records import dataclass
-
-if TYPE_CHECKING:
-    from tactile_bayes.inference.chain_state import ChainStore
 
 LADDER = ("laplace", "importance", "ensemble")
 STEPS_UP = 1
@@ -33,34 +30,11 @@ CHECKED = 512
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True, slots=True)
-class MethodOptions:
-    """How exactly.
-
-    Parameters
-    ----------
-    accuracy_sd, accuracy_mm
-        Wanted Monte-Carlo error of the ends of 95 % intervals, in posterior SDs, or of the widths in mm; None for the
-        method's default. Where both are given the finer holds.
-    max_steps
-        Of the ensemble; None for its default.
-    store
-        Where an ensemble keeps its state between runs.
-    draws
-        Of ``laplace``, which has no accuracy to reach.
-    """
-
-    accuracy_sd: float | None = None
-    accuracy_mm: float | None = None
-    max_steps: int | None = None
-    store: ChainStore | None = None
-    draws: int = INDEPENDENT_DRAWS
-
-    def in_sd(self, fit: FieldFit) -> float | None:
-        """The accuracy in posterior SDs of this fit's widths."""
-        if self.accuracy_mm is None:
-            return self.accuracy_sd
-        return min(max(self.accuracy_mm / width_sd_mm(fit), 1e-3), self.accuracy_sd or 0.5)
+def accuracy_in_sd(fit: FieldFit, options: EstimateOptions) -> float | None:
+    """The accuracy that the options ask for, in posterior SDs of this fit's widths; the finer of SD and mm holds."""
+    if options.accuracy_mm is None:
+        return options.accuracy_sd
+    return min(max(options.accuracy_mm / width_sd_mm(fit), 1e-3), options.accuracy_sd or 0.5)
 
 
 def width_sd_mm(fit: FieldFit) -> float:
@@ -71,10 +45,9 @@ def width_sd_mm(fit: FieldFit) -> float:
 
 def draw_scene(
     fit: FieldFit,
-    method: str,
+    options: EstimateOptions,
     *,
     rng: np.random.Generator,
-    options: MethodOptions | None = None,
     progress: Progress | None = None,
     solved: Solved | None = None,
 ) -> tuple[ParameterDraws, tuple[str, ...]]:
@@ -96,10 +69,9 @@ def draw_scene(
     NotConvergedError
         When the last method does not converge either; the message says what was wrong with each.
     """
-    options = options or MethodOptions()
     passed_over: list[str] = []
     figures: Mapping[str, float] = {}
-    first = LADDER.index(method)
+    first = LADDER.index(options.method)
     for name in LADDER[first : first + STEPS_UP + 1]:
         try:
             draws = _draw(fit, name, rng=rng, options=options, progress=progress, solved=solved)
@@ -120,13 +92,13 @@ def _draw(
     method: str,
     *,
     rng: np.random.Generator,
-    options: MethodOptions,
+    options: EstimateOptions,
     progress: Progress | None,
     solved: Solved | None,
 ) -> ParameterDraws:
     if method == "laplace":
         return judged_laplace(fit, rng=rng, draws=options.draws)
-    accuracy = options.in_sd(fit)
+    accuracy = accuracy_in_sd(fit, options)
     density = Sampled.of(fit)
     if method == "importance":
         draws = importance_draws(density.keeping(solved), rng=rng, accuracy_sd=accuracy)
@@ -217,8 +189,8 @@ def ensemble_draws(
     density: Sampled,
     *,
     rng: np.random.Generator,
+    options: EstimateOptions,
     accuracy_sd: float | None = None,
-    options: MethodOptions | None = None,
     progress: Progress | None = None,
 ) -> ParameterDraws:
     """MCMC from importance draws, compared with them.
@@ -230,7 +202,6 @@ def ensemble_draws(
     """
     from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 
-    options = options or MethodOptions()
     settings = EnsembleOptions()
     if options.max_steps is not None:
         settings = replace(settings, max_steps=options.max_steps)
@@ -290,14 +261,14 @@ def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> st
     digest = hashlib.sha256()
     cells = target.window.cells
     arrays = [cells.x_mm, cells.y_mm, cells.value, cells.count, target.window.variance, fit.mode, fit.covariance]
-    arrays += [] if target.departure is None else [target.departure]
+    arrays += [] if target.problem.departure is None else [target.problem.departure]
     for values in arrays:
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
     said = {
         "scene": asdict(fit.scene),
-        "prior": target.prior.as_dict(),
-        "scale": target.amplitude_scale,
-        "bounds": [target.widest_mm, target.radius_mm],
+        "prior": target.problem.prior.as_dict(),
+        "scale": target.problem.amplitude_scale,
+        "bounds": [target.problem.widest_mm, target.problem.radius_mm],
         "fields": target.chosen_fields(),
         "cosines": target.window.cosines,
         "pose_noise": None if cells.pose_noise is None else asdict(cells.pose_noise),

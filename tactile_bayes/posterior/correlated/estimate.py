@@ -14,12 +14,13 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.paired import MOST_PAIRED, paired_points
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.correlated.draw import MethodOptions, draw_scene
+from tactile_bayes.posterior.correlated.draw import draw_scene
 from tactile_bayes.posterior.correlated.fit import FieldFit, field_window, shape_draws, start_vector
 from tactile_bayes.posterior.correlated.neighbour import WANTED, add_beside, rising_ribs
 from tactile_bayes.posterior.correlated.noise import cosines_for
 from tactile_bayes.posterior.correlated.peakedness import ask_departure
 from tactile_bayes.posterior.correlated.pose_error import pose_covariance
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.ridge import ridge_instead, ridge_text
 from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.correlated.selection import ASKING, SceneChoice, choose_shape
@@ -27,6 +28,7 @@ from tactile_bayes.posterior.correlated.surroundings import Surroundings
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import trusted
 from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.options import EstimateOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.white.fit import BumpFit
 from tactile_bayes.presets import FIELD_COSINES
@@ -89,15 +91,8 @@ def look(
     """
 
     def under(number: int, start: FloatArray) -> FieldAnswer:
-        choice = choose_shape(
-            field_window(fit, cosines=number),
-            start,
-            prior=prior,
-            radius_mm=radius_mm,
-            amplitude_scale=fit.bump.scale,
-            scene=scene,
-            least_odds=least_odds,
-        )
+        problem = Problem(field_window(fit, cosines=number), prior, radius_mm, fit.bump.scale)
+        choice = choose_shape(problem, start, scene=scene, least_odds=least_odds)
         return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
 
     full = Scene("rotated")
@@ -128,7 +123,7 @@ def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: floa
 def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
     """Log of how many windows the map has."""
     area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2
-    return float(np.log(max(area / (np.pi * plain.target.radius_mm**2), 1.0)))
+    return float(np.log(max(area / (np.pi * plain.target.problem.radius_mm**2), 1.0)))
 
 
 def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: str = "auto") -> FieldAnswer:
@@ -153,11 +148,9 @@ def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: str 
 def draw(
     answer: FieldAnswer,
     tactile_map: TactileMap,
-    method: str,
+    options: EstimateOptions,
     *,
     rng: np.random.Generator,
-    scene: str = "auto",
-    options: MethodOptions | None = None,
     progress: Progress | None = None,
 ) -> FieldDraws:
     """Draws of what was found.
@@ -167,11 +160,12 @@ def draw(
     NotConvergedError
         When no method converges, or the neighbour that the scene asks for was not found.
     """
+    scene = scene_asked(options)
     choice, wanted = answer.choice, WANTED.get(scene, "")
     if wanted and choice.fit.scene.extra != wanted:
         raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {scene}")
     solved = Solved(choice.fit.target.conditional)
-    draws, passed_over = draw_scene(choice.fit, method, rng=rng, options=options, progress=progress, solved=solved)
+    draws, passed_over = draw_scene(choice.fit, options, rng=rng, progress=progress, solved=solved)
     detection = answer.detection
     if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
         detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])

@@ -11,10 +11,10 @@ from tactile_bayes.inference.derivatives import finite_differences, stencil
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
 from tactile_bayes.inference.laplace import find_mode, mode_and_covariance
 from tactile_bayes.posterior.correlated.marginal import CollapsedTarget, independent_variance
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.correlated.window import Window
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII, BumpFit
+from tactile_bayes.posterior.white.fit import BumpFit
 from tactile_bayes.presets import FIELD_COSINES
 from tactile_bayes.records import dataclass
 
@@ -119,14 +119,9 @@ def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:
 
 
 def fit_scene(
-    window: Window,
+    problem: Problem,
     scene: Scene,
     start: FloatArray,
-    *,
-    prior: BumpPrior,
-    radius_mm: float,
-    amplitude_scale: float = 1.0,
-    departure: FloatArray | None = None,
 ) -> FieldFit:
     """Find the mode; the fields that matter and the mode are settled in turn, because each depends on the other.
 
@@ -134,23 +129,13 @@ def fit_scene(
     ----------
     start : (p,) array
         The scene's parameters, for example from least squares.
-    departure
-        As `CollapsedTarget`'s.
 
     Raises
     ------
     NotConvergedError
         When there is no mode.
     """
-    target = CollapsedTarget(
-        window,
-        scene,
-        prior=prior,
-        widest_mm=WIDEST_IN_RADII * radius_mm,
-        radius_mm=radius_mm,
-        amplitude_scale=amplitude_scale,
-        departure=departure,
-    )
+    target = CollapsedTarget(problem, scene)
     target.settle_fields(start)
     mode, _ = find_mode(target, start, scale=scene.steps, tolerance=ROUGH)
     target.settle_fields(mode)

@@ -24,9 +24,9 @@ from tactile_bayes.inference.cache import Solution, Solved, distinct_rows
 from tactile_bayes.posterior.correlated.basis import LEAST_BUMPS, Spanned
 from tactile_bayes.posterior.correlated.linear import FieldColumns, Inner, LinearSolution, joined, solve
 from tactile_bayes.posterior.correlated.noise import LENGTHS_MM, SHARES, Whitening, no_field
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene
-from tactile_bayes.posterior.correlated.window import Profiles, Projected, Window
-from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.correlated.window import Profiles, Projected
 from tactile_bayes.posterior.lump.cells import FitCells
 
 BLOCK = 128
@@ -46,39 +46,21 @@ class CollapsedTarget:
 
     Parameters
     ----------
-    window
-        The cells; targets of several scenes share one, and with it the fields.
+    problem
+        The window, the priors and the bounds.
     scene
-        What is in it.
-    prior
-        On widths and amplitudes.
-    widest_mm, radius_mm
-        Bounds of the widths, and of the centre about the window's middle.
-    amplitude_scale
-        Unit of the amplitudes' prior, see `cells.value_scale`.
-    departure : (k, n) array
-        Further fixed columns, see `posterior.departure`; None for none.
+        What is in the window.
     """
 
-    def __init__(
-        self,
-        window: Window,
-        scene: Scene,
-        *,
-        prior: BumpPrior,
-        widest_mm: float,
-        radius_mm: float,
-        amplitude_scale: float = 1.0,
-        departure: FloatArray | None = None,
-    ) -> None:
-        self.window, self.scene, self.prior, self.departure = window, scene, prior, departure
-        self.widest_mm, self.radius_mm = widest_mm, radius_mm
-        self.amplitude_scale = amplitude_scale
-        self.amplitude_sd = prior.amplitude_sd * amplitude_scale
+    def __init__(self, problem: Problem, scene: Scene) -> None:
+        self.problem, self.scene = problem, scene
+        self.window = window = problem.window
+        self.amplitude_sd = problem.prior.amplitude_sd * problem.amplitude_scale
         # without its mean, a large level does not cost the digits that the bump is in
         self._mean = float(np.mean(window.cells.value))
         centred = window.cells.value - self._mean
-        fixed = [linear_columns(window.cells, tilt=scene.tilt)] + ([] if departure is None else [departure])
+        fixed = [linear_columns(window.cells, tilt=scene.tilt)]
+        fixed += [] if problem.departure is None else [problem.departure]
         self._plain = np.concatenate([*fixed, centred[None]])
         scaled = self._plain / window.variance
         self._weighted_plain = window.on_grid(scaled)
@@ -94,15 +76,7 @@ class CollapsedTarget:
             other = copy(self)
             other.scene, other._fields, other._made_up = scene, None, 0.0
             return other
-        return CollapsedTarget(
-            self.window,
-            scene,
-            prior=self.prior,
-            widest_mm=self.widest_mm,
-            radius_mm=self.radius_mm,
-            amplitude_scale=self.amplitude_scale,
-            departure=self.departure,
-        )
+        return CollapsedTarget(self.problem, scene)
 
     @property
     def dimension(self) -> int:
@@ -152,9 +126,7 @@ class CollapsedTarget:
 
     def log_prior(self, theta: FloatArray) -> FloatArray:
         """(m,) log prior of the shape; -inf outside the window and where the bump is wider than it."""
-        return self.scene.log_prior(
-            theta, prior=self.prior, middle=self.window.middle, radius_mm=self.radius_mm, widest_mm=self.widest_mm
-        )
+        return self.scene.log_prior(theta, self.problem)
 
     def settle_fields(self, theta: FloatArray) -> bool:
         """Keep, of all fields, those that carry the evidence at one shape; the others cost time and say nothing.
@@ -287,7 +259,7 @@ class CollapsedTarget:
         covariance = tau2[:, None, None] * (solution.level_covariance[:, 1:3, 1:3] + spread)
         square = np.einsum("hc,hcd,hd->h", mean, np.linalg.inv(covariance), mean)
         at_zero = -0.5 * (square + np.linalg.slogdet(covariance)[1]) - np.log(2.0 * np.pi)
-        prior = -np.log(2.0 * np.pi * (self.prior.tilt_sd * self.amplitude_scale) ** 2)
+        prior = -np.log(2.0 * np.pi * (self.problem.prior.tilt_sd * self.problem.amplitude_scale) ** 2)
         return float(prior - np.logaddexp.reduce(weight + at_zero))
 
     def amplitude_at(self, theta: FloatArray) -> float:

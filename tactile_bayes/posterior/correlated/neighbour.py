@@ -9,15 +9,16 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.correlated.marginal import BLOCK
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import APART, REACH_IN_RADII, BoolArray, Extra
 from tactile_bayes.posterior.correlated.selection import (
     ASKING,
     LEAST_ODDS,
-    Fitter,
     SceneChoice,
     Structure,
     asked_again,
     change_in_sd,
+    fit_or_none,
     odds,
 )
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
@@ -45,22 +46,22 @@ def add_beside(
     """
     if scene not in ASKING:
         return choice
-    fit, beside = _beside_questions(Fitter.of(choice.plain), choice.plain, surroundings, ridges, scene)
+    fit, beside = _beside_questions(choice.plain.target.problem, choice.plain, surroundings, ridges, scene)
     found = choice if fit is choice.plain else asked_again(choice, fit)
     return replace(found, structures=(*found.structures, *beside))
 
 
 def _beside_questions(
-    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: str
+    problem: Problem, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: str
 ) -> tuple[FieldFit, list[Structure]]:
     """A second lump and a rib, each against the scene without; the likelier of those that the map asks for."""
-    lumps = second_lumps(plain, fitter)
+    lumps = second_lumps(plain, problem)
     places: dict[Extra, FloatArray] = {
         "second lump": lumps[rises(plain, surroundings, "second lump", lumps)],
         "rib": _apart(plain, ridges),
     }
     fits = {
-        extra: _fit_beside(fitter, plain, surroundings, extra, rising, forced=WANTED.get(scene) == extra)
+        extra: _fit_beside(problem, plain, surroundings, extra, rising, forced=WANTED.get(scene) == extra)
         for extra, rising in places.items()
     }
     asked = [extra for extra, (fit, log_odds, _) in fits.items() if fit is not None and log_odds > np.log(SECOND_ODDS)]
@@ -79,14 +80,14 @@ def _beside_questions(
 
 
 def _fit_beside(
-    fitter: Fitter, plain: FieldFit, surroundings: Surroundings, extra: Extra, rising: FloatArray, *, forced: bool
+    problem: Problem, plain: FieldFit, surroundings: Surroundings, extra: Extra, rising: FloatArray, *, forced: bool
 ) -> tuple[FieldFit | None, float, bool]:
     """The fit with a second structure, its log odds, and whether these are only a bound (then there is no fit)."""
     scene = replace(plain.scene, extra=extra)
     starts, bound = _starts(plain, extra, rising)
     if not starts or (bound < np.log(LEAST_ODDS) and not forced):
         return None, min(bound, 0.0), True
-    fits = [fit for start in starts if (fit := fitter.fit_or_none(scene, start)) is not None]
+    fits = [fit for start in starts if (fit := fit_or_none(problem, scene, start)) is not None]
     standing = [fit for fit in fits if rises(fit, surroundings, extra, fit.mode[None, -3:])[0]]
     if not standing:
         return None, -np.inf, True
@@ -136,12 +137,12 @@ def rises(fit: FieldFit, surroundings: Surroundings, extra: Extra, places: Float
     return np.asarray(rise > LEAST_RISE * amplitude)
 
 
-def second_lumps(plain: FieldFit, fitter: Fitter) -> FloatArray:
+def second_lumps(plain: FieldFit, problem: Problem) -> FloatArray:
     """(g, 3) centres and log widths of the second lumps that are tried, apart from the first."""
-    reach = REACH_IN_RADII * fitter.radius_mm
+    reach = REACH_IN_RADII * problem.radius_mm
     axis = np.arange(-reach, reach + 1e-9, GRID_MM)
     x, y, w = (v.ravel() for v in np.meshgrid(axis, axis, np.log(GRID_WIDTHS_MM), indexing="ij"))
-    middle = fitter.window.middle
+    middle = problem.window.middle
     p = float(plain.scene.widths(plain.mode)[0])
     centre = [float(plain.scene.column(plain.mode, name)) for name in "xy"]
     apart = np.hypot(x + middle[0] - centre[0], y + middle[1] - centre[1]) > (APART + 0.5) * np.exp(np.maximum(p, w))
@@ -149,9 +150,9 @@ def second_lumps(plain: FieldFit, fitter: Fitter) -> FloatArray:
     return np.asarray(np.stack([x + middle[0], y + middle[1], w], axis=1)[keep])
 
 
-def ribs(fitter: Fitter) -> FloatArray:
+def ribs(problem: Problem) -> FloatArray:
     """(g, 3) angles, offsets and log widths of the ridges that are tried."""
-    reach = REACH_IN_RADII * fitter.radius_mm
+    reach = REACH_IN_RADII * problem.radius_mm
     offsets = np.arange(-reach + 0.5 * GRID_MM, reach, GRID_MM)
     angles = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
     grids = np.meshgrid(angles, offsets, np.log(GRID_WIDTHS_MM), indexing="ij")
@@ -167,7 +168,7 @@ def _apart(plain: FieldFit, ridges: FloatArray) -> FloatArray:
 
 def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:
     """(g, 3) those of `ribs` along which the map rises beside a bump."""
-    places = ribs(Fitter.of(plain))
+    places = ribs(plain.target.problem)
     return np.asarray(places[rises(plain, surroundings, "rib", places)])
 
 

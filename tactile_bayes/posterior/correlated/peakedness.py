@@ -16,7 +16,14 @@ from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.correlated.linear import FLOOR
-from tactile_bayes.posterior.correlated.selection import LEAST_ODDS, Fitter, SceneChoice, Structure, change_in_sd, odds
+from tactile_bayes.posterior.correlated.selection import (
+    LEAST_ODDS,
+    SceneChoice,
+    Structure,
+    change_in_sd,
+    fit_or_none,
+    odds,
+)
 from tactile_bayes.posterior.correlated.tangent import tangent_columns
 
 EXPONENT_SD = 0.25
@@ -49,7 +56,7 @@ def _fitted(fit: FieldFit, column: FloatArray) -> FieldFit | None:
     found: FieldFit | None = fit
     for left in reversed(range(SETTLINGS)):
         assert found is not None
-        found = replace(Fitter.of(fit), departure=column[None]).fit_or_none(fit.scene, found.mode)
+        found = fit_or_none(replace(fit.target.problem, departure=column[None]), fit.scene, found.mode)
         if found is None or not left:
             break
         column = _departure(found)[0]

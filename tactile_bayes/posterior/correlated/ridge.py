@@ -9,8 +9,9 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.correlated.neighbour import GRID_ANGLES
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene
-from tactile_bayes.posterior.correlated.selection import Fitter, SceneChoice
+from tactile_bayes.posterior.correlated.selection import SceneChoice, fit_or_none
 
 
 def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
@@ -28,27 +29,27 @@ def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
     """
     if not len(ridges):
         return None
-    fitter = Fitter.of(choice.plain)
-    starts = _starts(choice, fitter, ridges)
-    fits = [fit for scene, start in starts if (fit := fitter.fit_or_none(scene, start)) is not None]
+    problem = choice.plain.target.problem
+    starts = _starts(choice, problem, ridges)
+    fits = [fit for scene, start in starts if (fit := fit_or_none(problem, scene, start)) is not None]
     return max(fits, key=lambda fit: fit.log_evidence) if fits else None
 
 
-def _starts(choice: SceneChoice, fitter: Fitter, places: FloatArray) -> Iterator[tuple[Scene, FloatArray]]:
+def _starts(choice: SceneChoice, problem: Problem, places: FloatArray) -> Iterator[tuple[Scene, FloatArray]]:
     """A ridge where the map rises most like one; and with a neighbour one through the bump."""
     alone = Scene("ridge")
     yield alone, _best(choice, alone, places[:, [2, 0, 1]])
     extra = choice.fit.scene.extra
     if extra:
         scene, beside = Scene("ridge", extra=extra), choice.fit.mode[-3:]
-        through = _through_bump(choice.fit, fitter)
+        through = _through_bump(choice.fit, problem)
         yield scene, _best(choice, scene, np.column_stack([through, np.tile(beside, (len(through), 1))]))
 
 
-def _through_bump(fit: FieldFit, fitter: Fitter) -> FloatArray:
+def _through_bump(fit: FieldFit, problem: Problem) -> FloatArray:
     """(g, 3) ridges as wide as the bump through its centre, in all directions."""
     angle = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
-    x, y = (float(fit.scene.column(fit.mode, name)) - m for name, m in zip("xy", fitter.window.middle, strict=True))
+    x, y = (float(fit.scene.column(fit.mode, name)) - m for name, m in zip("xy", problem.window.middle, strict=True))
     width = np.full(GRID_ANGLES, float(fit.scene.widths(fit.mode)[0]))
     return np.stack([width, angle, x * np.cos(angle) + y * np.sin(angle)], axis=1)
 

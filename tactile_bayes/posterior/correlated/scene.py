@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.window import Profiles, Window
-from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.records import dataclass
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
@@ -124,10 +124,9 @@ class Scene:
             found.append(window.ridges(angle, offset, log_width=w))
         return found
 
-    def log_prior(
-        self, theta: FloatArray, *, prior: BumpPrior, middle: tuple[float, float], radius_mm: float, widest_mm: float
-    ) -> FloatArray:
+    def log_prior(self, theta: FloatArray, problem: Problem) -> FloatArray:
         """(m,) normalised log prior of the shape; -inf outside the window and where a bump is wider than it."""
+        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
         p, q, r = self.widths(theta)
         ratio = np.hypot(q, r)
         total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd)
@@ -136,21 +135,20 @@ class Scene:
         else:
             x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
             inside, volume = np.hypot(x, y) <= radius_mm, np.pi * radius_mm**2
-        inside, total = inside & (p + ratio <= np.log(widest_mm)), total - np.log(volume)
+        inside, total = inside & (p + ratio <= np.log(problem.widest_mm)), total - np.log(volume)
         if self.shape in ("ellipse", "rotated"):
             # q is half of u - v, p half of their sum: the volume of (u, v) is twice that of (p, q)
             total = total + log_normal_density(q, 0.0, prior.log_ratio_sd) - np.log(2.0)
         if self.shape == "rotated":
             total = total + log_normal_density(r, 0.0, prior.log_ratio_sd)
         if self.extra:
-            beside, allowed = self._log_prior_beside(theta, prior, middle, radius_mm)
-            total, inside = total + beside, inside & allowed & (self.column(theta, "w2") <= np.log(widest_mm))
+            beside, allowed = self._log_prior_beside(theta, problem)
+            total, inside = total + beside, inside & allowed & (self.column(theta, "w2") <= np.log(problem.widest_mm))
         return np.where(inside, total, -np.inf)
 
-    def _log_prior_beside(
-        self, theta: FloatArray, prior: BumpPrior, middle: tuple[float, float], radius_mm: float
-    ) -> tuple[FloatArray, BoolArray]:
+    def _log_prior_beside(self, theta: FloatArray, problem: Problem) -> tuple[FloatArray, BoolArray]:
         """Log prior of the second structure (its amplitude's is in the target), and where it may lie."""
+        prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
         w, reach = self.column(theta, "w2"), REACH_IN_RADII * radius_mm
         total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
         if self.extra == "rib":

@@ -10,9 +10,8 @@ import numpy as np
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.correlated.fit import FieldFit, Mixture, fit_scene, newton_mixture
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene, Shape
-from tactile_bayes.posterior.correlated.window import Window
-from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.records import dataclass
 
 LEAST_ODDS = 3.0
@@ -78,12 +77,9 @@ class SceneChoice:
 
 
 def choose_shape(
-    window: Window,
+    problem: Problem,
     start: FloatArray,
     *,
-    prior: BumpPrior,
-    radius_mm: float,
-    amplitude_scale: float = 1.0,
     scene: str = "auto",
     least_odds: float = LEAST_ODDS,
 ) -> SceneChoice:
@@ -102,15 +98,14 @@ def choose_shape(
     where the evidence does not ask for it costs coverage and gains little (docs/decisions/0055). What the evidence says
     of them is reported all the same.
     """
-    fitter = Fitter(window, prior, radius_mm, amplitude_scale)
     shapes: dict[str, Shape] = {"round": "round", "rotated": "rotated"}
     wanted = Scene(shapes.get(scene, "ellipse"))
-    chosen = fitter.fit(wanted, Scene("rotated").carried(start, wanted))
+    chosen = fit_scene(problem, wanted, Scene("rotated").carried(start, wanted))
     found = [_ellipse_question(chosen)] if wanted.shape == "ellipse" else []
     if scene in ASKING:
-        chosen, turned = _rotation_question(fitter, chosen, start, least_odds)
+        chosen, turned = _rotation_question(problem, chosen, start, least_odds)
         found.append(turned)
-    return SceneChoice(chosen, chosen, _supported_shape(chosen, found), (*found, _tilt_question(fitter, chosen)))
+    return SceneChoice(chosen, chosen, _supported_shape(chosen, found), (*found, _tilt_question(chosen)))
 
 
 def asked_again(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
@@ -121,56 +116,29 @@ def asked_again(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
     answers = {one.name: one for one in choice.structures}
     if fit.scene.shape == "ellipse":
         answers["ellipse"] = _ellipse_question(fit)
-    answers["tilt"] = _tilt_question(Fitter.of(fit), fit)
+    answers["tilt"] = _tilt_question(fit)
     structures = tuple(answers.values())
     return replace(choice, fit=fit, supported=_supported_shape(fit, structures), structures=structures)
 
 
-@dataclass(frozen=True, slots=True)
-class Fitter:
-    """Fits of several scenes to one window under one prior."""
+def fit_or_none(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit | None:
+    """As `fit_scene`; None where the density has no mode."""
+    try:
+        return fit_scene(problem, scene, start)
+    except NotConvergedError:
+        return None
 
-    window: Window
-    prior: BumpPrior
-    radius_mm: float
-    amplitude_scale: float
-    departure: FloatArray | None = None
 
-    @classmethod
-    def of(cls, fit: FieldFit) -> Fitter:
-        """As another fit was made."""
-        target = fit.target
-        return cls(target.window, target.prior, target.radius_mm, target.amplitude_scale, target.departure)
-
-    def fit(self, scene: Scene, start: FloatArray) -> FieldFit:
-        """As `fit_scene`."""
-        return fit_scene(
-            self.window,
-            scene,
-            start,
-            prior=self.prior,
-            radius_mm=self.radius_mm,
-            amplitude_scale=self.amplitude_scale,
-            departure=self.departure,
-        )
-
-    def fit_or_none(self, scene: Scene, start: FloatArray) -> FieldFit | None:
-        """As `fit`; None where the density has no mode."""
-        try:
-            return self.fit(scene, start)
-        except NotConvergedError:
-            return None
-
-    def near(self, fit: FieldFit, scene: Scene) -> Mixture | None:
-        """Another scene's Gaussians by one step from a fit's mode; None where they do not lie close together."""
-        target = fit.target.of_scene(scene)
-        start = fit.scene.carried(fit.mode, scene)
-        target.settle_fields(start)
-        scale = np.diag(np.square(scene.steps))
-        shared = [name for name in scene.names if name in fit.scene.names]
-        here, there = ([s.names.index(n) for n in shared] for s in (fit.scene, scene))
-        scale[np.ix_(there, there)] = fit.covariance[np.ix_(here, here)]
-        return newton_mixture(target, start, scale)
+def near(fit: FieldFit, scene: Scene) -> Mixture | None:
+    """Another scene's Gaussians by one step from a fit's mode; None where they do not lie close together."""
+    target = fit.target.of_scene(scene)
+    start = fit.scene.carried(fit.mode, scene)
+    target.settle_fields(start)
+    scale = np.diag(np.square(scene.steps))
+    shared = [name for name in scene.names if name in fit.scene.names]
+    here, there = ([s.names.index(n) for n in shared] for s in (fit.scene, scene))
+    scale[np.ix_(there, there)] = fit.covariance[np.ix_(here, here)]
+    return newton_mixture(target, start, scale)
 
 
 def _supported_shape(chosen: FieldFit, found: Sequence[Structure]) -> str:
@@ -183,7 +151,7 @@ def _ellipse_question(fit: FieldFit) -> Structure:
     """Ellipse against round: the Savage-Dickey ratio at q = 0, and the conditional means there."""
     direction = np.zeros(len(fit.mode))
     direction[:2] = 0.5, -0.5
-    log_odds = savage_dickey(fit.mixture, direction, prior_sd=fit.target.prior.log_ratio_sd)
+    log_odds = savage_dickey(fit.mixture, direction, prior_sd=fit.target.problem.prior.log_ratio_sd)
     mean, covariance = fit.mixture.moments()
     along = covariance @ direction
     shift = -along * (direction @ mean) / (direction @ along)
@@ -192,21 +160,21 @@ def _ellipse_question(fit: FieldFit) -> Structure:
 
 
 def _rotation_question(
-    fitter: Fitter, straight: FieldFit, start: FloatArray, least_odds: float
+    problem: Problem, straight: FieldFit, start: FloatArray, least_odds: float
 ) -> tuple[FieldFit, Structure]:
     """Turned against straight: one step first, the mode only where that leaves it open."""
     scene = replace(straight.scene, shape="rotated")
-    mixture = fitter.near(straight, scene)
+    mixture = near(straight, scene)
     axis = np.eye(5)[4]
-    log_odds = np.inf if mixture is None else savage_dickey(mixture, axis, prior_sd=fitter.prior.log_ratio_sd)
+    log_odds = np.inf if mixture is None else savage_dickey(mixture, axis, prior_sd=problem.prior.log_ratio_sd)
     turned = None
     if log_odds > -1.5:
         begin = straight.scene.carried(straight.mode, scene)
         begin[4] = start[4] if mixture is None else mixture.moments()[0][4]
-        turned = fitter.fit_or_none(scene, begin)
+        turned = fit_or_none(problem, scene, begin)
         if turned is not None:
             mixture = turned.mixture
-            log_odds = savage_dickey(mixture, axis, prior_sd=fitter.prior.log_ratio_sd)
+            log_odds = savage_dickey(mixture, axis, prior_sd=problem.prior.log_ratio_sd)
     if mixture is None:
         return straight, Structure("rotated", 0.0, False, False)
     used = turned is not None and log_odds > np.log(least_odds)
@@ -216,9 +184,9 @@ def _rotation_question(
     return straight, Structure("rotated", odds(log_odds), False, False, False, x, y)
 
 
-def _tilt_question(fitter: Fitter, fit: FieldFit) -> Structure:
+def _tilt_question(fit: FieldFit) -> Structure:
     log_odds = fit.target.tilt_log_odds(fit.mode)
-    level_only = fitter.near(fit, replace(fit.scene, tilt=False))
+    level_only = near(fit, replace(fit.scene, tilt=False))
     x, y = (None, None) if level_only is None else change_in_sd(fit, level_only.moments()[0])
     return Structure("tilt", odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), True, False, x, y)
 

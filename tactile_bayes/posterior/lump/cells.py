@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -15,10 +16,10 @@ SMOOTHING_MM = 3.0
 """Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""
 RIM_MM, RIM_SHARE = 6.0, 0.6
 """A place is at the map's rim where less than the share of the disc of this radius about it is covered."""
-
-
 FEW_READINGS = 0.1
 """A cell with a smaller share of the median count is left out of the fit."""
+MAPS_AT_HAND = 4
+"""Maps of which what was worked out once is kept: the map, its levelled one, and both without the measured lump."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,15 +88,18 @@ class FitCells:
         return float(np.sum(self.variance[known] * self.count[known])) / readings if readings > 0 else 0.0
 
 
+@lru_cache(maxsize=MAPS_AT_HAND)
 def trusted(tactile_map: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """(ny, nx) True for covered cells with at least a tenth of the median count.
 
     At the rim of a map a handful of readings from one side of the head decide a cell, and they are off together.
+    Worked out once per map, and read-only.
     """
     covered = tactile_map.covered
-    if not covered.any():
-        return covered
-    return covered & (tactile_map.count >= FEW_READINGS * np.median(tactile_map.count[covered]))
+    if covered.any():
+        covered = covered & (tactile_map.count >= FEW_READINGS * np.median(tactile_map.count[covered]))
+    covered.setflags(write=False)
+    return covered
 
 
 def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> FitCells:
@@ -180,8 +184,12 @@ def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: in
     return found
 
 
+@lru_cache(maxsize=MAPS_AT_HAND)
 def smoothed_excess(tactile_map: TactileMap, *, width_mm: float = SMOOTHING_MM) -> FloatArray:
-    """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data."""
+    """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data.
+
+    Worked out once per map, and read-only.
+    """
     covered = trusted(tactile_map)
     excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
     weight = np.where(covered, np.sqrt(tactile_map.count.astype(np.float64)), 0.0)
@@ -189,13 +197,17 @@ def smoothed_excess(tactile_map: TactileMap, *, width_mm: float = SMOOTHING_MM) 
     top = _smooth(excess * weight, width_mm / cell)
     bottom = _smooth(weight, width_mm / cell)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(covered & (bottom > 0), top / bottom, -np.inf)
+        smoothed = np.where(covered & (bottom > 0), top / bottom, -np.inf)
+    smoothed.setflags(write=False)
+    return smoothed
 
 
+@lru_cache(maxsize=MAPS_AT_HAND)
 def levelled(tactile_map: TactileMap) -> TactileMap:
     """The map less its mean over the places of the array that feel a cell, as frames divided by their means show it.
 
-    A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain a frame needs it.
+    A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain per frame needs it. Worked
+    out once per map.
     """
     noise = PoseNoise.of(tactile_map)
     if tactile_map.recipe.normalise != "gain" or noise is None:

@@ -15,10 +15,12 @@ from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene, shape_dr
 from tactile_bayes.posterior.correlated.linear import _one
 from tactile_bayes.posterior.correlated.marginal import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.correlated.noise import cosine_profiles, gram_of_cosines, spectrum
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.correlated.window import Window
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import FitCells, window_cells
+from tactile_bayes.posterior.options import EstimateOptions
 
 RADIUS = 20.0
 START = np.array([np.log(6.0), np.log(4.5), 1.3, -0.8, 0.0])
@@ -32,13 +34,13 @@ def cells_of(noise: np.ndarray | float, radius: float = RADIUS, **bump: float) -
 
 def target_of(cells: FitCells, *, scene: Scene = TURNED) -> CollapsedTarget:
     window = Window(cells, independent_variance(cells))
-    return CollapsedTarget(window, scene, prior=BumpPrior(), widest_mm=0.75 * RADIUS, radius_mm=RADIUS)
+    return CollapsedTarget(Problem(window, BumpPrior(), RADIUS), scene)
 
 
 def fitted(cells: FitCells, *, scene: Scene = STRAIGHT, start: np.ndarray | None = None) -> FieldFit:
     window = Window(cells, independent_variance(cells))
     begin = TURNED.carried(START, scene) if start is None else start
-    return fit_scene(window, scene, begin, prior=BumpPrior(), radius_mm=RADIUS)
+    return fit_scene(Problem(window, BumpPrior(), RADIUS), scene, begin)
 
 
 def bumps_of(target: CollapsedTarget, theta: np.ndarray) -> np.ndarray:
@@ -226,7 +228,9 @@ def test_amplitude_and_noise_come_back() -> None:
 )
 def test_the_methods_agree(methods: tuple[str, ...]) -> None:
     fit = fitted(cells_of(noise(5, field=0.01)))
-    drawn = {method: draw_scene(fit, method, rng=np.random.default_rng(1))[0].flat for method in methods}
+    drawn = {
+        method: draw_scene(fit, EstimateOptions(method), rng=np.random.default_rng(1))[0].flat for method in methods
+    }
     sd = drawn["importance"].std(axis=0)
     for name, draws in drawn.items():
         assert (np.abs(draws.mean(axis=0) - drawn["importance"].mean(axis=0)) < 0.2 * sd).all(), name

@@ -85,8 +85,8 @@ def test_what_the_column_takes_is_no_longer_noise() -> None:
     found = estimated(1.25, noise=0.002)
     assert found.scene is not None
     with_it, without = fit_of(found), found.scene.plain
-    assert with_it.target.departure is not None
-    assert without.target.departure is None
+    assert with_it.target.problem.departure is not None
+    assert without.target.problem.departure is None
     assert with_it.sd("u") < 0.6 * without.sd("u")
 
 

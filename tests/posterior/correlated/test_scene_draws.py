@@ -14,10 +14,12 @@ from tactile_bayes.files.checkpoint_npz import CheckpointFile
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.posterior.correlated import draw as methods
-from tactile_bayes.posterior.correlated.draw import MethodOptions, Sampled, disagreement, draw_scene, importance_draws
+from tactile_bayes.posterior.correlated.draw import Sampled, disagreement, draw_scene, importance_draws
 from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.options import EstimateOptions
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 from tests.posterior.correlated.test_selection import bump, choose, errors, rib, second
 
@@ -119,24 +121,24 @@ def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(draws, diagnostics=dict(draws.diagnostics) | {"pareto_k": float("nan")})
 
     monkeypatch.setattr(methods, "judged_laplace", untrusted)
-    draws, passed = draw_scene(strong(), "laplace", rng=np.random.default_rng(1))
+    draws, passed = draw_scene(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
     assert draws.method == "importance"
     assert passed[0].startswith("laplace: Pareto shape nan")
     monkeypatch.setattr(methods, "importance_draws", heavy)
     with pytest.raises(NotConvergedError, match=r"laplace: .*importance: Pareto shape 0.91$"):
-        draw_scene(strong(), "laplace", rng=np.random.default_rng(1))
+        draw_scene(strong(), EstimateOptions("laplace"), rng=np.random.default_rng(1))
     with pytest.raises(NotConvergedError, match=r"importance: Pareto shape 0.91; ensemble: .*max_steps"):
-        draw_scene(strong(), "importance", rng=np.random.default_rng(1), options=MethodOptions(max_steps=150))
+        draw_scene(strong(), EstimateOptions(max_steps=150), rng=np.random.default_rng(1))
 
 
 def test_accuracy_in_millimetres_is_accuracy_of_the_widths() -> None:
     fit = strong()
-    options = MethodOptions(accuracy_mm=0.004)
-    assert options.in_sd(fit) == pytest.approx(0.004 / methods.width_sd_mm(fit))
-    assert MethodOptions(accuracy_sd=0.01, accuracy_mm=0.5).in_sd(fit) == 0.01
-    draws, _ = draw_scene(fit, "importance", rng=np.random.default_rng(1), options=options)
+    options = EstimateOptions(accuracy_mm=0.004)
+    assert methods.accuracy_in_sd(fit, options) == pytest.approx(0.004 / methods.width_sd_mm(fit))
+    assert methods.accuracy_in_sd(fit, EstimateOptions(accuracy_sd=0.01, accuracy_mm=0.5)) == 0.01
+    draws, _ = draw_scene(fit, options, rng=np.random.default_rng(1))
     assert draws.diagnostics["end_error_mm"] <= 0.004
-    coarse, _ = draw_scene(fit, "importance", rng=np.random.default_rng(1))
+    coarse, _ = draw_scene(fit, EstimateOptions(), rng=np.random.default_rng(1))
     assert coarse.diagnostics["end_error_mm"] > 0.0
 
 
@@ -151,8 +153,8 @@ def run(
     path: Path | None, *, max_steps: int, seed: int = 3, fit: FieldFit | None = None, context: str = ""
 ) -> ParameterDraws:
     store = None if path is None else CheckpointFile(path, context=context)
-    options = MethodOptions(accuracy_sd=0.08, max_steps=max_steps, store=store)
-    return draw_scene(fit or quick(), "ensemble", rng=np.random.default_rng(seed), options=options)[0]
+    options = EstimateOptions("ensemble", accuracy_sd=0.08, max_steps=max_steps, store=store)
+    return draw_scene(fit or quick(), options, rng=np.random.default_rng(seed))[0]
 
 
 @cache
@@ -180,7 +182,7 @@ def test_another_runs_checkpoint_is_refused(tmp_path: Path) -> None:
         with pytest.raises(BadDataError, match="of another map, calibration or setting"):
             run(path, max_steps=6000, **changed)  # type: ignore[arg-type]
     prior, scene = BumpPrior(log_width_sd=2.0), quick().scene
-    other = fit_scene(quick().target.window, scene, quick().mode, prior=prior, radius_mm=20.0)
+    other = fit_scene(Problem(quick().target.window, prior, 20.0), scene, quick().mode)
     with pytest.raises(BadDataError, match="of another map, calibration or setting"):
         run(path, max_steps=6000, fit=other)
 
@@ -228,6 +230,6 @@ def test_disagreement_counts_joint_errors() -> None:
 def test_a_rib_of_which_only_a_flank_shows_is_sampled_all_the_same() -> None:
     choice = choose(bump() + rib(y=22.0) + errors(8))
     assert choice.fit.scene.extra == "rib"
-    draws, passed = draw_scene(choice.fit, "importance", rng=np.random.default_rng(1))
+    draws, passed = draw_scene(choice.fit, EstimateOptions(), rng=np.random.default_rng(1))
     assert draws.method == "importance"
     assert not passed

@@ -12,6 +12,7 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.correlated import neighbour as beside
 from tactile_bayes.posterior.correlated.marginal import independent_variance
 from tactile_bayes.posterior.correlated.neighbour import add_beside, rising_ribs
+from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.correlated.selection import SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
@@ -45,7 +46,7 @@ def choose(values: np.ndarray, *, scene: str = "auto", width: float = 5.0, r: fl
     cells = window_cells(tactile_map, (1.0, -1.0), radius_mm=RADIUS)
     start = np.array([np.log(width), np.log(width), 1.0, -1.0, r])
     window = Window(cells, independent_variance(cells))
-    choice = choose_shape(window, start, prior=BumpPrior(), radius_mm=RADIUS, scene=scene)
+    choice = choose_shape(Problem(window, BumpPrior(), RADIUS), start, scene=scene)
     surroundings = Surroundings.of(tactile_map)
     return add_beside(choice, surroundings, ridges=rising_ribs(choice.plain, surroundings), scene=scene)
 
