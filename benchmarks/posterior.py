@@ -218,8 +218,8 @@ def _in_jax(fit: Any) -> Callable[[Any], Any]:
             prior = jnp.log(variance) + (along_data / power) ** 2 / variance
             parts.append(one.log_prior - 0.5 * (one.log_det + jnp.log(power) + prior + dof * jnp.log(squares)))
         p, q = 0.5 * (theta[0] + theta[1]), 0.5 * (theta[0] - theta[1])
-        widths = ((p - jnp.log(target.prior.width_median_mm)) / target.prior.log_width_sd) ** 2
-        widths += (q / target.prior.log_ratio_sd) ** 2
+        widths = ((p - jnp.log(target.problem.prior.width_median_mm)) / target.problem.prior.log_width_sd) ** 2
+        widths += (q / target.problem.prior.log_ratio_sd) ** 2
         return jnp.logaddexp.reduce(jnp.concatenate(parts)) - 0.5 * widths
 
     return log_density
