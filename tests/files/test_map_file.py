@@ -26,6 +26,7 @@ from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 PROVENANCE = Provenance("map", {"cell_mm": 1.0}, {"scan_1": "0" * 64})
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 MODERATE = st.floats(-1e6, 1e6)
+CHARACTERS = st.characters(exclude_categories=["Cs"], exclude_characters="\0")  # NUL is refused where JSON is read
 
 
 @st.composite
@@ -60,8 +61,8 @@ def maps(draw) -> TactileMap:
         patient_from_plane=draw(transforms()),
         background=draw(st.none() | FINITE),
         frame_count=draw(st.integers(0, 2**40)),
-        quality=draw(st.dictionaries(st.text(max_size=9), FINITE, max_size=4)),
-        masked_taxels=tuple(draw(st.lists(st.text(max_size=30), max_size=4))),
+        quality=draw(st.dictionaries(st.text(CHARACTERS, max_size=9), FINITE, max_size=4)),
+        masked_taxels=tuple(draw(st.lists(st.text(CHARACTERS, max_size=30), max_size=4))),
     )
 
 
