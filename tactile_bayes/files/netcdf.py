@@ -24,6 +24,7 @@ from tactile_bayes.records import dataclass
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable.{:10d}"
 _PACKING: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "fletcher32": True}
 _DEFLATE, _SHUFFLE, _CHECKSUM = 1, 2, 3  # HDF5's numbers of the filters above
+_CHECKSUM_BYTES: Final = 4
 _DAMAGED: Final = "not a readable netCDF file"
 _MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 
@@ -194,7 +195,11 @@ class Group:
         return found
 
     def _check_chunks(self, name: str, found: Any) -> None:
-        """Refuse a chunk that unpacks to more than it declares: HDF5 would go on for as long as there is memory."""
+        """Refuse a chunk that does not unpack to what it declares.
+
+        HDF5 unpacks more for as long as there is memory, takes what is missing from whatever lies in memory, and ends
+        the process where a checksum has less than its four bytes.
+        """
         created = found.id.get_create_plist()
         filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
         if len(set(filters)) < len(filters) or not set(filters) <= {_DEFLATE, _SHUFFLE, _CHECKSUM}:
@@ -203,13 +208,26 @@ class Group:
             return
         declared = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize
         check_limit(declared, self._most_bytes, what=f"a chunk of variable {name} unpacks to {{}} bytes")
-        if _DEFLATE not in filters:
-            return
         for number in range(found.id.get_num_chunks()):
-            _, packed = found.id.read_direct_chunk(found.id.get_chunk_info(number).chunk_offset)
-            if len(zlib.decompressobj().decompress(packed, declared + 5)) > declared + 4:  # a checksum has four bytes
-                what = f"a chunk of variable {name} unpacks to more than it declares"
+            stored = found.id.get_chunk_info(number)
+            check_limit(stored.size, self._most_bytes, what=f"a chunk of variable {name} takes {{}} bytes")
+            over = _unpacked_bytes(found, stored, filters, most=declared + 1) - declared
+            if over:
+                what = f"a chunk of variable {name} unpacks to {'more' if over > 0 else 'less'} than it declares"
                 raise BadDataError(what, way_out=self._way_out)
+
+
+def _unpacked_bytes(found: Any, stored: Any, filters: list[int], *, most: int) -> int:
+    """How many bytes a chunk's values take, up to `most`; less than none where a checksum has no room."""
+    applied = [one for number, one in enumerate(filters) if not stored.filter_mask >> number & 1]
+    if _DEFLATE not in applied:
+        return int(stored.size) - _CHECKSUM_BYTES * (_CHECKSUM in applied)
+    _, packed = found.id.read_direct_chunk(stored.chunk_offset)
+    before, after = applied[: applied.index(_DEFLATE)], applied[applied.index(_DEFLATE) :]
+    if _CHECKSUM in after:
+        packed = packed[:-_CHECKSUM_BYTES]
+    room = _CHECKSUM_BYTES * (_CHECKSUM in before)
+    return len(zlib.decompressobj().decompress(packed, most + room)) - room
 
 
 def _text(value: Any) -> str | None:

@@ -6,6 +6,7 @@ import json
 import os
 import resource
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -98,6 +99,38 @@ def test_a_packed_chunk_of_a_map_gives_no_more_than_it_declares(plain: Path, req
     request.getfixturevalue("little_memory")
     with pytest.raises(BadDataError, match="unpacks to more than it declares"):
         read_map(plain)
+
+
+MAP_CHUNKS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "of one byte": (lambda path: hostile.write_chunk(path, b"x"), "unpacks to less than it declares"),
+    "of nothing but a checksum": (lambda path: hostile.write_chunk(path, bytes(4)), "unpacks to less"),
+    "of a tenth of its values": (
+        lambda path: hostile.write_chunk(path, zlib.compress(bytes(48)) + bytes(4), skipped=0b100),
+        "unpacks to less than it declares",
+    ),
+    "of a tenth of its values, not packed": (
+        lambda path: hostile.write_chunk(path, bytes(48), skipped=0b111),
+        "unpacks to less than it declares",
+    ),
+    "of one byte, by the index": (lambda path: hostile.claim_chunk(path, 1), "unpacks to less than it declares"),
+    "of 2.7 GB, by the index": (lambda path: hostile.claim_chunk(path, 27 * 10**8), "takes 2,700,000,000 bytes, over"),
+}
+
+
+@pytest.mark.parametrize("case", MAP_CHUNKS)
+def test_a_chunk_that_holds_other_than_it_declares_is_refused(case: str, plain: Path, request) -> None:
+    spoil, message = MAP_CHUNKS[case]
+    spoil(plain)
+    request.getfixturevalue("little_memory")
+    with pytest.raises(BadDataError, match=f"a chunk of variable mean {message}") as refusal:
+        read_map(plain)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_chunk_that_is_not_packed_is_read(plain: Path) -> None:
+    before = read_map(plain)
+    hostile.write_chunk(plain, before.mean.tobytes(), skipped=0b111)
+    np.testing.assert_array_equal(read_map(plain).mean, before.mean)
 
 
 @pytest.fixture

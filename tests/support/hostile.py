@@ -107,6 +107,26 @@ def deflate_bomb(path: Path, megabytes: int) -> None:
         file["mean"].id.write_direct_chunk((0, 0), data + bytes(4))
 
 
+def write_chunk(path: Path, data: bytes, *, skipped: int = 0) -> None:
+    """A map in which the first chunk of `mean` is stored as `data`; bits of `skipped` are filters not applied."""
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        file["mean"].id.write_direct_chunk((0, 0), data, filter_mask=skipped)
+
+
+def claim_chunk(path: Path, size: int) -> None:
+    """A map that says of the first chunk of `mean` that it is stored in `size` bytes."""
+    import h5py
+
+    with h5py.File(path) as file:
+        stored = file["mean"].id.get_chunk_info(0)
+    there, claimed = (struct.pack("<IIQQQQ", n, 0, 0, 0, 0, stored.byte_offset) for n in (stored.size, size))
+    data = path.read_bytes()
+    assert data.count(there) == 1
+    path.write_bytes(data.replace(there, claimed))
+
+
 def ragged_calibration(source: Path, *place: str) -> str:
     """A size calibration in which one row of the matrix at `place` is short."""
     document = json.loads(source.read_text())
