@@ -83,13 +83,13 @@ def _value_unit(tactile_map: TactileMap) -> str:
 def _map(path: Path) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from tactile_bayes.files.map_nc import SCHEMA, read_map, read_map_header
+    from tactile_bayes.files.map_nc import read_map, read_map_header
 
     header = read_map_header(path)
     tactile_map = read_map(path)
     ny, nx = tactile_map.mean.shape
     return {
-        "schema": SCHEMA,
+        "schema": header["schema"],
         "kind": "map",
         "shape": {"ny": ny, "nx": nx},
         "extent_mm": {"x": nx * tactile_map.recipe.cell_mm, "y": ny * tactile_map.recipe.cell_mm},
@@ -101,7 +101,7 @@ def _map(path: Path) -> dict[str, Any]:
         "recipe": asdict(tactile_map.recipe),
         "quality": dict(tactile_map.quality),
         "masked_taxels": list(tactile_map.masked_taxels),
-        "provenance": header.get("provenance", {}),
+        "provenance": header["provenance"],
     }
 
 

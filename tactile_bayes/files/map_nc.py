@@ -1,4 +1,8 @@
-"""Tactile maps as netCDF: everything a map is, readable by any netCDF tool; equal maps give equal bytes."""
+"""Tactile maps as netCDF by the CF conventions: everything a map is; equal maps give equal bytes.
+
+Files of the schema map/2 hold the cells' centres as the coordinate variables ``x`` and ``y``. Those of map/1, which are
+read too, hold them as ``x_mm`` and ``y_mm`` on dimensions ``x`` and ``y`` that have no coordinates (record 0089).
+"""
 
 from __future__ import annotations
 
@@ -20,17 +24,35 @@ from tactile_bayes.geometry import check_rigid
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.presets import NORMALISE
 
-SCHEMA = "tactile-bayes/map/1"
+SCHEMA = "tactile-bayes/map/2"
+_OLD_SCHEMA = "tactile-bayes/map/1"
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"
 
-# variable -> (type, dimensions, attributes); the long names are for the reader of the file.
-_VARIABLES: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
+# schema -> field of the map -> the variable that holds it
+_AXES = {SCHEMA: {"y_mm": "y", "x_mm": "x"}, _OLD_SCHEMA: {"y_mm": "y_mm", "x_mm": "x_mm"}}
+# field of the map -> (type, dimensions, attributes); the attributes are for other programs.
+_FIELDS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
     "y_mm": ("f8", ("y",), {"units": "mm", "axis": "Y", "long_name": "cell centres along the head"}),
     "x_mm": ("f8", ("x",), {"units": "mm", "axis": "X", "long_name": "cell centres across the head"}),
-    "mean": ("f8", ("y", "x"), {"long_name": "mean of the readings in the cell"}),
-    "variance": ("f8", ("y", "x"), {"long_name": "variance of the readings in the cell about their mean"}),
-    "count": ("i8", ("y", "x"), {"units": "1", "long_name": "readings in the cell"}),
+    "mean": (
+        "f8",
+        ("y", "x"),
+        {"long_name": "mean of the readings in the cell", "ancillary_variables": "variance count"},
+    ),
+    "variance": (
+        "f8",
+        ("y", "x"),
+        {"long_name": "variance of the readings in the cell about their mean", "ancillary_variables": "count"},
+    ),
+    "count": (
+        "i8",
+        ("y", "x"),
+        {"units": "1", "long_name": "readings in the cell", "standard_name": "number_of_observations"},
+    ),
 }
+_MAY_BE_MISSING = ("mean", "variance")  # NaN is no value there
+# Units of pressure, force and voltage that UDUNITS reads; what else a user calls a grid's values is not checked.
+_CF_UNITS = ("1", "Pa", "hPa", "kPa", "MPa", "bar", "mbar", "psi", "mmHg", "N", "mN", "V", "mV")
 _TRANSFORMS = {
     "plane_from_base": "p_plane = plane_from_base p_base (tracker base, mm)",
     "patient_from_plane": "p_patient = patient_from_plane p_plane (origin xiphoid, y to sternal notch, mm)",
@@ -64,9 +86,11 @@ def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, fo
 def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
     units = _units(tactile_map)
     variables = {}
-    for name, (kind, dimensions, attributes) in _VARIABLES.items():
-        more = {"units": units[name]} if name in units else {}
-        variables[name] = Variable(np.asarray(getattr(tactile_map, name), kind), dimensions, attributes | more)
+    for field, (kind, dimensions, attributes) in _FIELDS.items():
+        more = {"units": units[field]} if units.get(field) else {}
+        values = np.asarray(getattr(tactile_map, field), kind)
+        fill = np.nan if field in _MAY_BE_MISSING else None
+        variables[_variable_of(field, SCHEMA)] = Variable(values, dimensions, more | attributes, fill)
     for name, meaning in _TRANSFORMS.items():
         transform = getattr(tactile_map, name)
         if transform is not None:
@@ -86,9 +110,11 @@ def read_map(path: Path) -> TactileMap:
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
         check_limit(_dimension(file, "y") * _dimension(file, "x"), CELLS, what="it has {} cells")
-        arrays = {name: _read_variable(file, name) for name in _VARIABLES}
+        names = {field: _variable_of(field, header["schema"]) for field in _FIELDS}
+        _check_one_form(file, header["schema"])
+        arrays = {field: _read_variable(file, name, field=field) for field, name in names.items()}
         transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
-        _check_lattice({name: arrays[name] for name in ("x_mm", "y_mm")}, header["recipe"].cell_mm)
+        _check_lattice({names[field]: arrays[field] for field in ("x_mm", "y_mm")}, header["recipe"].cell_mm)
         return TactileMap(
             **arrays,
             **transforms,
@@ -113,16 +139,23 @@ def read_map_header(path: Path) -> dict[str, Any]:
         return _header(file) | {"shape": shape}
 
 
+def _variable_of(field: str, schema: str) -> str:
+    """What a field of the map is called in files of a schema."""
+    return _AXES[schema].get(field, field)
+
+
 def _units(tactile_map: TactileMap) -> dict[str, str]:
-    """Units of the variables whose unit hangs on the recipe."""
+    """Units of the fields whose unit hangs on the recipe; empty where it is unknown."""
     unit = tactile_map.recipe.value_unit
     return {"mean": unit, "variance": unit if unit in ("", "1") else f"{unit}2" if unit.isalpha() else f"({unit})2"}
 
 
 def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, str]:
-    """Global attributes; whatever has structure is JSON with keys in a fixed order."""
-    return {
-        "Conventions": "CF-1.11",
+    """Global attributes; whatever has structure is JSON with keys in a fixed order.
+
+    CF wants a unit that UDUNITS reads for every quantity that has one: a map without such a unit does not claim CF.
+    """
+    return ({"Conventions": "CF-1.11"} if tactile_map.recipe.value_unit in _CF_UNITS else {}) | {
         "title": "Tactile map: mean normalised pressure on the best-fit plane",
         "schema": SCHEMA,
         "recipe": _json(asdict(tactile_map.recipe)),
@@ -148,8 +181,8 @@ def _header(file: Group) -> dict[str, Any]:
         raise BadDataError("is a posterior, not a map", way_out="give the map that it was estimated from")
     texts = file.attributes()
     schema = _attribute(texts, "schema")
-    if schema != SCHEMA:
-        raise BadDataError(f"schema is {schema!r}, not {SCHEMA!r}", way_out=_WAY_OUT)
+    if schema not in _AXES:
+        raise BadDataError(f"schema is {schema!r}, not {SCHEMA!r} or {_OLD_SCHEMA!r}", way_out=_WAY_OUT)
     return {
         "schema": schema,
         "recipe": _recipe(_decoded(texts, "recipe", dict)),
@@ -237,8 +270,17 @@ def _dimension(file: Group, name: str) -> int:
     return length
 
 
-def _read_variable(file: Group, name: str) -> Any:
-    kind, dimensions, _ = _VARIABLES[name]
+def _check_one_form(file: Group, schema: str) -> None:
+    """Raise `BadDataError` if the file also holds the cells' centres as files of the other schema do."""
+    other = _OLD_SCHEMA if schema == SCHEMA else SCHEMA
+    for name in _AXES[other].values():
+        if file.holds(name):
+            what = f"schema is {schema!r}, but variable {name} is how {other!r} holds the centres of cells"
+            raise BadDataError(what, way_out=_WAY_OUT)
+
+
+def _read_variable(file: Group, name: str, *, field: str) -> Any:
+    kind, dimensions, _ = _FIELDS[field]
     values = file.array(name, kind=kind, dimensions=dimensions)
     if values is None:
         raise BadDataError(f"variable {name} is missing", way_out=_WAY_OUT)

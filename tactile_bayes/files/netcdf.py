@@ -41,11 +41,14 @@ class Variable:
         The name of each axis.
     attributes
         Text by name: units, a long name.
+    fill
+        What stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates.
     """
 
     values: Any
     dimensions: tuple[str, ...]
     attributes: Mapping[str, str]
+    fill: float | None = None
 
 
 def netcdf_bytes(variables: Mapping[str, Variable], *, attributes: Mapping[str, str], group: str = "/") -> bytes:
@@ -100,7 +103,9 @@ def _write_variable(place: Any, name: str, variable: Variable, scales: Mapping[s
 
 
 def _write_values(place: Any, name: str, variable: Variable) -> Any:
-    written = place.create_dataset(name, data=variable.values, track_order=True, **_PACKING)
+    written = place.create_dataset(name, data=variable.values, fillvalue=variable.fill, track_order=True, **_PACKING)
+    if variable.fill is not None:
+        written.attrs["_FillValue"] = np.array([variable.fill], written.dtype)
     for key, text in variable.attributes.items():
         written.attrs[key] = text
     return written
@@ -143,10 +148,14 @@ class Group:
         found = self._dataset(name)
         return None if found is None or len(found.shape) != 1 else int(found.shape[0])
 
+    def holds(self, name: str) -> bool:
+        """Whether there is an array of this name; a dimension without values is none."""
+        found = self._dataset(name)
+        return found is not None and not _is_bare(found)
+
     def variables(self) -> list[str]:
         """The names of the arrays, in alphabetical order; dimensions without values are not among them."""
-        datasets = {str(name): self._dataset(str(name)) for name in self._place}
-        return sorted(name for name, found in datasets.items() if found is not None and not _is_bare(found))
+        return sorted(name for name in map(str, self._place) if self.holds(name))
 
     def array(self, name: str, *, kind: str, dimensions: tuple[str, ...]) -> Any:
         """The values of a variable; None where there is none.

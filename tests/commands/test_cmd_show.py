@@ -20,7 +20,7 @@ DEMO = Path(tactile_bayes.__file__).parent / "demo"
 # file: schema, kind, words of the text
 KINDS = {
     "scan.mcap": ("tactile-bayes/scan/1", "scan", "frame_rate_hz"),
-    "a.nc": ("tactile-bayes/map/1", "map", "covered_cells"),
+    "a.nc": ("tactile-bayes/map/2", "map", "covered_cells"),
     "post.nc": ("tactile-bayes/posterior/1", "posterior", "sigma_x_mm"),
     "size.json": ("tactile-bayes/size-calibration/1", "size calibration", "residual_correlation"),
     "one.json": ("tactile-bayes/estimate/1", "estimate", "detected_probability"),

@@ -15,15 +15,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from map_files import PROVENANCE, assert_same, plain_map
 from mapping_scans import rotation
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.map_nc import SCHEMA, read_map, read_map_header, write_map
-from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 
-PROVENANCE = Provenance("map", {"cell_mm": 1.0}, {"scan_1": "0" * 64})
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 MODERATE = st.floats(-1e6, 1e6)
 CHARACTERS = st.characters(exclude_categories=["Cs"], exclude_characters="\0")  # NUL is refused where JSON is read
@@ -64,26 +63,6 @@ def maps(draw) -> TactileMap:
         quality=draw(st.dictionaries(st.text(CHARACTERS, max_size=9), FINITE, max_size=4)),
         masked_taxels=tuple(draw(st.lists(st.text(CHARACTERS, max_size=30), max_size=4))),
     )
-
-
-def plain_map(ny: int = 6, nx: int = 8) -> TactileMap:
-    rng = np.random.default_rng(5)
-    return TactileMap(
-        rng.random((ny, nx)), rng.random((ny, nx)), np.full((ny, nx), 9), np.arange(nx) - 3.0, np.arange(ny) - 2.0,
-        MapRecipe("scan", "mean", 1.0, (5.0, 14.0), 4.0), plane_from_base=np.eye(4), quality={"frames_used": 7.0},
-    )  # fmt: skip
-
-
-def assert_same(one: TactileMap, two: TactileMap) -> None:
-    for name in ("mean", "variance", "count", "x_mm", "y_mm", "plane_from_base", "patient_from_plane"):
-        a, b = getattr(one, name), getattr(two, name)
-        if a is None or b is None:
-            assert a is b, name
-        else:
-            assert a.dtype == b.dtype
-            assert a.tobytes() == b.tobytes(), name
-    for name in ("recipe", "background", "frame_count", "quality", "masked_taxels"):
-        assert getattr(one, name) == getattr(two, name), name
 
 
 @given(tactile_map=maps())
@@ -129,8 +108,8 @@ def test_other_programs_see_units_and_axes(tmp_path):
     write_map(tmp_path / "map.nc", replace(plain_map(), recipe=MapRecipe("scan", "none", 1.0)), provenance=PROVENANCE)
     with netCDF4.Dataset(tmp_path / "map.nc") as file:
         assert file["mean"].dimensions == ("y", "x")
-        assert {name: file[name].units for name in ("mean", "variance", "count", "x_mm")} == {
-            "mean": "kPa", "variance": "kPa2", "count": "1", "x_mm": "mm"
+        assert {name: file[name].units for name in ("mean", "variance", "count", "x")} == {
+            "mean": "kPa", "variance": "kPa2", "count": "1", "x": "mm"
         }  # fmt: skip
 
 
@@ -179,7 +158,14 @@ FAULTS = {
     "another file": (_edit(lambda file: file.delncattr("schema")), "attribute schema is missing; give a map"),
     "a later schema": (_edit(lambda file: file.setncattr("schema", "tactile-bayes/map/9")), "map/9', not"),
     "no mean": (_edit(lambda file: file.renameVariable("mean", "average")), "variable mean is missing"),
-    "no dimension": (_edit(lambda file: file.renameDimension("y", "rows")), "dimension y is missing"),
+    "no dimension": (
+        _edit(lambda file: (file.renameDimension("y", "rows"), file.renameVariable("y", "rows"))),
+        "dimension y is missing",
+    ),
+    "a coordinate of another dimension": (
+        _edit(lambda file: file.renameDimension("y", "rows")),
+        r"variable y has dimensions \('rows',\), not \('y',\)",
+    ),
     "broken JSON": (_edit(lambda file: file.setncattr("quality", "{")), "attribute quality is not JSON"),
     "quality in words": (_edit(lambda file: file.setncattr("quality", '{"a": "b"}')), "quality.a is 'b', not a number"),
     "quality a list": (_edit(lambda file: file.setncattr("quality", "[]")), "attribute quality holds"),
@@ -194,8 +180,8 @@ FAULTS = {
     "negative count": (_edit(lambda file: file["count"].__setitem__((0, 0), -1)), "count holds -1"),
     "infinite mean": (_edit(lambda file: file["mean"].__setitem__((0, 0), np.inf)), "infinite values"),
     "an axis of NaN": (
-        _edit(lambda file: file["x_mm"].__setitem__(0, np.nan)),
-        "x_mm holds values that are not finite",
+        _edit(lambda file: file["x"].__setitem__(0, np.nan)),
+        "variable x holds values that are not finite",
     ),
     "no rotation": (_edit(lambda file: file["plane_from_base"].__setitem__((0, 0), 2.0)), "not a rigid transform"),
     "a flipped bit": (_flip, "not a readable netCDF file"),

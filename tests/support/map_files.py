@@ -1,0 +1,30 @@
+"""A small map for the tests of its file, and what makes two maps the same."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+
+PROVENANCE = Provenance("map", {"cell_mm": 1.0}, {"scan_1": "0" * 64})
+
+
+def plain_map(ny: int = 6, nx: int = 8) -> TactileMap:
+    rng = np.random.default_rng(5)
+    return TactileMap(
+        rng.random((ny, nx)), rng.random((ny, nx)), np.full((ny, nx), 9), np.arange(nx) - 3.0, np.arange(ny) - 2.0,
+        MapRecipe("scan", "mean", 1.0, (5.0, 14.0), 4.0), plane_from_base=np.eye(4), quality={"frames_used": 7.0},
+    )  # fmt: skip
+
+
+def assert_same(one: TactileMap, two: TactileMap) -> None:
+    for name in ("mean", "variance", "count", "x_mm", "y_mm", "plane_from_base", "patient_from_plane"):
+        a, b = getattr(one, name), getattr(two, name)
+        if a is None or b is None:
+            assert a is b, name
+        else:
+            assert a.dtype == b.dtype
+            assert a.tobytes() == b.tobytes(), name
+    for name in ("recipe", "background", "frame_count", "quality", "masked_taxels"):
+        assert getattr(one, name) == getattr(two, name), name
