@@ -125,14 +125,17 @@ def test_exact_limits_fail_the_same_check() -> None:
 
 
 def slope_held(method: str, trials: int = 150) -> float:
-    rng, hits = np.random.default_rng(5), 0
+    """Share of trials whose slope's interval holds, of those that are given one: a rare trial rests on one patient."""
+    rng, hits, given = np.random.default_rng(5), 0, 0
     for _ in range(trials):
         one = trial(rng, np.arange(20), sd=0.4)
         chosen = Intervals(0.95, method=method)  # type: ignore[arg-type]
         ends = compare_methods(one, confidence=chosen).figures["ols_slope"].interval
-        assert ends is not None
-        hits += ends[0] <= math.exp(0.02 + 0.4**2 / 2) <= ends[1]
-    return hits / trials
+        if ends is not None:
+            given += 1
+            hits += ends[0] <= math.exp(0.02 + 0.4**2 / 2) <= ends[1]
+    assert given >= 0.97 * trials
+    return hits / given
 
 
 @pytest.mark.slow
