@@ -231,7 +231,8 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
         return LiveAnswer(f"no estimate: {found.reason if found.code == 'extrapolated' else why}")
     lump = _in_base(tactile_map, found.map_posterior)
     if found.size is not None:
-        caution = "CAUTION: outside the calibration's range: " if found.diagnostics.get("outside_calibration") else ""
+        outside = found.diagnostics is not None and found.diagnostics.outside_calibration
+        caution = "CAUTION: outside the calibration's range: " if outside else ""
         return LiveAnswer(caution + _interval("largest size", found.size.max_size_mm, INTERVAL), lump)
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     return LiveAnswer(_interval("map width sigma", widths, INTERVAL), lump)

@@ -48,12 +48,13 @@ def write_posterior(path: Path, estimate: Estimate, *, provenance: Provenance, f
             "max_size_mm": estimate.size.max_size_mm,
             "min_size_mm": estimate.size.min_size_mm,
         }
+    figures = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
     attributes = {
         "schema": SCHEMA,
         "research_use": RESEARCH_USE,
         "method": estimate.draws.method,
         "provenance": json.dumps(provenance.as_dict()),
-        "diagnostics": json.dumps({k: v for k, v in estimate.diagnostics.items() if _plain(v)}),
+        "diagnostics": json.dumps({k: v for k, v in figures.items() if _plain(v)}),
     }
     write_bytes(path, _posterior_bytes(variables, attributes), force=force)
 

@@ -136,7 +136,8 @@ def estimate_one(
     if used is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
         words = calibration_line(name, used, shipped=name in SHIPPED)
-        estimate = replace(estimate, diagnostics={**estimate.diagnostics, "size_calibration": words})
+        assert estimate.diagnostics is not None
+        estimate = replace(estimate, diagnostics=replace(estimate.diagnostics, size_calibration=words))
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     recorded = _recorded(settings, options, calibration=named)
     return Outcome(tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed), settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -11,6 +11,7 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault
+from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection, detect
@@ -49,7 +50,7 @@ class MapDraws:
     fit: BumpFit
     draws: ParameterDraws
     posterior: MapPosterior
-    figures: Mapping[str, object]
+    figures: NoiseFigures
     scene: SceneChoice | None = None
 
 

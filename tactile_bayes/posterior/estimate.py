@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,14 +10,16 @@ from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import no_bump, searched, undetected
+from tactile_bayes.posterior.assessment import MapDraws
 from tactile_bayes.posterior.drawn import draw_sized
+from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions, check_options
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.search import best_chance, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.white.detection import Detection
-from tactile_bayes.posterior.white.fit import BumpFit, Candidate, check_background
+from tactile_bayes.posterior.white.fit import Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.size import omissions
 from tactile_bayes.size.calibration import Calibration
@@ -86,8 +88,7 @@ def estimate_map(
     if found.fault is not None:
         return _none(found.fault, candidates, detection)
     calibration = found.calibration
-    diagnostics = _diagnostics(tactile_map, fit, posterior, calibration) | dict(draws.diagnostics) | dict(made.figures)
-    diagnostics["method"] = draws.method
+    diagnostics = _diagnostics(tactile_map, made, calibration)
     if found.too_far:
         return _none(extrapolated(list(found.too_far)), candidates, detection, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
@@ -105,7 +106,7 @@ def estimate_map(
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
-        left_out=_left_out(tactile_map, options, calibration, diagnostics),
+        left_out=_left_out(tactile_map, options, calibration, made.figures),
         scene=made.scene,
         sensitivity=_sensitivity(posterior, size, options),
     )
@@ -115,14 +116,14 @@ def _none(
     why: Abstention,
     candidates: tuple[Candidate, ...] = (),
     detection: Detection | None = None,
-    diagnostics: Mapping[str, object] | None = None,
+    diagnostics: Diagnostics | None = None,
 ) -> Estimate:
     return Estimate(
         "no_estimate",
         why.reason,
         detection=detection,
         candidates=candidates,
-        diagnostics=diagnostics or {},
+        diagnostics=diagnostics,
         code=why.code,
         advice=why.advice,
     )
@@ -163,31 +164,33 @@ def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: FitOpti
 
 def _diagnostics(
     tactile_map: TactileMap,
-    fit: BumpFit,
-    posterior: MapPosterior,
+    made: MapDraws,
     calibration: Calibration | None,
-) -> dict[str, object]:
-    _, sigma_x, sigma_y = posterior.medians
-    return {
-        "cells": len(fit.cells),
-        "covered_share": fit.covered_share,
-        "coarse_cells": tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(sigma_x, sigma_y),
-        "outside_calibration": [] if calibration is None else calibration.outside(*posterior.medians),
-        "fat_mm": None if calibration is None else calibration.fat_mm,
-    }
+) -> Diagnostics:
+    medians = made.posterior.medians
+    return Diagnostics(
+        cells=len(made.fit.cells),
+        covered_share=made.fit.covered_share,
+        coarse_cells=tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(medians[1:]),
+        outside_calibration=() if calibration is None else tuple(calibration.outside(*medians)),
+        fat_mm=None if calibration is None else calibration.fat_mm,
+        method=made.draws.method,
+        sampler=made.draws.diagnostics,
+        noise=made.figures,
+    )
 
 
 def _left_out(
     tactile_map: TactileMap,
     options: EstimateOptions,
     calibration: Calibration | None,
-    diagnostics: Mapping[str, object],
+    noise: NoiseFigures,
 ) -> tuple[str, ...]:
     notes = []
-    if tactile_map.recipe.source == "scan" and diagnostics.get("places_share") is None:
+    if tactile_map.recipe.source == "scan" and noise.places_share is None:
         notes.append("errors of the frames' places and their blur")
-    odds = diagnostics["rotation_odds"]
-    if odds is not None and not diagnostics["rotated"] and not options.fit.correlated:
+    odds = noise.rotation_odds
+    if odds is not None and not noise.rotated and not options.fit.correlated:
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
     if options.fit.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, field
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Literal
 
 from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.sensitivity import Sensitivity
 from tactile_bayes.posterior.white.detection import Detection
@@ -65,7 +65,7 @@ class Estimate:
     candidates
         Every place that was looked at.
     diagnostics
-        Figures and flags for the report.
+        Figures and flags for the report; None where nothing was drawn.
     left_out
         What the estimate does not contain, in words.
     code, advice
@@ -86,7 +86,7 @@ class Estimate:
     map_posterior: MapPosterior | None = None
     size: SizePosterior | None = None
     candidates: tuple[Candidate, ...] = ()
-    diagnostics: Mapping[str, object] = field(default_factory=dict)
+    diagnostics: Diagnostics | None = None
     left_out: tuple[str, ...] = ()
     code: str = ""
     advice: str = ""

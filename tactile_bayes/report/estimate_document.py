@@ -33,7 +33,7 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
         on_plane = np.stack([posterior.x_mm, posterior.y_mm, np.zeros_like(posterior.x_mm)], axis=-1)
         in_patient = apply(tactile_map.patient_from_plane, on_plane)
         draws |= {"centre_patient_mm.x": in_patient[..., 0], "centre_patient_mm.y": in_patient[..., 1]}
-    if estimate.diagnostics.get("rotated"):
+    if estimate.diagnostics is not None and estimate.diagnostics.noise.rotated:
         draws["angle_deg"] = np.degrees(posterior.angle_rad)
     labels, worth = estimate.draws.labels, estimate.draws.effective_draws
     found = {
@@ -105,7 +105,7 @@ def _rounded(value: Any) -> Any:
 
 def _diagnostics(estimate: Estimate) -> dict[str, Any]:
     """Figures of the method and the fit; a figure that is not finite is null."""
-    found: dict[str, Any] = dict(estimate.diagnostics)
+    found: dict[str, Any] = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
     if estimate.detection is not None:
         found["log_bayes_factor"] = estimate.detection.log_bayes_factor
     if estimate.size is not None:

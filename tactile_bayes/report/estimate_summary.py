@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.posterior.result import Estimate, Rise
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_text import LEAST_SHARE, no_estimate_line, size_table, texts, warnings
+from tactile_bayes.report.estimate_text import no_estimate_line, size_table, tracker_share, warnings
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
 from tactile_bayes.report.scene_text import scene_line
 
@@ -37,7 +37,7 @@ def _nothing(estimate: Estimate) -> list[str]:
 
 
 def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probability: float) -> list[str]:
-    outside = texts(estimate.diagnostics.get("outside_calibration"))
+    outside = () if estimate.diagnostics is None else estimate.diagnostics.outside_calibration
     lines = joined(outside, most=MOST_CAUTIONS, lead="CAUTION: outside the calibration's range: ")
     shown = [name for name in SIZES if name in quantities] or [name for name in WIDTHS if name in quantities]
     lines += size_table({name: quantities[name] for name in shown}, probability)
@@ -100,15 +100,14 @@ def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:
     ends = f"interval ends to {worst.mc_error / worst.sd:.3f} SD" if worst.sd > 0 else "interval ends exact"
     found = estimate.draws.diagnostics
     parts = [f"method {estimate.draws.method}, {ends}"]
-    if isinstance(words := estimate.diagnostics.get("size_calibration"), str):
+    if estimate.diagnostics is not None and (words := estimate.diagnostics.size_calibration):
         parts.insert(0, words.split(" (", 1)[0].replace("Sizes by", "sizes by", 1))  # what it is made of is in the text
     if estimate.draws.method == "ensemble":
         parts.append(f"R-hat {found['rhat']:.3f}")
     elif estimate.draws.method == "importance":
         parts.append(f"Pareto shape {found['pareto_k']:.2f}")
-    share = estimate.diagnostics.get("places_share")
-    if isinstance(share, float) and share >= LEAST_SHARE:
-        parts.append(f"{100 * share:.0f} % of the width variance is tracker position error")
+    if share := tracker_share(estimate):
+        parts.append(share)
     if estimate.size is not None and estimate.size.invalid:
         parts.append(f"{estimate.size.invalid} draws gave no size and were left out")
     return [f"Quality: {'; '.join(parts)}."]

@@ -63,7 +63,7 @@ def estimate_text(
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
     lines += [*_findings(estimate, quantities), *_scene(estimate), *warnings(estimate), *_left_out(estimate)]
-    lines += [] if prior is None else [prior_line(prior, field=estimate.diagnostics.get("noise") == "field")]
+    lines += [] if prior is None else [prior_line(prior, field=estimate.scene is not None)]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
@@ -91,7 +91,7 @@ def size_table(quantities: Mapping[str, Quantity], probability: float) -> list[s
 
 
 def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
-    lines = []
+    lines, found = [], estimate.diagnostics
     if estimate.detection is not None:
         lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
     lines += rise_lines(estimate.other_rises)
@@ -99,15 +99,22 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
         lines += width_lines(estimate.size.variance_share)
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
-        if words := estimate.diagnostics.get("size_calibration"):
-            lines.append(f"{words}.")
+        if found is not None and found.size_calibration:
+            lines.append(f"{found.size_calibration}.")
         if estimate.size.invalid:
             lines.append(f"{estimate.size.invalid} draws gave no size and were left out.")
-    share = estimate.diagnostics.get("places_share")
-    if isinstance(share, float) and share >= LEAST_SHARE:
-        lines.append(f"{100 * share:.0f} % of the width variance is tracker position error.")
-    lines += [f"Passed over: {text}." for text in texts(estimate.diagnostics.get("passed_over"))]
+    if share := tracker_share(estimate):
+        lines.append(f"{share}.")
+    lines += [f"Passed over: {text}." for text in (() if found is None else found.noise.passed_over)]
     return [*lines, method_line(estimate.draws, quantities)] if estimate.draws is not None else lines
+
+
+def tracker_share(estimate: Estimate) -> str:
+    """How much of the width variance is tracker position error, in words; empty where it is too little for a word."""
+    share = None if estimate.diagnostics is None else estimate.diagnostics.noise.places_share
+    if share is None or share < LEAST_SHARE:
+        return ""
+    return f"{100 * share:.0f} % of the width variance is tracker position error"
 
 
 def method_line(draws: ParameterDraws, quantities: Mapping[str, Quantity]) -> str:
@@ -138,27 +145,21 @@ def _scene(estimate: Estimate) -> list[str]:
 
 def _cautions(estimate: Estimate) -> list[str]:
     """What must be read before any number: that the map lies outside the calibration's range."""
-    return range_cautions(texts(estimate.diagnostics.get("outside_calibration")))
+    return [] if estimate.diagnostics is None else range_cautions(estimate.diagnostics.outside_calibration)
 
 
 def warnings(estimate: Estimate) -> list[str]:
     """What a reader should check: the cells, the level about the lump, other places that were passed over."""
-    found = estimate.diagnostics
-    lines = []
-    if found.get("coarse_cells"):
+    found, lines = estimate.diagnostics, []
+    if found is not None and found.coarse_cells:
         lines.append("The cells are coarse for this width: map again with a smaller --cell-mm.")
-    offset = found.get("level_offset")
-    if isinstance(offset, float) and abs(offset) >= NEAR_LEVEL:
+    offset = None if found is None else found.noise.level_offset
+    if offset is not None and abs(offset) >= NEAR_LEVEL:
         lines.append(
             f"The level about the bump is {offset:+.3f} off the fixed background: something else bears on the head "
             "(a rib, a second mass), or the lump is large for it; the size is less certain than the interval says."
         )
     return lines + passed_over(estimate)
-
-
-def texts(value: object) -> list[str]:
-    """The strings of a list among the diagnostics; none where it is not there."""
-    return [str(item) for item in value] if isinstance(value, list) else []
 
 
 def passed_over(estimate: Estimate) -> list[str]:

@@ -136,12 +136,12 @@ def test_a_calibration_by_another_recipe_is_refused(recipe: Recipe, words: str) 
 
 def test_outside_the_calibration_is_flagged() -> None:
     flagged = run(use=calibration(), amplitude=1.2)
-    assert flagged.diagnostics["outside_calibration"] == [
+    assert flagged.diagnostics.outside_calibration == tuple(
         f"{axis}: amplitude 1.2 (table: 0.05 to 0.8)" for axis in "xy"
-    ]
+    )
     text = estimate_text(flagged, bump_map(), probability=0.95)
     assert text.startswith("CAUTION: outside the calibration's range: x: amplitude 1.2")
-    assert run(use=calibration()).diagnostics["outside_calibration"] == []
+    assert run(use=calibration()).diagnostics.outside_calibration == ()
 
 
 def test_far_outside_the_calibration_there_is_no_size() -> None:
@@ -167,9 +167,9 @@ def test_without_a_calibration_there_are_widths_only() -> None:
 
 def test_rotation_is_spent_where_the_map_asks_for_it() -> None:
     straight, turned = run(fit=FitOptions()), run(fit=FitOptions(), angle_deg=30.0)
-    assert straight.diagnostics["rotated"] is False
+    assert straight.diagnostics.noise.rotated is False
     assert any("rotation of the ellipse" in note for note in straight.left_out)
-    assert turned.diagnostics["rotated"] is True
+    assert turned.diagnostics.noise.rotated is True
     assert turned.map_posterior is not None
     assert np.degrees(np.median(turned.map_posterior.angle_rad)) == pytest.approx(30.0, abs=4.0)
 
@@ -180,7 +180,7 @@ def test_coarse_cells_are_flagged() -> None:
     found = estimate_map(
         tactile_map, calibration=None, options=EstimateOptions("optimise", OFF), rng=np.random.default_rng(1)
     )
-    assert found.diagnostics["coarse_cells"] is True
+    assert found.diagnostics.coarse_cells is True
     assert "smaller --cell-mm" in estimate_text(found, tactile_map, probability=0.95)
 
 
@@ -190,7 +190,7 @@ def test_a_level_off_the_background_is_reported() -> None:
         tactile_map, calibration=None, options=EstimateOptions("optimise", OFF), rng=np.random.default_rng(1)
     )
     assert found.status == "estimate"
-    level = [found.diagnostics["level_offset"], run(method="optimise").diagnostics["level_offset"]]
+    level = [one.diagnostics.noise.level_offset for one in (found, run(method="optimise"))]
     assert level[0] > 0.005 > 5 * abs(level[1])  # the bump widens to take most of the 0.05 upon itself
 
 

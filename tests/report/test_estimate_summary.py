@@ -104,15 +104,14 @@ def crowded() -> tuple[Estimate, dict]:
     options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
     found = estimate_map(MAPS["clear.nc"], calibration=None, options=options, rng=np.random.default_rng(1))
     rise = Rise(10.0, 1.0, 30.0, amplitude=0.1, sigma_x_mm=4.0, sigma_y_mm=4.0, probability=0.97)
-    odd = {
-        "outside_calibration": [f"reason {i}" for i in range(9)],
-        "coarse_cells": True,
-        "level_offset": 0.2,
-        "places_share": 0.4,
-    }
-    full = replace(
-        found, other_rises=(rise,) * 9, diagnostics=found.diagnostics | odd, reason="of a reason", advice="advice"
+    assert found.diagnostics is not None
+    odd = replace(
+        found.diagnostics,
+        outside_calibration=tuple(f"reason {i}" for i in range(9)),
+        coarse_cells=True,
+        noise=replace(found.diagnostics.noise, level_offset=0.2, places_share=0.4),
     )
+    full = replace(found, other_rises=(rise,) * 9, diagnostics=odd, reason="of a reason", advice="advice")
     return full, estimate_quantities(full, MAPS["clear.nc"], probability=0.9)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from tactile_bayes.posterior.correlated.selection import ASKING, SceneChoice, ch
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import trusted
+from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection, detection_from_odds
@@ -63,7 +64,7 @@ class FieldDraws:
     choice: SceneChoice
     draws: ParameterDraws
     posterior: MapPosterior
-    figures: Mapping[str, object]
+    figures: NoiseFigures
 
 
 def look(
@@ -170,8 +171,7 @@ def draw(
     if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
         detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
     places = pose_covariance(choice.fit)
-    figures = _diagnostics(choice) | ({"passed_over": list(passed_over)} if passed_over else {})
-    figures["places_share"] = _places_share(choice.fit, places)
+    figures = _figures(choice, _places_share(choice.fit, places), passed_over)
     return FieldDraws(detection, choice, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
 
 
@@ -215,12 +215,15 @@ def _places_share(fit: FieldFit, places: FloatArray) -> float | None:
     return added / (added + float(np.diag(fit.covariance)[widths].sum()))
 
 
-def _diagnostics(choice: SceneChoice) -> dict[str, object]:
+def _figures(choice: SceneChoice, places_share: float | None, passed_over: tuple[str, ...]) -> NoiseFigures:
     odds = {one.name: one.odds for one in choice.structures}
-    found: dict[str, object] = {
-        "noise": "field",
-        "rotation_odds": odds.get("rotated"),
-        "rotated": choice.fit.rotated,
-        "field_cosines": choice.fit.target.window.cosines,
-    }
-    return found | choice.fit.target.field_summary(choice.fit.mode)
+    target = choice.fit.target
+    figures = {"field_cosines": target.window.cosines, **target.field_summary(choice.fit.mode)}
+    return NoiseFigures(
+        "field",
+        choice.fit.rotated,
+        odds.get("rotated"),
+        figures,
+        places_share=places_share,
+        passed_over=passed_over,
+    )

@@ -13,6 +13,7 @@ from tactile_bayes.inference.cache import Solved
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.fit import BumpFit, rotation_odds
@@ -94,13 +95,8 @@ def _draw(
     raise ValueError(f"unknown method {options.method!r}")
 
 
-def judged_noise(fit: BumpFit, odds: float | None) -> dict[str, object]:
+def judged_noise(fit: BumpFit, odds: float | None) -> NoiseFigures:
     """What the errors were found to be, for the report."""
-    return {
-        "noise": "independent",
-        "noise_inflation": fit.errors.inflation,
-        "noise_dof": fit.errors.dof,
-        "level_offset": level_offset(fit.fit.residual, weight=fit.weight),
-        "rotation_odds": odds,
-        "rotated": fit.bump.rotated,
-    }
+    figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
+    offset = level_offset(fit.fit.residual, weight=fit.weight)
+    return NoiseFigures("independent", fit.bump.rotated, odds, figures, level_offset=offset)

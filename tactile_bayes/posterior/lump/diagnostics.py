@@ -1,0 +1,93 @@
+"""Figures and flags of an estimate: of the fit, of the errors, of the method and of the size calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tactile_bayes.records import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseFigures:
+    """What the errors were found to be, and what was decided under them.
+
+    Parameters
+    ----------
+    noise
+        ``"independent"`` or ``"field"``.
+    rotated, rotation_odds
+        Whether the ellipse is rotated, and the odds of it; None where that was decided beforehand.
+    figures
+        Of the noise model: inflation and degrees of freedom, or the field's cosines, length and share.
+    level_offset
+        Of the cells about the bump from the background, under independent errors; None where the level is integrated
+        out.
+    places_share
+        Of the width variance, that errors of the frames' places make; None where a map does not give them.
+    passed_over
+        Methods that could not be trusted, and why.
+    """
+
+    noise: str
+    rotated: bool
+    rotation_odds: float | None
+    figures: Mapping[str, float]
+    level_offset: float | None = None
+    places_share: float | None = None
+    passed_over: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain data."""
+        decided: dict[str, object] = {"rotation_odds": self.rotation_odds, "rotated": self.rotated}
+        if self.level_offset is not None:
+            return {"noise": self.noise, **self.figures, "level_offset": self.level_offset, **decided}
+        passed: dict[str, object] = {"passed_over": list(self.passed_over)} if self.passed_over else {}
+        return {"noise": self.noise, **decided, **self.figures, **passed, "places_share": self.places_share}
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """Figures and flags of an estimate.
+
+    Parameters
+    ----------
+    cells, covered_share
+        Cells in the fit window, and the share of it that they cover.
+    coarse_cells
+        Whether the cells are coarse for the width.
+    outside_calibration
+        What lies outside the calibration's range, in words.
+    fat_mm
+        Depth of fat that the size is for; None where the map does not give it.
+    method, sampler
+        The method that drew, and its own figures.
+    noise
+        Of the errors.
+    size_calibration
+        Which calibration gave the size and what it cannot know, in words.
+    """
+
+    cells: int
+    covered_share: float
+    coarse_cells: bool
+    outside_calibration: tuple[str, ...]
+    fat_mm: float | None
+    method: str
+    sampler: Mapping[str, float]
+    noise: NoiseFigures
+    size_calibration: str = ""
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain data."""
+        words = {"size_calibration": self.size_calibration} if self.size_calibration else {}
+        return {
+            "cells": self.cells,
+            "covered_share": self.covered_share,
+            "coarse_cells": self.coarse_cells,
+            "outside_calibration": list(self.outside_calibration),
+            "fat_mm": self.fat_mm,
+            **self.sampler,
+            **self.noise.as_dict(),
+            "method": self.method,
+            **words,
+        }
