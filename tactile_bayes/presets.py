@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, Literal, get_args
 
 RESEARCH_USE: Final = "Research use only: not a diagnostic device."
 
@@ -39,8 +39,14 @@ POSE_NOISE: Final = ("pose_noise_x_mm", "pose_noise_y_mm", "frame_side_x_mm", "f
 NORMALISE: Final = ("mean", "gain", "none")
 # See docs/decisions/0065; the paper divides by the mean.
 DEFAULT_NORMALISE: Final = "gain"
-METHODS: Final = ("optimise", "laplace", "importance", "ensemble")
-NOISE: Final = ("independent", "field")
+Method = Literal["optimise", "laplace", "importance", "ensemble"]
+METHODS: Final[tuple[Method, ...]] = get_args(Method)
+Noise = Literal["independent", "field"]
+NOISE: Final[tuple[Noise, ...]] = get_args(Noise)
+Background = Literal["fixed", "free"]
+Rotation = Literal["auto", "off", "on"]
+SceneAsked = Literal["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]
+SCENES: Final[tuple[SceneAsked, ...]] = get_args(SceneAsked)
 INTERVAL: Final = 0.95
 # Probability of the intervals of a size calibration that are held against bodies left out.
 HELD: Final = 0.9

@@ -18,7 +18,7 @@ from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.pipeline.one_map import Answer, answer_file, answer_of, estimate_file
 from tactile_bayes.pipeline.settings import FROM_FILE, Settings
-from tactile_bayes.presets import METHODS
+from tactile_bayes.presets import METHODS, SCENES
 
 if TYPE_CHECKING:
     from tactile_bayes.batch import Outcome
@@ -72,7 +72,7 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 )
 @click.option(
     "--scene",
-    type=click.Choice(["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]),
+    type=click.Choice(SCENES),
     default=_DEFAULTS.scene,
     show_default=True,
     help="What the window holds; auto: the simplest scene that the map supports.",

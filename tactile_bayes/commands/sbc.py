@@ -13,7 +13,7 @@ import click
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.number_or import WholeOrAuto
 from tactile_bayes.commands.paths import FilePath
-from tactile_bayes.presets import MOST_FIELD_COSINES
+from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 
 if TYPE_CHECKING:
     from tactile_bayes.batch import BatchStore, Outcome
@@ -51,7 +51,7 @@ _FILE = FilePath()
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 def command(
     maps: int,
-    method: str,
+    method: Method,
     field_cosines: int | None,
     seed: int,
     workers: int,
@@ -108,7 +108,14 @@ def command(
 
 
 def _run(
-    maps: int, method: str, seed: int, cosines: int | None, *, workers: int, scheduler: str | None, output: Path | None
+    maps: int,
+    method: Method,
+    seed: int,
+    cosines: int | None,
+    *,
+    workers: int,
+    scheduler: str | None,
+    output: Path | None,
 ) -> tuple[list[Outcome[MapRanks]], int]:
     """Every map's outcome, and how many of them this run made."""
     from functools import partial
@@ -136,7 +143,7 @@ def _run(
     return outcomes, max(maps - had, 0)
 
 
-def ranks_of_map(index: int, *, method: str, seed: int, cosines: int | None) -> MapRanks:
+def ranks_of_map(index: int, *, method: Method, seed: int, cosines: int | None) -> MapRanks:
     """The ranks of one map, in whichever process."""
     from tactile_bayes.studies import sbc
 

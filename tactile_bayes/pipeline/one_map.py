@@ -236,7 +236,14 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
         background = "free"
     background = settings.background or background
     radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
-    fit = FitOptions(background, radius, settings.rotation, settings.centre_mm, noise, None, settings.field_cosines)
+    fit = FitOptions(
+        background=background,
+        radius_mm=radius,
+        rotation=settings.rotation,
+        centre_mm=settings.centre_mm,
+        noise=noise,
+        field_cosines=settings.field_cosines,
+    )
     return EstimateOptions(
         method=settings.method,
         fit=fit,

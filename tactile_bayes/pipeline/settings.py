@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, get_args
 
-from tactile_bayes.presets import INTERVAL
+from tactile_bayes.errors import UsageError
+from tactile_bayes.presets import INTERVAL, METHODS, NOISE, SCENES, Background, Method, Noise, Rotation, SceneAsked
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
@@ -26,6 +27,14 @@ FROM_FILE: Final = (
     "field_cosines",
 )
 """Settings that the command line takes from a settings file only, besides the priors."""
+
+_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
+    "method": METHODS,
+    "noise": NOISE,
+    "scene": SCENES,
+    "background": get_args(Background),
+    "rotation": get_args(Rotation),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,27 +65,42 @@ class Settings:
         Where MCMC keeps its state.
     settings_file
         Where some of these were read from, for the provenance.
+
+    Raises
+    ------
+    UsageError
+        When a setting has a value that it cannot have.
     """
 
     calibration: str | Calibration | None = None
-    method: str = "importance"
+    method: Method = "importance"
     seed: int = 1
     interval: float = INTERVAL
-    background: str | None = None
+    background: Background | None = None
     fit_radius_mm: float | None = None
-    rotation: str = "auto"
+    rotation: Rotation = "auto"
     centre_mm: tuple[float, float] | None = None
     max_steps: int | None = None
-    noise: str | None = None
+    noise: Noise | None = None
     accuracy_sd: float | None = None
     between_map_sd: float | None = None
     known: tuple[tuple[str, float], ...] = ()
-    scene: str = "auto"
+    scene: SceneAsked = "auto"
     accuracy_mm: float | None = None
     prior: Mapping[str, float] | None = None
     checkpoint: Path | None = None
     field_cosines: int | None = None
     settings_file: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name, choices in _CHOICES.items():
+            value = getattr(self, name)
+            if value not in choices and not (value is None and name in ("background", "noise")):
+                raise UsageError(f"{name} is {value!r}; give one of {', '.join(choices)}")
+        if not 0.0 < self.interval < 1.0:
+            raise UsageError(f"interval is {self.interval:g}; give a probability between 0 and 1")
+        if self.seed < 0:
+            raise UsageError(f"seed is {self.seed}; give a whole number from 0 on")
 
     @property
     def calibration_name(self) -> str | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.presets import FIT_RADIUS_MM, Background, Noise
 
 if TYPE_CHECKING:
     from tactile_bayes.files.tables import Table
@@ -126,10 +126,11 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
             raise _contradiction(table, name, said[name], value)
     found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
     normalise = found["normalise"] or "mean"
-    background = found["background"] or ("free" if normalise == "none" else "fixed")
+    background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
     if normalise == "none" and background == "fixed":
         raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
-    radius_mm, noise = found["fit_radius_mm"] or FIT_RADIUS_MM, found["noise"] or "independent"
+    radius_mm = found["fit_radius_mm"] or FIT_RADIUS_MM
+    noise: Noise = found["noise"] or "independent"
     by_hand = any(said[name] is None for name in declared)
     return Recipe(normalise, background, radius_mm, declared=by_hand, noise=noise, flat_field=said["flat_field"])
 

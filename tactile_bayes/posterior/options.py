@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from tactile_bayes.errors import UsageError
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.presets import Background, Method, Noise, Rotation, SceneAsked
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.pooling import SizePriors
 
@@ -44,11 +45,11 @@ class FitOptions:
         bump's width calls for, see `correlated.noise.cosines_for`.
     """
 
-    background: str = "fixed"
+    background: Background = "fixed"
     radius_mm: float = 20.0
-    rotation: str = "auto"
+    rotation: Rotation = "auto"
     centre_mm: tuple[float, float] | None = None
-    noise: str = "independent"
+    noise: Noise = "independent"
     start_width_mm: float | None = None
     field_cosines: int | None = None
 
@@ -80,7 +81,7 @@ class EstimateOptions:
     size_priors
         Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
     scene
-        One of `selection.SCENES`, under a noise field.
+        One of `presets.SCENES`, under a noise field.
     accuracy_mm
         The same in mm; the finer of the two holds. Under a noise field.
     store
@@ -89,14 +90,14 @@ class EstimateOptions:
         Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD.
     """
 
-    method: str = "importance"
+    method: Method = "importance"
     fit: FitOptions = field(default_factory=FitOptions)
     prior: BumpPrior = field(default_factory=BumpPrior)
     least_probability: float = DETECTED
     max_steps: int | None = None
     accuracy_sd: float | None = None
     size_priors: SizePriors = field(default_factory=SizePriors)
-    scene: str = "auto"
+    scene: SceneAsked = "auto"
     accuracy_mm: float | None = None
     store: ChainStore | None = None
     draws: int = INDEPENDENT_DRAWS
@@ -119,7 +120,8 @@ def check_options(options: EstimateOptions) -> None:
         raise UsageError('a noise field takes level and tilt with it; give background = "free" in --settings FILE.toml')
 
 
-def scene_asked(options: EstimateOptions) -> str:
+def scene_asked(options: EstimateOptions) -> SceneAsked:
     """The scene asked for; the option that turns the ellipse decides where none was named."""
-    turned = {"on": "rotated", "off": "ellipse"}.get(options.fit.rotation, "auto")
+    by_rotation: dict[Rotation, SceneAsked] = {"on": "rotated", "off": "ellipse", "auto": "auto"}
+    turned = by_rotation[options.fit.rotation]
     return turned if options.scene == "auto" else options.scene

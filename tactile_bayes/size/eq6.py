@@ -9,6 +9,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import Background, Noise
 from tactile_bayes.records import dataclass
 from tactile_bayes.size import omissions
 from tactile_bayes.size.calibration_range import outside_domain, too_far
@@ -37,10 +38,10 @@ class Recipe:
     """
 
     normalise: str = "mean"
-    background: str = "fixed"
+    background: Background = "fixed"
     radius_mm: float = 20.0
     declared: bool = True
-    noise: str = "independent"
+    noise: Noise = "independent"
     flat_field: bool | None = None
 
     def differences(

@@ -44,6 +44,7 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII
+from tactile_bayes.presets import Method
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
@@ -133,7 +134,7 @@ def settings(method: str, seed: int, *, size: str = "", cosines: int | None = No
 
 
 def ranks_of_map(
-    index: int, *, method: str, seed: int, calibration: LogQuadratic | None = None, cosines: int | None = None
+    index: int, *, method: Method, seed: int, calibration: LogQuadratic | None = None, cosines: int | None = None
 ) -> MapRanks:
     """Draw one map from the prior, estimate it and rank its truth: all random numbers come from seed and index.
 

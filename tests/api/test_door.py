@@ -188,6 +188,22 @@ BAD: dict[str, tuple[Any, type[Exception], str]] = {
         TypeError,
         "no option 'sid'",
     ),
+    **{
+        f"no such {name}": (
+            lambda f, name=name, value=value: tb.estimate(f / "map.nc", **{name: value}),
+            UsageError,
+            f"{name} is .*; give ",
+        )
+        for name, value in {
+            "method": "emcee",
+            "scene": "turned",
+            "noise": "white",
+            "background": "none",
+            "rotation": "yes",
+            "interval": 95.0,
+            "seed": -1,
+        }.items()
+    },
     "no head": (
         lambda f: tb.record(f / "s.mcap", head="/dev/nothing", duration_s=1, like=DEMO / "scan.mcap"),
         DeviceError,

@@ -17,9 +17,10 @@ from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.pareto import TRUSTED_SHAPE, smooth_weights
 from tactile_bayes.posterior.correlated.fit import FieldFit, laplace_mixture
 from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.presets import Method
 from tactile_bayes.records import dataclass
 
-LADDER = ("laplace", "importance", "ensemble")
+LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
 STEPS_UP = 1
 """Methods that are tried after the one asked for: who asks for a quick one does not wait minutes for chains."""
 DISAGREEMENT = 5.0
@@ -89,7 +90,7 @@ def draw_scene(
 
 def _draw(
     fit: FieldFit,
-    method: str,
+    method: Method,
     *,
     rng: np.random.Generator,
     options: EstimateOptions,

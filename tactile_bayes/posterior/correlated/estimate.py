@@ -32,7 +32,7 @@ from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.white.fit import BumpFit
-from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.presets import FIELD_COSINES, SceneAsked
 from tactile_bayes.records import dataclass
 
 Progress = Callable[[int, int], None]
@@ -73,7 +73,7 @@ def look(
     *,
     prior: BumpPrior,
     radius_mm: float,
-    scene: str = "auto",
+    scene: SceneAsked = "auto",
     least_odds: float,
     cosines: int | None = None,
 ) -> FieldAnswer:
@@ -127,7 +127,7 @@ def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
     return float(np.log(max(area / (np.pi * plain.target.problem.radius_mm**2), 1.0)))
 
 
-def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: str = "auto") -> FieldAnswer:
+def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: SceneAsked = "auto") -> FieldAnswer:
     """The same with a second structure where the map asks for one, the lump weighed against a ridge where one rises.
 
     A bump alone is asked whether it is a Gaussian. Only scenes that ask what lies beside the lump are weighed so:

@@ -23,6 +23,7 @@ from tactile_bayes.posterior.correlated.selection import (
 )
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
 from tactile_bayes.posterior.correlated.window import Profiles
+from tactile_bayes.presets import SceneAsked
 
 SECOND_ODDS = 10.0
 """For a second lump or a rib: a bump that is not quite a Gaussian must not bring one."""
@@ -37,7 +38,7 @@ WANTED: dict[str, Extra] = {"second-lump": "second lump", "rib": "rib"}
 
 
 def add_beside(
-    choice: SceneChoice, surroundings: Surroundings, *, ridges: FloatArray, scene: str = "auto"
+    choice: SceneChoice, surroundings: Surroundings, *, ridges: FloatArray, scene: SceneAsked = "auto"
 ) -> SceneChoice:
     """Ask for a second lump or a rib beside the bump; the draws have it where the map asks for it, or `scene` does.
 
@@ -52,7 +53,7 @@ def add_beside(
 
 
 def _beside_questions(
-    problem: Problem, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: str
+    problem: Problem, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: SceneAsked
 ) -> tuple[FieldFit, list[Structure]]:
     """A second lump and a rib, each against the scene without; the likelier of those that the map asks for."""
     lumps = second_lumps(plain, problem)

@@ -12,12 +12,12 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.correlated.fit import FieldFit, Mixture, fit_scene, newton_mixture
 from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene, Shape
+from tactile_bayes.presets import SceneAsked
 from tactile_bayes.records import dataclass
 
 LEAST_ODDS = 3.0
 """A structure is used when the map favours the scene with it by this factor."""
 ASKING = ("auto", "second-lump", "rib")
-SCENES = ("auto", "none", "round", "ellipse", "rotated", "second-lump", "rib")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def choose_shape(
     problem: Problem,
     start: FloatArray,
     *,
-    scene: str = "auto",
+    scene: SceneAsked = "auto",
     least_odds: float = LEAST_ODDS,
 ) -> SceneChoice:
     """Fit the bump, and ask whether it is round, turned, and on a slope.
@@ -90,7 +90,7 @@ def choose_shape(
     start : (5,) array
         ``(u, v, x, y, r)`` of a rotated ellipse.
     scene
-        One of `SCENES`: ``"auto"``, or what the draws shall have.
+        One of `presets.SCENES`: ``"auto"``, or what the draws shall have.
 
     Notes
     -----

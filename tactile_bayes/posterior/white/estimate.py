@@ -87,12 +87,10 @@ def _draw(
             return importance(density, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
         except NotConvergedError:
             pass  # its weights cannot be trusted here; chains need none
-    if options.method in ("importance", "ensemble"):
-        from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
+    from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 
-        settings = EnsembleOptions() if options.max_steps is None else EnsembleOptions(max_steps=options.max_steps)
-        return ensemble(target, mode, covariance, rng=rng, options=settings, progress=progress)
-    raise ValueError(f"unknown method {options.method!r}")
+    settings = EnsembleOptions() if options.max_steps is None else EnsembleOptions(max_steps=options.max_steps)
+    return ensemble(target, mode, covariance, rng=rng, options=settings, progress=progress)
 
 
 def judged_noise(fit: BumpFit, odds: float | None) -> NoiseFigures:

@@ -24,6 +24,7 @@ from tactile_bayes.posterior.options import FitOptions
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.residuals import ErrorModel, count_weights, error_model, independent_errors
 from tactile_bayes.posterior.white.target import LogPrior, Target, flat_prior
+from tactile_bayes.presets import Background, Noise
 from tactile_bayes.records import dataclass
 
 START_WIDTHS_MM = (5.0, 2.0, 10.0)
@@ -214,7 +215,7 @@ def fit_close(
     return fit_bump(tactile_map, centre_mm, options=near)
 
 
-def default_errors(tactile_map: TactileMap) -> tuple[str, str]:
+def default_errors(tactile_map: TactileMap) -> tuple[Background, Noise]:
     """Background and noise of `FitOptions` where neither an option nor a size calibration decides.
 
     As the paper printed it where the level is known. Without a level the background is free, under correlated errors,
