@@ -1,4 +1,4 @@
-"""Lump size with an honest credible interval from tactile maps of the breast (research use only).
+"""Lump size with a credible interval from tactile maps of the breast (research use only).
 
 ``import tactile_bayes as tb`` offers what the command line does; each name is loaded when it is first used:
 

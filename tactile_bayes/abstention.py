@@ -1,4 +1,4 @@
-"""No number: the reason in words and in a code that programs can read, and what would change it."""
+"""Reasons for giving no number: a sentence, a code for programs, and what would help."""
 
 from __future__ import annotations
 

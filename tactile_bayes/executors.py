@@ -1,4 +1,4 @@
-"""Where the items of a batch run: in this process, in worker processes of this machine or on a dask cluster."""
+"""Executors for batches: this process, local worker processes or a dask cluster."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything printed goes through here: control characters are shown, not obeyed, and a full disk is one line."""
+"""All printing: control characters are escaped, and a full disk is one error line."""
 
 from __future__ import annotations
 

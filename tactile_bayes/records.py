@@ -1,4 +1,4 @@
-"""Frozen records whose classes are made in half the time that `dataclasses.dataclass` takes.
+"""Frozen dataclasses that are created in half the time of the standard library's.
 
 A command makes sixty classes before it does anything, a tenth of its time. The standard library writes and compiles up
 to six functions for each; here only ``__init__`` is compiled, and the others are shared.

@@ -1,1 +1,1 @@
-"""What Python sees of the program: `import tactile_bayes as tb` offers it all, each name loaded when first used."""
+"""The public Python API: `import tactile_bayes as tb` offers it, each name loaded on first use."""

@@ -1,4 +1,4 @@
-"""Paths as Python callers give them."""
+"""Conversion of paths that Python callers give as str or Path."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""One module a command: parse, load, call one function, write."""
+"""One module per command: parse options, load files, call one function, write results."""

@@ -31,29 +31,29 @@ def command() -> None:
     type=click.Choice(["eq6", "log-quadratic"]),
     default="eq6",
     show_default=True,
-    help="eq6: as printed, one row a lump; log-quadratic: from a table of `population`, one row an exam.",
+    help="eq6: as printed, one row per lump; log-quadratic: from a table of `population`, one row per exam.",
 )
 @click.option(
     "--normalise",
     type=click.Choice(NORMALISE),
-    help="How the table's maps were normalised, for a table that does not say. Default: mean.",
+    help="Normalisation of the table's maps, if the table does not state it. Default: mean.",
 )
 @click.option(
     "--background",
     type=click.Choice(["fixed", "free"]),
-    help="Level of the table's maps in their fits, for a table that does not say. Default: fixed, or free with "
+    help="Background in the table's fits, if the table does not state it. Default: fixed, or free with "
     "--normalise none.",
 )
 @click.option(
     "--fit-radius-mm",
     type=FiniteRange(min=0.0, min_open=True),
-    help="Radius about the lump within which they were fitted, for a table that does not say. "
+    help="Radius of the table's fit windows, mm, if the table does not state it. "
     f"Default: {FIT_RADIUS_MM:g}.",
 )
 @click.option(
     "--noise",
     type=click.Choice(NOISE),
-    help="Errors they were fitted under, for a table that does not say; least squares is independent. "
+    help="Noise model of the table's fits, if the table does not state it; least squares is independent. "
     "Default: independent.",
 )
 @click.option(
@@ -61,9 +61,9 @@ def command() -> None:
     type=FiniteRange(min=0.0),
     default=0.0,
     show_default=True,
-    help="Leave out softer lumps: above 8 the paper's widths change by less than 5 %.",
+    help="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed.")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
 @click.pass_context
 def size(
@@ -155,15 +155,15 @@ def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
     help="The bladder's pressure and what the head recorded under it.",
 )
 @click.option("-o", "--output", required=True, metavar="ARRAY.json", type=_FILE, help="Where to write the calibration.")
-@click.option("--head-id", metavar="ID", help="Of the head; by default what the scans say.")
+@click.option("--head-id", metavar="ID", help="Identifier of the head. Default: what the scans state.")
 @click.option(
-    "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="When it was measured; by default today."
+    "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="Day of the measurement. Default: today."
 )
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
 def array(
     steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
 ) -> None:
-    """Learn gain and offset of each taxel from a pressure bladder, with what is left uneven.
+    """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay.
 
     Record each step with `record --uncalibrated`. Dead and hot taxels are found and get gain 0, which leaves them out
     of maps. A parabola is fitted as well, to tell whether a straight line is enough.

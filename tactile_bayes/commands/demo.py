@@ -31,14 +31,14 @@ PROGRAM = "tactile-bayes"
     default=Path("tactile-bayes-demo"),
     show_default=True,
     metavar="DIR",
-    help="Where to put the files.",
+    help="Folder for the files.",
 )
 @click.option(
     "--method",
     type=click.Choice(METHODS[:3]),
     default="importance",
     show_default=True,
-    help="Method of both estimates, see `estimate --help`.",
+    help="Method of both estimates; see `estimate --help`.",
 )
 @click.option("--force", is_flag=True, help="Overwrite the files of an earlier demo.")
 @click.pass_context

@@ -1,4 +1,4 @@
-"""`devices`: what is plugged in, and which way round its rotations are."""
+"""`devices`: list serial ports and check which way a tracker's rotations go."""
 
 from __future__ import annotations
 
@@ -10,22 +10,32 @@ from tactile_bayes.commands.emulate import PROTOCOLS
 
 
 @click.command("devices")
-@click.option("--probe", "url", metavar="URL", help="Ask what is on this port, in each protocol; this writes to it.")
 @click.option(
-    "--pivot", "pivot_url", metavar="URL", help="Turn this tracker about a fixed point: are rotations inverse?"
+    "--probe",
+    "url",
+    metavar="URL",
+    help="Identify the device on this port, by asking in each protocol; this writes to it.",
+)
+@click.option(
+    "--pivot", "pivot_url", metavar="URL", help="Check for inverse rotations: turn this tracker about a fixed point."
 )
 @click.option(
     "--tracker-protocol",
     type=click.Choice(PROTOCOLS),
     default="fastrak",
     show_default=True,
-    help="Of the tracker to turn.",
+    help="Protocol of the tracker to rotate.",
 )
 @click.option(
-    "--duration", type=click.FloatRange(min=0.2), default=10.0, show_default=True, metavar="S", help="Of the turning."
+    "--duration",
+    type=click.FloatRange(min=0.2),
+    default=10.0,
+    show_default=True,
+    metavar="S",
+    help="How long to rotate it, s.",
 )
 def command(*, url: str | None, pivot_url: str | None, tracker_protocol: str, duration: float) -> None:
-    """List the serial ports with a guess at what is on them.
+    """List the serial ports and the devices that are probably on them.
 
     With --pivot, hold the head's apex on one point and turn the handle about it: the right sense of the rotations keeps
     the point where it is, the wrong one does not.

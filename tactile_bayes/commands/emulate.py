@@ -26,26 +26,37 @@ _SHARE = click.FloatRange(0.0, 1.0)
 @click.command("emulate")
 @click.argument("kind", metavar="head|tracker|both", type=click.Choice(["head", "tracker", "both"]))
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
-@click.option("--protocol", type=click.Choice(PROTOCOLS), default="open", show_default=True, help="Of the tracker.")
+@click.option(
+    "--protocol", type=click.Choice(PROTOCOLS), default="open", show_default=True, help="Protocol of the tracker."
+)
 @click.option(
     "--tcp",
     metavar="HOST:PORT",
     help="Listen there (port 0: any; both: the tracker on the next port). Default: a pseudo-terminal.",
 )
 @click.option(
-    "--once", is_flag=True, help="End when the scan has been sent and read. Default: it can be started again."
+    "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
 )
-@click.option("--speed", type=click.FloatRange(0.01, 100.0), default=1.0, show_default=True, help="Times the own rate.")
+@click.option(
+    "--speed",
+    type=click.FloatRange(0.01, 100.0),
+    default=1.0,
+    show_default=True,
+    help="Playback speed; 1 is real time.",
+)
 @click.option("--drop", type=_SHARE, default=0.0, help="Share of the records that are not sent.")
 @click.option("--corrupt", type=_SHARE, default=0.0, help="Share of the records with one bit changed.")
 @click.option(
-    "--stall", type=(float, float), metavar="AT FOR", help="Send nothing from AT s on for FOR s; what it held is lost."
+    "--stall",
+    type=(float, float),
+    metavar="AT FOR",
+    help="Send nothing for FOR s from AT s on; those records are lost.",
 )
-@click.option("--disconnect", type=click.FloatRange(min=0.0), metavar="AT", help="Pull the cable at AT s.")
+@click.option("--disconnect", type=click.FloatRange(min=0.0), metavar="AT", help="Disconnect at AT s.")
 @click.option(
     "--hold", type=click.IntRange(min=1), default=1, show_default=True, help="Tracker: measure only every n-th pose."
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the faults.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
 def command(
     *,
     kind: str,

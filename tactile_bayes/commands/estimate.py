@@ -37,8 +37,8 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--size-calibration",
     metavar="solid|solid-mean|plane-strain|none|SIZE.json",
-    help="From widths to sizes: one that comes with the program (if nothing is said solid, or solid-mean for maps of "
-    "frames divided by their means), yours, or none: widths only.",
+    help="Calibration from widths to sizes: a shipped one, your own file, or none (widths only). Default: "
+    "solid, or solid-mean for maps of frames divided by their means.",
 )
 @click.option(
     "--method",
@@ -47,16 +47,14 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     show_default=True,
     help="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares.",
 )
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True, help="Of the random numbers."
-)
+@click.option("--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True, help="Random seed.")
 @click.option(
     "--interval", type=_PROBABILITY, default=_DEFAULTS.interval, show_default=True, help="Probability of the intervals."
 )
 @click.option("-o", "--output", metavar="POST.nc", type=_FILE, help="Write all draws (netCDF that arviz opens).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
 @click.option(
-    "--figure", metavar=METAVAR, type=FigurePath(), help="Draw the size posterior; the map, where there is none."
+    "--figure", metavar=METAVAR, type=FigurePath(), help="Draw the size posterior, or the map where there is no size."
 )
 @click.option(
     "--map-figure",
@@ -68,14 +66,14 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     "--centre-mm",
     type=(FiniteRange(), FiniteRange()),
     metavar="X Y",
-    help="Where on the map to look; else the highest bump.",
+    help="Place on the map to measure. Default: the highest bump that can be a lump.",
 )
 @click.option(
     "--scene",
     type=click.Choice(SCENES),
     default=_DEFAULTS.scene,
     show_default=True,
-    help="What the window holds; auto: the simplest scene that the map supports.",
+    help="Structures in the fit window; auto: the simplest scene that the map supports.",
 )
 @click.option(
     "--settings",
@@ -87,25 +85,29 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--accuracy-sd",
     type=FiniteRange(min=0.001, max=0.5),
-    help="Wanted Monte-Carlo error of the interval ends of sizes and map widths, in posterior SDs. Default: 0.02 for "
-    "importance, 0.1 for ensemble.",
+    help="Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. Default: "
+    "0.02 for importance, 0.1 for ensemble.",
 )
 @click.option(
     "--known",
     type=(str, FiniteRange()),
     multiple=True,
     metavar="NAME VALUE",
-    help="Of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, stiffness_ratio, fat_kpa, "
-    "gland_ratio or thickness_mm.",
+    help="Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
+    "stiffness_ratio, fat_kpa, gland_ratio or thickness_mm.",
 )
-@click.option("--pool", is_flag=True, help="The maps are of one mass: one size from all of them.")
+@click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @click.option(
-    "--workers", type=click.IntRange(min=1), default=1, show_default=True, help="Processes, for several maps."
+    "--workers",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Number of worker processes, for several maps.",
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Send several maps to a dask scheduler (extra [cluster]).")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 @click.option(
-    "-v", "--verbose", is_flag=True, help="Print the whole report, not its 12 lines; say on stderr how long it took."
+    "-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines, and the time taken on stderr."
 )
 @click.pass_context
 def command(

@@ -26,16 +26,16 @@ _LONGEST_UNITS = 20
     "--as",
     "kind",
     type=click.Choice(["scan", "map"]),
-    help="What SRC holds. Default: a map where the output ends in .nc or SRC is a table or an image, else a scan.",
+    help="What SRC holds. Default: a map if the output ends in .nc or SRC is a table or an image, otherwise a scan.",
 )
 @click.option("--spacing-mm", type=float, metavar="H", help="Map: side of the square cells, in mm.")
 @click.option(
     "--normalise",
     type=click.Choice(NORMALISE),
-    help="Map: how the values were divided already; none (the default) if they were not.",
+    help="Map: how the values are already normalised. Default: none.",
 )
 @click.option(
-    "--units", metavar="TEXT", help="Map: unit of values that were not divided, such as kPa. Default: unknown."
+    "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."
 )
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 def command(
@@ -48,7 +48,7 @@ def command(
     units: str | None,
     force: bool,
 ) -> None:
-    """Bring other people's data in.
+    """Import scans, grids and images from other programs.
 
     SRC is an .npz of raw counts and poses (a scan), a scan file to repair (what is intact is kept), or a grid of
     values (a map): .npz with `mean`, .csv, or a grey .tif, .pgm or .png image. The first row of a grid has the lowest

@@ -1,4 +1,4 @@
-"""The process of a live view: sees what a recording shows, keeps a map, draws it, and lets another one estimate.
+"""The live view's process: follows a recording, keeps a map, draws it and has it estimated in another process.
 
 It is started by `record` and never makes it wait; if it dies, the recording goes on.
 """

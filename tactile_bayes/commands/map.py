@@ -38,7 +38,7 @@ _FILE = FilePath()
     type=click.Choice(NORMALISE),
     default=DEFAULT_NORMALISE,
     show_default=True,
-    help="gain: solve for one gain a frame; mean: divide a frame by its mean (the paper); none: keep kPa.",
+    help="gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: keep kPa.",
 )
 @click.option(
     "--latency-ms",
@@ -46,7 +46,7 @@ _FILE = FilePath()
     metavar="MS|auto",
     default="0",
     show_default=True,
-    help="By how much the tracker's time stamps are late; auto finds it from the scan, or refuses.",
+    help="Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse.",
 )
 @click.option(
     "--plane-radius-mm",
@@ -54,15 +54,15 @@ _FILE = FilePath()
     metavar="MM|auto|all",
     default="all",
     show_default=True,
-    help="Fit the plane to the frames so near to the mass; auto: those whose array can reach it.",
+    help="Fit the plane to frames within this distance of the mass; auto: those whose array can reach it.",
 )
-@click.option("--flat-field", is_flag=True, help="Take off the head's own response, from frames without a lump.")
+@click.option("--flat-field", is_flag=True, help="Remove the head's own response, measured on frames without a lump.")
 @click.option(
-    "--register-strokes", is_flag=True, help="Shift the strokes onto each other, for a lump that follows the head."
+    "--register-strokes", is_flag=True, help="Align the strokes with each other, for a lump that moves with the head."
 )
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the map and its coverage.")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
-@click.option("-v", "--verbose", is_flag=True, help="Say on stderr how long each step took.")
+@click.option("-v", "--verbose", is_flag=True, help="Print the time of each step on stderr.")
 def command(
     scans: tuple[Path, ...],
     output: Path,

@@ -1,4 +1,4 @@
-"""Options that a command had once: giving one says where it is now."""
+"""Options that have moved: using one prints where it is now."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`plan`: how large a trial must be, and how many maps a mass are worth making."""
+"""`plan`: sample size of a trial, and the value of more maps per mass."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other
     multiple=True,
     default=(16, 24, 32, 48),
     show_default=True,
-    help="With one mass each.",
+    help="Number of patients, one mass each.",
 )
 @click.option(
     "--maps",
@@ -37,27 +37,41 @@ _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other
     multiple=True,
     default=(1, 3, 5),
     show_default=True,
-    help="Tactile maps a mass.",
+    help="Number of tactile maps per mass.",
 )
 @click.option("--tactile-bias", type=_BIAS, default=0.02, show_default=True, help="Mean of ln(size / ex vivo).")
 @click.option("--mass-sd", type=_SD, default=0.18, show_default=True, help="SD of ln size shared by a mass's maps.")
 @click.option("--map-sd", type=_SD, default=0.15, show_default=True, help="SD of ln size of single maps.")
-@click.option("--other-bias", type=_BIAS, default=-0.08, show_default=True, help="Of the modality compared with.")
-@click.option("--other-sd", type=_SD, default=0.40, show_default=True, help="SD of ln size of that modality.")
 @click.option(
-    "--other-miss", type=FiniteRange(0, 1), default=0.04, show_default=True, help="Share of masses it misses."
+    "--other-bias",
+    type=_BIAS,
+    default=-0.08,
+    show_default=True,
+    help="Mean of ln(size / ex vivo) of the modality compared with.",
+)
+@click.option(
+    "--other-sd", type=_SD, default=0.40, show_default=True, help="SD of ln size of the modality compared with."
+)
+@click.option(
+    "--other-miss",
+    type=FiniteRange(0, 1),
+    default=0.04,
+    show_default=True,
+    help="Share of masses that the modality compared with misses.",
 )
 @click.option(
     "--pilot",
     metavar="TRIAL.csv",
     type=_FILE,
-    help="Take the errors from this trial, but for those given by options; needs --excision.",
+    help="Take the errors that no option gives from this trial; needs --excision.",
 )
 @click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
-@click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot compared with.")
-@click.option("--trials", type=click.IntRange(50), default=1000, show_default=True, help="Simulated for each design.")
-@click.option("--seed", type=click.IntRange(0), default=1999, show_default=True, help="Of the simulation.")
-@click.option("--workers", type=click.IntRange(0), default=1, show_default=True, help="Local processes.")
+@click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot to compare with.")
+@click.option(
+    "--trials", type=click.IntRange(50), default=1000, show_default=True, help="Number of simulated trials per design."
+)
+@click.option("--seed", type=click.IntRange(0), default=1999, show_default=True, help="Random seed.")
+@click.option("--workers", type=click.IntRange(0), default=1, show_default=True, help="Number of worker processes.")
 @click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
 @click.option("-o", "--output", metavar="PLAN.json", type=_FILE, help="Write the plan as JSON to this file.")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")

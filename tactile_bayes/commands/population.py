@@ -1,4 +1,4 @@
-"""`population`: scans of bodies that differ, mapped and fitted as patients' are: the table of a size calibration."""
+"""`population`: simulated exams of varied bodies, mapped and fitted: the table for a size calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ _FILE = FilePath()
 
 @click.command("population")
 @click.option("-o", "--output", required=True, metavar="TABLE.csv", type=_FILE, help="Where to write the table.")
-@click.option("--masses", type=click.IntRange(min=1), default=400, show_default=True, help="Bodies with a lump each.")
+@click.option(
+    "--masses", type=click.IntRange(min=1), default=400, show_default=True, help="Number of bodies, one lump each."
+)
 @click.option(
     "--centred",
     type=click.IntRange(min=0),
@@ -26,16 +28,16 @@ _FILE = FilePath()
     show_default=True,
     help="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
 )
-@click.option("--scans", type=click.IntRange(min=1), default=2, show_default=True, help="Exams of each.")
+@click.option("--scans", type=click.IntRange(min=1), default=2, show_default=True, help="Number of exams per body.")
 @click.option(
     "--normalise",
     type=click.Choice(["gain", "mean"]),
     default=DEFAULT_NORMALISE,
     show_default=True,
-    help="Of the maps, as `map` has it; sizes are told of maps made the same way.",
+    help="Normalisation of the maps, as in `map`; the calibration is for maps made the same way.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True, help="Of the random numbers.")
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
+@click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True, help="Random seed.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
 @click.option("--scheduler", metavar="ADDR", help="Send the masses to a dask scheduler (extra [cluster]).")
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
 def command(

@@ -1,4 +1,4 @@
-"""`record`: a scan head and a tracker into a scan file, losing nothing."""
+"""`record`: record a scan head and a tracker to a scan file without losing data."""
 
 from __future__ import annotations
 
@@ -32,32 +32,64 @@ _CODE = "A code, not a name."
     type=click.Choice(PROTOCOLS),
     default="fastrak",
     show_default=True,
-    help="What the tracker speaks; PATRIOT is liberty.",
+    help="Protocol of the tracker; a PATRIOT speaks liberty.",
 )
-@click.option("--head-baud", type=click.IntRange(min=300), default=2_000_000, show_default=True, help="Line rate.")
-@click.option("--tracker-baud", type=click.IntRange(min=300), help="Line rate; by default the protocol's.")
+@click.option(
+    "--head-baud",
+    type=click.IntRange(min=300),
+    default=2_000_000,
+    show_default=True,
+    help="Baud rate of the head's port.",
+)
+@click.option(
+    "--tracker-baud", type=click.IntRange(min=300), help="Baud rate of the tracker's port. Default: the protocol's."
+)
 @click.option("--tracker-rom", type=_FILE, metavar="TOOL.rom", help="ndi: description of a wireless tool.")
-@click.option("--every", type=click.IntRange(1, 255), default=1, show_default=True, help="Ask for every n-th frame.")
-@click.option("--duration", "duration_s", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Stop then.")
-@click.option("--at-once", is_flag=True, help="Start without waiting for space. Default: with --duration.")
+@click.option(
+    "--every", type=click.IntRange(1, 255), default=1, show_default=True, help="Record every n-th frame only."
+)
+@click.option(
+    "--duration",
+    "duration_s",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="S",
+    help="Stop after this time, s.",
+)
+@click.option(
+    "--at-once", is_flag=True, help="Start at once, without waiting for space. Default: only with --duration."
+)
 @click.option(
     "--clock",
     type=click.Choice(["arrival", "shared"]),
     default="arrival",
     show_default=True,
-    help="Place poses by when they arrive, or trust that both devices count from one zero.",
+    help="Time the poses by their arrival, or trust one clock of both devices.",
 )
 @click.option("--invert-rotation", is_flag=True, help="The tracker gives the inverse rotation.")
 @click.option("--like", type=_FILE, metavar="SCAN.mcap", help="Take geometry and calibration from this scan.")
-@click.option("--head-geometry", type=_FILE, metavar="HEAD.json", help="Where the taxels and the tracker sit.")
-@click.option("--array-calibration", type=_FILE, metavar="ARRAY.json", help="From `calibrate array`.")
+@click.option(
+    "--head-geometry", type=_FILE, metavar="HEAD.json", help="Positions of the taxels and of the tracker's sensor."
+)
+@click.option(
+    "--array-calibration", type=_FILE, metavar="ARRAY.json", help="Array calibration, made by `calibrate array`."
+)
 @click.option("--uncalibrated", is_flag=True, help="Record with the nominal gain: for bladder steps.")
-@click.option("--accept-calibration", is_flag=True, help="Even when it is stale or another head's.")
-@click.option("--calibration-days", type=click.FloatRange(min=0.0), default=1.0, show_default=True, help="Stale after.")
+@click.option(
+    "--accept-calibration", is_flag=True, help="Accept an array calibration that is stale or of another head."
+)
+@click.option(
+    "--calibration-days",
+    type=click.FloatRange(min=0.0),
+    default=1.0,
+    show_default=True,
+    help="Age from which an array calibration is stale, days.",
+)
 @click.option("--landmarks", type=_FILE, metavar="FILE", help="Take landmarks from a JSON file or a scan.")
-@click.option("--side", type=click.Choice(["left", "right", "phantom"]), help="Which breast.")
-@click.option("--posture", type=click.Choice(["supine", "oblique", "sitting", "phantom"]), help="During the scan.")
-@click.option("--lubricant", metavar="TEXT", help="What was put on the skin.")
+@click.option("--side", type=click.Choice(["left", "right", "phantom"]), help="Breast that is scanned.")
+@click.option(
+    "--posture", type=click.Choice(["supine", "oblique", "sitting", "phantom"]), help="Posture during the scan."
+)
+@click.option("--lubricant", metavar="TEXT", help="Lubricant on the skin.")
 @click.option("--examiner", metavar="CODE", help=_CODE)
 @click.option("--subject", metavar="CODE", help=_CODE)
 @click.option(
@@ -65,18 +97,18 @@ _CODE = "A code, not a name."
     "session_file",
     type=_FILE,
     metavar="SESSION.toml",
-    help="Take these five, and other plain text facts, from a file; an option overrides it.",
+    help="Read these five, and other facts in plain text, from a file; an option overrides it.",
 )
 @click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
 @click.option(
-    "--serve", metavar="HOST:PORT", help="Show it to a browser on this computer, with a tone for the pressure."
+    "--serve", metavar="HOST:PORT", help="Show the map in a browser on this computer, with a tone for the pressure."
 )
 @click.option(
     "--size-calibration",
     default="solid-mean",
     show_default=True,
     metavar="solid-mean|plane-strain|none|SIZE.json",
-    help="For the live view's size estimate; its frames are divided by their means.",
+    help="Size calibration of the live view, whose frames are divided by their means.",
 )
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @click.pass_context

@@ -1,4 +1,4 @@
-"""What can end or mark a recording from outside: signals and the keys of a terminal."""
+"""External control of a recording: signals and terminal keys."""
 
 from __future__ import annotations
 

@@ -12,10 +12,12 @@ from tactile_bayes.presets import RESEARCH_USE
 
 @click.command("repair")
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
-@click.option("-o", "--output", metavar="OUT.mcap", type=FilePath(), help="Write there instead.")
+@click.option(
+    "-o", "--output", metavar="OUT.mcap", type=FilePath(), help="Write to this file instead of replacing SCAN.mcap."
+)
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 def command(*, scan: Path, output: Path | None, force: bool) -> None:
-    """Rewrite a scan that was cut off or damaged: what is intact is kept, what is lost is told.
+    """Repair a scan that was cut off or damaged: keep what is intact, report what is lost.
 
     The file is replaced when the new one is whole, unless -o is given. A file that is whole already is left alone.
 

@@ -19,17 +19,25 @@ _FILE = FilePath()
 
 @click.command("replay")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
-@click.option("-o", "--output", metavar="OUT.mcap", type=_FILE, help="Keep what is recorded on the way.")
+@click.option("-o", "--output", metavar="OUT.mcap", type=_FILE, help="Save what is recorded.")
 @click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
-@click.option("--serve", metavar="HOST:PORT", help="Show it to a browser here, with a tone.")
+@click.option(
+    "--serve", metavar="HOST:PORT", help="Show the map in a browser on this computer, with a tone for the pressure."
+)
 @click.option(
     "--size-calibration",
     default="solid-mean",
     show_default=True,
     metavar="solid-mean|plane-strain|none|SIZE.json",
-    help="For the live view's size estimate; its frames are divided by their means.",
+    help="Size calibration of the live view, whose frames are divided by their means.",
 )
-@click.option("--speed", type=click.FloatRange(0.01, 100.0), default=1.0, show_default=True, help="Times the own rate.")
+@click.option(
+    "--speed",
+    type=click.FloatRange(0.01, 100.0),
+    default=1.0,
+    show_default=True,
+    help="Playback speed; 1 is real time.",
+)
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @click.pass_context
 def command(
@@ -42,7 +50,7 @@ def command(
     speed: float,
     force: bool,
 ) -> None:
-    """Play a scan as if it were being recorded: emulated devices, reading processes, recorder, live view.
+    """Replay a scan through emulated devices, recorder and live view, as if it were being recorded.
 
     Example: tactile-bayes replay scan.mcap --live
     """

@@ -1,4 +1,4 @@
-"""`sbc`: whether the posterior of a map is what it claims to be, on maps from its own prior."""
+"""`sbc`: simulation-based calibration of a map's posterior."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FILE = FilePath()
     type=click.Choice(["laplace", "importance"]),
     default="importance",
     show_default=True,
-    help="How the posterior is drawn from, as in `estimate`.",
+    help="Method of the posterior draws, as in `estimate`.",
 )
 @click.option(
     "--field-cosines",
@@ -38,13 +38,17 @@ _FILE = FilePath()
     metavar="N|auto",
     default="auto",
     show_default=True,
-    help="As of `estimate`.",
+    help="Basis functions of the noise field, as field_cosines of `estimate`.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
 @click.option("--scheduler", metavar="ADDR", help="Send the maps to a dask scheduler (extra [cluster]).")
 @click.option(
-    "-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write truths and ranks; with it a run can be resumed."
+    "-o",
+    "--output",
+    metavar="TABLE.csv",
+    type=_FILE,
+    help="Write truths and ranks; an interrupted run resumes from it.",
 )
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the ECDFs of the ranks with their bands.")
 @click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
@@ -63,12 +67,12 @@ def command(
 ) -> None:
     """Check the posterior against itself: simulation-based calibration and coverage.
 
-    Maps are drawn from the model's own prior (bump, level, slope, correlated errors) and estimated as `estimate --noise
-    field --rotation off` does it. Where the posterior is right, the rank of each true value among the draws is uniform
-    and an interval holds it as often as it says. This tests the program, not whether breasts are like its model. Maps
+    Maps are drawn from the model's own prior (bump, level, slope, correlated errors) and estimated under correlated
+    errors, without rotation. Where the posterior is right, the rank of each true value among the draws is uniform and
+    an interval covers it as often as it states. This tests the program, not whether breasts are like its model. Maps
     without an estimate are counted and left out, and so are those on which another rise than the drawn one was
-    measured; their number is held against what the estimates' probabilities announce. The size is that of a round lump
-    by the shipped calibration. With -o an interrupted run goes on where it stopped.
+    measured; their number is compared with what the estimates' probabilities predict. The size is that of a round
+    lump by the shipped calibration. With -o an interrupted run goes on where it stopped.
 
     Example: tactile-bayes sbc --maps 300 --workers 2 -o sbc.csv --figure sbc.png
     """

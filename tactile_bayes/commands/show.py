@@ -1,4 +1,4 @@
-"""`show`: say what a file is."""
+"""`show`: describe a file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tactile_bayes.presets import RESEARCH_USE
 @click.argument("file", type=FilePath())
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(file: Path, as_json: bool) -> None:
-    """Say what any of our files is: schema, shape, units, quality, provenance.
+    """Show what a file holds: schema, shape, units, quality, provenance.
 
     Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms.
 

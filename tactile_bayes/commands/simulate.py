@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @click.option(
     "--fidelity",
     type=click.Choice(["empirical-gaussian", "empirical", "plane-strain", "solid"]),
-    help="Model of the tissue; by default the one the scene is written for.",
+    help="Model of the tissue. Default: the one the scene is written for.",
 )
 @head_option(
     "Default: as the scene's [head] gives them for solid, shoulders-inside for plane-strain and empirical. "

@@ -1,4 +1,4 @@
-"""`study`: the Gaussian that the map of each lump shows, from the forward model."""
+"""`study`: amplitude and width of each lump's map, from the forward models."""
 
 from __future__ import annotations
 
@@ -39,15 +39,21 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
     show_default=True,
     help="The paper's two-dimensional body, or balls under the whole head in three dimensions.",
 )
-@click.option("--grid", default="paper", show_default=True, metavar="paper|FILE", help="150 cases, or a table of them.")
+@click.option(
+    "--grid",
+    default="paper",
+    show_default=True,
+    metavar="paper|FILE",
+    help="The paper's 150 cases, or a table of cases.",
+)
 @click.option(
     "--seat",
     default="centred",
     show_default=True,
     metavar="centred|resting|0..2",
-    help="How far the lump stands out of the gland, where the grid does not say.",
+    help="How far the lump stands out of the gland, if the grid does not state it.",
 )
-@click.option("-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write the table; else it is printed.")
+@click.option("-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write the table. Default: print it.")
 @click.option("--figures", metavar="DIR", type=_FILE, help="Draw figures 5 to 8 of the paper into this directory.")
 @click.option("--head-radius-mm", type=_ABOVE_0, default=35.0, show_default=True, help="Radius of the head's arc.")
 @click.option(
@@ -62,19 +68,27 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
 @click.option("--fat-kpa", type=_ABOVE_0, default=5.0, show_default=True, help="Young's modulus of fat.")
 @click.option("--poisson", type=float, default=0.495, show_default=True, help="Poisson's ratio of the tissues.")
 @click.option("--gland-ratio", type=_ABOVE_0, default=10.0, show_default=True, help="Modulus of gland over fat.")
-@click.option("--thickness-mm", type=_ABOVE_0, help="Depth of the chest wall; 70, or deeper where the lump needs it.")
-@click.option("--fineness", type=click.IntRange(1, 8), default=2, show_default=True, help="Of the mesh; twice is half.")
+@click.option(
+    "--thickness-mm", type=_ABOVE_0, help="Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."
+)
+@click.option(
+    "--fineness",
+    type=click.IntRange(1, 8),
+    default=2,
+    show_default=True,
+    help="Mesh fineness; doubling it halves the elements.",
+)
 @click.option(
     "--background",
     type=click.Choice(["fixed", "free"]),
-    help="Eq 7's level, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1.",
+    help="Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1.",
 )
 @click.option(
     "--flat-field/--no-flat-field",
     default=None,
-    help="Take off what the head reads of the same body without the lump, solid only; by default it is.",
+    help="Remove what the head reads of the same body without the lump, solid only. Default: on.",
 )
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
 @click.option("--scheduler", metavar="ADDR", help="Send the geometries to a dask scheduler (extra [cluster]).")
 @click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 def command(

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     help="How far the lump stands out of the gland.",
 )
 @head_option("Default: shoulders-inside.")
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(*, seat: str, head: str | None, workers: int, as_json: bool) -> None:
-    """Compute Tables 1 and 2 of the paper again, beside the printed figures.
+    """Recompute Tables 1 and 2 of the paper beside the printed figures.
 
     The empirical model (Eqs 1 to 4) is fitted to frames of the elastic plane-strain model and compared with it: on the
     frame centred on the lump, on all frames, and on the map; for ten lumps, and for the four phantoms of section 2.3.

@@ -33,4 +33,4 @@ def _path(module: str) -> str:
 
 @click.group("tradeoff", cls=_Lazy)
 def command() -> None:
-    """Measure what more accuracy costs, here and now, and say what a case does not need."""
+    """Measure what more accuracy costs on this machine, and which of it a case does not need."""

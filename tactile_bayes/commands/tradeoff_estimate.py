@@ -26,20 +26,18 @@ _FILE = FilePath()
     type=FiniteRange(min=0.0, min_open=True),
     default=FIT_RADIUS_MM,
     show_default=True,
-    help="As of `estimate`.",
+    help="Radius of the fit window, mm, as in `estimate`.",
 )
-@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Priors, as for `estimate`.")
+@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Priors, as in `estimate`.")
 @click.option(
     "--tolerance-sd",
     type=FiniteRange(min=0.0, min_open=True),
     default=0.05,
     show_default=True,
-    help="A smaller error of an interval's end is not worth paying for.",
+    help="Error of an interval end below which more accuracy is not worth its cost.",
 )
-@click.option(
-    "--runs", type=click.IntRange(min=1), default=4, show_default=True, help="Runs that figures are means of."
-)
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random numbers.")
+@click.option("--runs", type=click.IntRange(min=1), default=4, show_default=True, help="Number of runs to average.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--force", is_flag=True, help="Overwrite an existing figure.")
 def command(

@@ -26,8 +26,8 @@ LEARNED = "learned"
 @click.option(
     "--size-calibration",
     metavar="solid-mean|plane-strain|learned|SIZE.json",
-    help="For the sizes: one that comes with the program, yours, or Eq 6 learned on the spot; "
-    "if nothing is said, each model's own.",
+    help="Calibration for the sizes: a shipped one, your own file, or Eq 6 learned in this run. Default: each "
+    "model's own.",
 )
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error in size against time.")
 @click.option(
@@ -35,9 +35,11 @@ LEARNED = "learned"
     type=FiniteRange(min=0.0, min_open=True),
     default=0.5,
     show_default=True,
-    help="A smaller error in size is not worth paying for.",
+    help="Error in size below which more accuracy is not worth its cost.",
 )
-@click.option("--runs", type=click.IntRange(min=1), default=1, show_default=True, help="The least time of so many.")
+@click.option(
+    "--runs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of runs; the shortest time counts."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--force", is_flag=True, help="Overwrite an existing figure.")
 def command(

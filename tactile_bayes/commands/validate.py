@@ -19,43 +19,49 @@ _DEFAULTS = TrialSettings()
 @click.command("validate")
 @click.argument("trial", metavar="TRIAL.csv", type=_FILE)
 @click.option("--excision", required=True, metavar="EX.csv", type=_FILE, help="Sizes measured after excision.")
-@click.option("--columns", metavar="MAP.toml", type=_FILE, help="TRIAL.csv is wide: which column holds which reading.")
+@click.option(
+    "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide TRIAL.csv: which column holds which reading."
+)
 @click.option(
     "--intervals",
     type=click.Choice(["corrected", "jackknife", "percentile", "bca"]),
     default=_DEFAULTS.intervals,
     show_default=True,
-    help="Over patients: leave-one-out with Student's t, corrected for rare misses and few influential patients; the "
-    "same uncorrected; or two bootstraps.",
+    help="Interval method, resampling patients. corrected: jackknife with Student's t, corrected for rare "
+    "misses and few influential patients; jackknife: uncorrected; percentile, bca: bootstraps.",
 )
 @click.option(
     "--resamples",
     type=click.IntRange(200, 100_000),
     default=_DEFAULTS.resamples,
     show_default=True,
-    help="Of the bootstraps.",
+    help="Number of bootstrap resamples.",
 )
-@click.option("--seed", type=click.IntRange(0), default=_DEFAULTS.seed, show_default=True, help="Of everything random.")
+@click.option("--seed", type=click.IntRange(0), default=_DEFAULTS.seed, show_default=True, help="Random seed.")
 @click.option(
     "--error-ratio",
     type=FiniteRange(1e-6, 1e6),
     default=_DEFAULTS.error_ratio,
     show_default=True,
-    help="Variance of the ex-vivo error over the modality's, for the Deming lines.",
+    help="Ratio of the ex-vivo error's variance to the modality's, for Deming lines.",
 )
 @click.option(
     "--check-intervals",
     type=click.IntRange(0),
     default=0,
     metavar="TRIALS",
-    help="Simulate so many trials of this size and count how often the intervals hold.",
+    help="Simulate this many trials of this size and report how often the intervals cover.",
 )
-@click.option("--bayes", is_flag=True, help="Errors-in-variables model by MCMC: the error of the next mass.")
+@click.option(
+    "--bayes", is_flag=True, help="Predict the error of the next mass, by an errors-in-variables model and MCMC."
+)
 @click.option("--methods", is_flag=True, help="Also print lines, limits of agreement, repeatability and pairs.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 @click.option("-o", "--output", metavar="REPORT.json", type=_FILE, help="Write the report as JSON to this file.")
 @click.option("--html", metavar="REPORT.html", type=_FILE, help="Write tables and figures as one self-contained page.")
-@click.option("--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis; its hash enters the report.")
+@click.option(
+    "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis; the report records its hash."
+)
 @click.option("--force", is_flag=True, help="Overwrite an existing output.")
 def command(
     trial: Path,

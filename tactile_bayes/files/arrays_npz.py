@@ -1,4 +1,4 @@
-"""Other people's arrays: one .npz with raw counts, poses and calibration becomes a scan.
+"""Import of arrays from other programs: an .npz of raw counts, poses and calibration becomes a scan.
 
 Arrays in mm, kPa and s, read without pickle; `arrays_layout.LAYOUT` says what each is.
 """

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, readable by their owner only; whatever hinders a write is one line."""
+"""Atomic writing of files, readable by their owner only; every failure to write is one error line."""
 
 from __future__ import annotations
 

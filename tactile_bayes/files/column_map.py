@@ -1,4 +1,4 @@
-"""Wide tables, one patient or mass a row, as exports of REDCap and spreadsheets have them: read by a mapping in TOML.
+"""Wide trial tables (one row per patient or mass, as REDCap exports them), read by a column mapping in TOML.
 
 The mapping says which column holds what; nothing is guessed. A blank cell is `not_done` unless the mapping gives the
 word that the table writes for a mass that was looked for and not found.

@@ -1,4 +1,4 @@
-"""JSON and TOML from files: of limited size and depth, with finite numbers and whole characters only, and no NUL."""
+"""Safe reading of JSON and TOML: limited size and depth, finite numbers, no NUL or surrogates."""
 
 from __future__ import annotations
 

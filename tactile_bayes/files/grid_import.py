@@ -1,4 +1,4 @@
-"""A grid or an image straight to a map: for other people's maps and for pictures of a Gaussian.
+"""Import of a grid or an image as a map.
 
 Orientation: arrays keep their order. Column 0 is the lowest x and row 0 the lowest y, so y runs down an image, whose
 row 0 is its top; a lump's angle is positive from x towards y, clockwise on the image. Pictures of such a map show it as

@@ -1,4 +1,4 @@
-"""A look at the text heaps of an HDF5 file before the library sees it: one kind of damage makes it loop without end."""
+"""Check of an HDF5 file's text heaps before the library opens it: one kind of damage makes it loop forever."""
 
 from __future__ import annotations
 

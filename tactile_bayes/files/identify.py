@@ -1,4 +1,4 @@
-"""Tell which of our files a path is, from its bytes, and describe it."""
+"""Identification and description of the program's files, by their first bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tell what a file holds from its first bytes, so that a reader given the wrong one can name the command to run."""
+"""Kind of a file from its first bytes, so that a reader given the wrong one names the command to run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unpacking the chunks of an MCAP file: never more than one declares, and never more in all than the file's limit."""
+"""Decompression of MCAP chunks within the declared and the total size limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All records of an MCAP file, finished or not: every intact chunk is kept and every loss is told."""
+"""All records of an MCAP file, finished or not: intact chunks are kept and losses reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What made a file: program version, settings, seed and the hashes of its inputs; never a clock time."""
+"""Provenance of a file: program version, settings, seed and hashes of its inputs, without clock times."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Forward models: what a scene of lumps shows to the scan head."""
+"""Forward models: from a scene of lumps to what the scan head measures."""

@@ -1,4 +1,4 @@
-"""The breast as a body: fat over gland over a rigid chest wall, with one circular lump at or above their boundary."""
+"""The layered breast model: fat over gland over a rigid chest wall, with a circular lump at or above their boundary."""
 
 from __future__ import annotations
 

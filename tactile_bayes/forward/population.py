@@ -1,4 +1,4 @@
-"""Scans of bodies that differ as people and examiners do: what a size calibration is learned over."""
+"""Simulated exams that vary as bodies and examiners do: the training set of a size calibration."""
 
 from __future__ import annotations
 

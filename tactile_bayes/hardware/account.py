@@ -1,4 +1,4 @@
-"""The account of a recording: what came, what was lost, and what speaks against using it."""
+"""Summary of a recording: what arrived, what was lost, and what makes it unfit for use."""
 
 from __future__ import annotations
 

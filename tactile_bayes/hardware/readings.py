@@ -1,4 +1,4 @@
-"""What devices say, whatever their protocol: frames, poses, who they are and when they stop."""
+"""Protocol-independent device readings: frames, poses, identity and end of transmission."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Take what devices send and hand it to a writer, losing nothing and saying what was lost on the way."""
+"""Recorder: hands what devices send to a writer without loss, and reports what was lost on the way."""
 
 from __future__ import annotations
 

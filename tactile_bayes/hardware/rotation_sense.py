@@ -1,4 +1,4 @@
-"""Whether a tracker gives the rotation from sensor to base or its inverse: turning it about a fixed point tells."""
+"""Test of a tracker's rotation convention (sensor to base, or inverse) by turning it about a fixed point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Why there is no number, in a word that programs can read, and what would change that."""
+"""Reasons why a map gives no number, as codes and sentences, with what would help."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The two verbs of a noise model, to assess a place on a map and to draw from it, and the choice between the models."""
+"""Noise models behind one interface: assess a place on a map, then draw from its posterior."""
 
 from __future__ import annotations
 

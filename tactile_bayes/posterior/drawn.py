@@ -1,4 +1,4 @@
-"""Draws of one map and its size, drawn again more finely until the size's interval is as exact as asked for."""
+"""Posterior draws of a map and its size, refined until the size interval is as exact as requested."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a map is fitted and estimated: one record, checked once, used by every step."""
+"""Options of fits and estimates, validated once and used by every step."""
 
 from __future__ import annotations
 

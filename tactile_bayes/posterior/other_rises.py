@@ -1,4 +1,4 @@
-"""Rises of a map other than the lump that was measured: where they stand, and how likely each is a lump."""
+"""Other lumps on the map: where they are, and how probable each is."""
 
 from __future__ import annotations
 

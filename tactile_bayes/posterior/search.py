@@ -1,4 +1,4 @@
-"""Where the lump is: the places a map offers, highest first, each fitted, weighed and doubted."""
+"""Search for the lump: candidate places, highest first, each fitted and assessed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much an answer leans on the prior of the widths: the draws weighed anew under a prior twice as wide."""
+"""Prior sensitivity: the draws reweighted under a width prior twice as wide."""
 
 from __future__ import annotations
 

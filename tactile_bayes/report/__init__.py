@@ -1,1 +1,1 @@
-"""Text and figures for people."""
+"""Reports for people: text, tables and figures."""

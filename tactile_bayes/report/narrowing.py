@@ -1,4 +1,4 @@
-"""What makes a size interval wide and what would narrow it, and how the 12 lines of a short report are kept short."""
+"""Sources of a size interval's width, remedies, and the pieces of short reports."""
 
 from __future__ import annotations
 

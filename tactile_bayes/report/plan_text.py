@@ -1,4 +1,4 @@
-"""A plan as text for people: one line a design, then what further maps bring."""
+"""A trial plan as text: one line per design, then the benefit of further maps."""
 
 from __future__ import annotations
 

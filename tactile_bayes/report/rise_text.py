@@ -1,4 +1,4 @@
-"""Other rises of a map than the lump that was measured, in sentences."""
+"""Sentences about other rises of a map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a window holds and what was asked about it, in sentences and as plain data."""
+"""Sentences and plain data about the scene in the fit window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sentences about a size that reports of one map and of several share."""
+"""Sentences about a size, shared by the reports of one map and of several."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`tradeoff estimate` in print, as plain data, and as a picture."""
+"""Report of `tradeoff estimate`: text, plain data and figure."""
 
 from __future__ import annotations
 

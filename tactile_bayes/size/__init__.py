@@ -1,1 +1,1 @@
-"""From amplitude and widths of a map to the size of a lump in mm."""
+"""Size calibrations: from a map's amplitude and widths to a lump's size in mm."""

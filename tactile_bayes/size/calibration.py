@@ -1,4 +1,4 @@
-"""The two forms of a size calibration, and the one step in which they differ: from map draws to sizes.
+"""The two forms of a size calibration, and the step in which they differ: from map draws to sizes.
 
 Both forms have `at_fat`, `fitting`, `outside`, `too_far` and `omissions`; whoever uses a calibration needs no other.
 """

@@ -1,4 +1,4 @@
-"""How far amplitude and width of a map lie outside the table that a size calibration was learned from.
+"""Distance of a map's amplitude and width from the range that a size calibration was learned on.
 
 Bodies simulated beyond the ranges of the table decide what follows (docs/decisions/0069): not far outside, intervals
 hold and the size is given with a caution; farther out nothing is known of them, and there is no size.

@@ -1,4 +1,4 @@
-"""Is the lump round? A ball's map is oval under an oblong head; only what exceeds that speaks of an oval lump."""
+"""Elongation of the lump: a ball's map is oval under an oblong head, and only what exceeds that is evidence."""
 
 from __future__ import annotations
 

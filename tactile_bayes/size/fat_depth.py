@@ -1,4 +1,4 @@
-r"""A size calibration that knows how deep the fat under the head is, because the head's own pressure tells.
+r"""A size calibration conditional on the depth of fat, which the pressure profile over the head gives.
 
 Amplitude and width alone leave the lump's seat open: how far it stands out of the gland. Where no lump lies, the
 pressure over the head depends on the depth F of the fat-gland boundary, so the profile tells F. ln d is then a full

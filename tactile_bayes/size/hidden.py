@@ -1,4 +1,4 @@
-"""What a size calibration says of bodies besides the size: how oval a ball's map is, and what no map shows."""
+"""Properties of the body in a size calibration: the shape of a ball's map, and what no map shows."""
 
 from __future__ import annotations
 

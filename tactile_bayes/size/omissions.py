@@ -1,4 +1,4 @@
-"""What a size does not contain, in words."""
+"""Descriptions of what a size leaves out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What accuracy costs on one map: every method and setting against a long reference of the same posterior."""
+"""Cost of accuracy on one map: every method and setting against a long reference of the same posterior."""
 
 from __future__ import annotations
 

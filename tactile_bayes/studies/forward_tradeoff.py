@@ -1,4 +1,4 @@
-"""What a forward model costs and how far off it is, setting by setting, for one lump: measured here and now.
+"""Cost and error of each forward model and setting for one lump, measured on this machine.
 
 The same lump is mapped by the empirical model, by the plane-strain one at several cells, and by the solid one at
 several meshes, ranks and rims. Each model's finest setting is the reference of its others.

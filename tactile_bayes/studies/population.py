@@ -1,4 +1,4 @@
-"""What a patient's path measures on simulated scans of known lumps: the rows a size calibration is learned from."""
+"""Measurements of simulated exams of known lumps: the rows that a size calibration is learned from."""
 
 from __future__ import annotations
 

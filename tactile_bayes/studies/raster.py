@@ -1,4 +1,4 @@
-"""The map of a study's raster of frames, built and fitted with what a patient's map is built and fitted with."""
+"""The map of a study's raster of frames, built and fitted as a patient's map is."""
 
 from __future__ import annotations
 

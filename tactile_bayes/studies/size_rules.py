@@ -1,4 +1,4 @@
-"""From the Gaussian of one map to one size, without uncertainty, by either form of the size calibration."""
+"""Point estimates of size from one map's Gaussian, by either form of the size calibration."""
 
 from __future__ import annotations
 

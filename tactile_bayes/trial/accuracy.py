@@ -1,4 +1,4 @@
-"""How far sizes lie from excision: percent and mm errors, and the bias."""
+"""Accuracy against excision: percent and mm errors, and bias."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intervals by drawing patients anew, all masses of a patient together: percentile and BCa."""
+"""Bootstrap intervals over patients (percentile and BCa), keeping a patient's masses together."""
 
 from __future__ import annotations
 

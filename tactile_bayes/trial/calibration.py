@@ -1,4 +1,4 @@
-"""Whether stated uncertainties are honest: probability integral transforms, scores, and what would mend them.
+"""Calibration of stated uncertainties: probability integral transforms, scores, and the correction they imply.
 
 A stated uncertainty becomes a predictive distribution of the size that the caliper will read: normal on the logarithm
 of size, through the stated interval (or mean and SD), widened in quadrature by the caliper's own error.

@@ -1,4 +1,4 @@
-"""What a reader must know of a modality's intervals before trusting them, said where the data meet the condition."""
+"""Cautions about a modality's intervals, given where the data meet their condition."""
 
 from __future__ import annotations
 

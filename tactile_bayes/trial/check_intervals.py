@@ -1,4 +1,4 @@
-"""How often the chosen intervals hold the true error, in simulated trials of this trial's own size and errors."""
+"""Coverage of the chosen intervals, in simulated trials of this trial's size and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One modality's error over another's."""
+"""Ratio of one modality's error to another's."""
 
 from __future__ import annotations
 

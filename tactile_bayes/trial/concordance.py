@@ -1,4 +1,4 @@
-"""Lin's concordance: how near pairs lie to the line of identity, and what keeps them from it."""
+"""Lin's concordance correlation: precision and accuracy about the line of identity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How often stated intervals hold the size found after excision."""
+"""Coverage of stated intervals against the size after excision."""
 
 from __future__ import annotations
 

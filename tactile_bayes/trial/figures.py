@@ -1,4 +1,4 @@
-"""A figure of a trial: a number, its interval, and the reason wherever one of the two is not there."""
+"""A figure of a trial: a number, its interval, and the reason where one of them is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intervals by leaving out one patient at a time: masses of one patient go together."""
+"""Jackknife intervals over patients, keeping a patient's masses together."""
 
 from __future__ import annotations
 

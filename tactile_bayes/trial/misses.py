@@ -1,4 +1,4 @@
-"""Figures that count a mass not found as size 0, with intervals that allow for misses that this trial did not see.
+"""Figures that count a missed mass as size 0, with intervals that allow for misses not yet seen.
 
 Where one mass in 25 is missed, a trial of 25 has none, one or two misses, and each moves the mean error by some 3
 points. Leaving out or redrawing patients sees only the misses that occurred: without any, the interval allows for none.

@@ -1,4 +1,4 @@
-r"""What the next mass may bring: a Bayesian model of each modality's errors, with error in the ex-vivo sizes too.
+r"""Prediction for the next mass: a Bayesian model of each modality's errors, with error in the ex-vivo sizes.
 
 For mass i of patient g with true log size :math:`\xi_i`, centred at the mean of the trial,
 

@@ -1,4 +1,4 @@
-"""The angles of the lines through all pairs of points, in order: by listing them, or by counting when they are many."""
+"""Angles of the lines through all pairs of points, in order: listed, or counted when there are many."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two modalities on the masses that both looked for: difference and ratio of errors, and a test without assumptions."""
+"""Paired comparison of two modalities: difference and ratio of errors, and a permutation test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trial before it is run: power, widths of intervals and the worth of more maps a mass, by simulation."""
+"""Trial planning by simulation: power, widths of intervals and the value of more maps per mass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Doubts about the units of a trial: sizes that no lump has, and modalities that differ from excision by a unit."""
+"""Plausibility of a trial's units: sizes no lump has, and modalities that differ from excision by a factor of 10."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Repeatability on the scale of ratios, and where the scatter of sizes comes from: masses, readers or maps."""
+"""Repeatability as a ratio, and the sources of the scatter of sizes: masses, readers or maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far replicates of one mass lie from one another."""
+"""Spread of replicates of one mass."""
 
 from __future__ import annotations
 

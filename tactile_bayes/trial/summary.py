@@ -1,4 +1,4 @@
-"""Everything a trial says about its modalities, in one call."""
+"""All statistics of a trial in one call."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Statistics that depend on the masses only through sums, so that leaving out or redrawing patients costs nothing."""
+"""Statistics that depend on masses only through sums, so that resampling patients is cheap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trial in the shape of the paper's, with nobody in it: for the demo, the tutorial and the tests.
+"""A synthetic trial in the shape of the paper's, for the demo, the tutorial and the tests.
 
 The package ships ``trial_csv()`` and ``excision_csv()`` as ``demo/trial.csv`` and ``demo/excision.csv``; to make
 them anew, write the two texts to those files. Every row says that it is synthetic.

@@ -1,4 +1,4 @@
-r"""What a lump changes in the response of the skin: the body condensed onto its surface and onto the lump's boundary.
+r"""How a lump changes the skin's response: static condensation onto the surface and the lump's boundary.
 
 The skin of the layered body without a lump answers exactly (`layers.surface_compliance`). The lump adds a matrix
 of low rank. With H the compliance of the body *with a hole* on the hole's boundary (and from there to the skin), and

@@ -1,1 +1,1 @@
-"""A bump, and what may stand beside it, under spatially correlated errors."""
+"""Posterior of a bump, and of neighbouring structures, under spatially correlated errors."""

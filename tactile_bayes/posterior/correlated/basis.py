@@ -1,4 +1,4 @@
-r"""Inner products of many bumps at once, from those of a few that span them.
+r"""Inner products of many bumps from those of a few that span them.
 
 Points about one mode have nearly the same bump. Along each axis their profiles are sums of about ten, told by a
 singular value decomposition of the points' own, and every bump is a sum of products of two. What a posterior needs of a

@@ -1,4 +1,4 @@
-"""Draws of a scene by the method asked for, or by the next one where that cannot be trusted."""
+"""Posterior draws of a scene by the chosen method, or by the next one if its diagnostics fail."""
 
 from __future__ import annotations
 

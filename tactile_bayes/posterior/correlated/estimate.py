@@ -1,4 +1,4 @@
-"""A bump under correlated errors, from its least-squares fit to detection, scene and draws."""
+"""A bump under correlated errors: detection, scene and draws from its least-squares fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is linear in a map given the places and widths, solved at once for many shapes and noise fields."""
+"""Conditional solutions for the linear parameters (amplitudes, level, tilt), batched over shapes and noise fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Posterior of a scene's place and shape with all the rest integrated out: amplitudes, level, tilt, noise.
+r"""Marginal posterior of a scene's centre and shape, with amplitudes, level, tilt and noise integrated out.
 
 For one noise field h (length and share) the map is linear in level, tilt and amplitudes given the places and widths.
 With flat priors on level and tilt, a normal one of variance s^2 on each of v amplitudes and the Jeffreys prior on the

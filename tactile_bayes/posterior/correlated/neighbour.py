@@ -1,4 +1,4 @@
-"""What lies beside the bump: a second lump or the edge of a rib, looked for within and just beyond the window."""
+"""Structures beside the bump: a second lump or the edge of a rib, in or just beyond the window."""
 
 from __future__ import annotations
 

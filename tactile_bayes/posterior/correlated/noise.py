@@ -1,4 +1,4 @@
-r"""Correlated errors of a map: a Gaussian field of few cosines plus independent errors, whitened once for many fits.
+r"""Correlated noise model: a Gaussian random field on a cosine basis plus white noise, whitened once for many fits.
 
 The error of cell i is :math:`\tau\,(\epsilon_i + \sqrt{\rho}\, f(x_i))` with independent
 :math:`\epsilon_i \sim N(0, D_i)` and a field f of unit variance and exponential correlation (Matern 1/2) of length l.

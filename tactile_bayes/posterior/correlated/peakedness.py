@@ -1,4 +1,4 @@
-r"""A bump that is flatter or sharper than a Gaussian: one more column where the map asks for it.
+r"""Non-Gaussian lumps: an extra regressor for the profile's exponent, used when the Bayes factor exceeds 3.
 
 The column is how :math:`\exp(-h^e)` with :math:`h = u^2/2`, u in widths, changes with its exponent e at the Gaussian's
 1: :math:`-h \ln h\, e^{-h}`. What it has in common with a change of amplitude, widths, centre, level and tilt is taken

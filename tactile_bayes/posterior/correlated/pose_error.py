@@ -1,4 +1,4 @@
-r"""What errors of the frames' places add to the spread of a bump's shape.
+r"""Contribution of tracker position error to the posterior of a bump's shape.
 
 A frame that is off by :math:`\delta` maps the bump shifted by it, so a cell's error is :math:`-\nabla g \cdot
 \bar\delta`, the mean over the frames that felt the cell. Cells less than the array's side apart share frames:

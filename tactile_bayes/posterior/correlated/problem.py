@@ -1,4 +1,4 @@
-"""What every scene of one fit window has in common."""
+"""The fit problem that all scenes of one window share: cells, prior and bounds."""
 
 from __future__ import annotations
 

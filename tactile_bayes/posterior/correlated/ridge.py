@@ -1,4 +1,4 @@
-"""Is it a lump, or a ridge such as a rib makes? Asked where the map rises along a line."""
+"""Lump or ridge: the evidence for a lump against a rib-like ridge, where the map rises along a line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a window may hold: a bump, round or not, turned or not, and beside it a second lump or the edge of a rib.
+"""Scenes: the structures that a fit window may hold, with their parameters and prior.
 
 Or a ridge in the bump's place: what a lump's evidence is held against where a ridge is to be feared.
 """

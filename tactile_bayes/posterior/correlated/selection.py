@@ -1,4 +1,4 @@
-"""The simplest scene that a window supports, by evidence under correlated errors, and what was left out of it."""
+"""Model selection: the simplest scene that a window's evidence supports, and what it leaves out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether what a window's rim hints at stands out on the map around it."""
+"""Check of a structure at the window's rim against the map around it."""
 
 from __future__ import annotations
 

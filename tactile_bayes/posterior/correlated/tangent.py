@@ -1,4 +1,4 @@
-"""How a window's cells change with everything a fitted scene leaves free: what an error or a misfit can look like."""
+"""Derivatives of a window's cells by everything that a fitted scene leaves free."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""A window's cells as a grid, and inner products of many bumps with a few fixed vectors and a field's cosines on it.
+r"""The fit window as a regular grid, with fast separable inner products of Gaussian templates and the noise basis.
 
 A Gaussian along the grid's axes is a product of two profiles, and so are the cosines: an inner product costs the work
 of the grid's rows, not of its cells times the cosines. Cells that the map does not cover have weight 0.

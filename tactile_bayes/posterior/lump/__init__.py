@@ -1,1 +1,1 @@
-"""The Gaussian bump and the cells that it is fitted to, whatever the noise model."""
+"""The Gaussian bump and the cells that it is fitted to, for every noise model."""

@@ -1,4 +1,4 @@
-"""The joint draws that every method and noise model ends in."""
+"""Joint posterior draws, the result of every method and noise model."""
 
 from __future__ import annotations
 

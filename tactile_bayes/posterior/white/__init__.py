@@ -1,1 +1,1 @@
-"""A bump under independent errors."""
+"""Posterior of a bump under independent errors."""

@@ -1,4 +1,4 @@
-"""Is there a lump? The evidence for a bump against correlated noise alone, over the whole map."""
+"""Detection of a lump: evidence for a bump against noise alone, over the whole map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a map to one fitted bump: choose the candidate, place the window, weigh the cells, judge the errors."""
+"""Least-squares fit of a bump: candidate, window, weights, error model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the residuals of a fit say about the errors of a map: their size, how counts weigh, how far they correlate."""
+"""Error model from a fit's residuals: variance, weights by count, and correlation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log density every method works on: a least-squares model with its noise scale integrated out."""
+"""Log posterior density of a least-squares model, with the noise scale integrated out."""
 
 from __future__ import annotations
 

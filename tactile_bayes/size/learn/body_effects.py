@@ -1,4 +1,4 @@
-r"""What seat, soft lumps, thickness and head do to the size by Eq 6, from a study in which they vary.
+r"""Effect of seat, soft lumps, thickness and head on Eq 6's size, from a study in which they vary.
 
 To first order about Eq 6 as it is learned, :math:`\theta`, with residuals :math:`r_i` of ln d,
 

@@ -1,4 +1,4 @@
-"""How well a form of the size calibration does on geometries of a study that it was not learned from."""
+"""Cross-validation of a size calibration's form over the geometries of a study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learn the calibration for maps that tell how deep the fat under the head is, see `fat_depth`."""
+"""Learning of the fat-depth calibration, see `size.fat_depth`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learn the log-quadratic calibration from maps of a population of bodies, see `regression`."""
+"""Learning of the log-quadratic calibration from maps of a population of bodies, see `regression`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""How ln d depends on what the maps of a population show, when each body was examined one or more times.
+r"""Regression of ln d on features of a population's maps, with repeated exams per body.
 
 For the means over the exams of body j, with what the maps themselves leave open (m, from their posteriors) known,
 
