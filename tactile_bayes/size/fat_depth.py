@@ -129,10 +129,7 @@ class FatCubic:
 
         None where they agree to three SDs of a difference between two exams, or where fewer than two tell a depth.
         """
-        known = np.array([one for one in profiles if one is not None], dtype=np.float64).reshape(
-            -1, len(self.depth.centre)
-        )
-        log_depth = self.depth.log_depth(known[self.depth.unlike(known) <= MOST_LEVERAGE])
+        log_depth = self._log_depths(profiles)
         if len(log_depth) < 2 or np.ptp(log_depth) <= 3.0 * np.sqrt(2.0) * self.depth.log_sd:
             return None
         return float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))
@@ -142,20 +139,22 @@ class FatCubic:
 
         Profiles unlike the table's are left out; those of one mass are averaged, for its exams share the body.
         """
-        known = np.array([one for one in profiles if one is not None], dtype=np.float64)
-        if not len(known):
+        if all(one is None for one in profiles):
             return None, "the map has no pressure profile of the head"
-        like = self.depth.unlike(known) <= MOST_LEVERAGE
-        if not like.any():
+        like = self._log_depths(profiles)
+        if not len(like):
             return None, "the head's pressure profile is unlike any of the calibration's"
-        log_depth = float(self.depth.log_depth(known[like]).mean())
-        low, high = self.fat_mm
-        if not low <= np.exp(log_depth) <= high:
-            return (
-                None,
-                f"the fat under the head is {np.exp(log_depth):.3g} mm deep (table: {low:.3g} to {high:.3g} mm)",
-            )
+        log_depth = float(like.mean())
+        (low, high), fat_mm = self.fat_mm, np.exp(log_depth)
+        if not low <= fat_mm <= high:
+            return None, f"the fat under the head is {fat_mm:.3g} mm deep (table: {low:.3g} to {high:.3g} mm)"
         return log_depth, ""
+
+    def _log_depths(self, profiles: Sequence[tuple[float, ...] | None]) -> FloatArray:
+        """(n,) ln F of the profiles that are like the table's."""
+        known = np.array([one for one in profiles if one is not None], dtype=np.float64)
+        known = known.reshape(-1, len(self.depth.centre))
+        return self.depth.log_depth(known[self.depth.unlike(known) <= MOST_LEVERAGE])
 
     def contraction(self, log_depth: float) -> FloatArray:
         """(10, 20) matrix: what the coefficients come to at one depth, in the order of `polynomials.powers`."""
