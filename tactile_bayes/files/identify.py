@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, parse_json
+from tactile_bayes.files.kinds import HDF5_MAGIC, MCAP_MAGIC
 from tactile_bayes.files.reading import open_input
 
 if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
     from tactile_bayes.mapping.tactile_map import TactileMap
 
-_MCAP = b"\x89MCAP0\r\n"
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 _TABLES = ("trial.table.json", "excision.table.json", "size_table.table.json")
 
 
@@ -35,9 +34,9 @@ def describe(path: Path) -> dict[str, Any]:
     """
     with open_input(path) as file:
         head = file.read(4096)
-    if head.startswith(_MCAP):
+    if head.startswith(MCAP_MAGIC):
         return _scan(path)
-    if head.startswith(_HDF5):
+    if head.startswith(HDF5_MAGIC):
         return _netcdf(path)
     if head.lstrip().startswith((b"{", b"[")):
         return _json(path)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Final
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.reading import open_input
 
+MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
+HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
+ZIP_MAGIC: Final = b"PK\x03\x04"
 _BEGINNINGS = {
-    b"\x89MCAP0\r\n": "a scan",
-    b"\x89HDF\r\n\x1a\n": "a map or posterior (netCDF)",
-    b"PK\x03\x04": "an archive (.npz or a spreadsheet)",
+    MCAP_MAGIC: "a scan",
+    HDF5_MAGIC: "a map or posterior (netCDF)",
+    ZIP_MAGIC: "an archive (.npz or a spreadsheet)",
     b"\x89PNG": "an image",
     b"II*\x00": "an image",
     b"MM\x00*": "an image",

@@ -19,11 +19,10 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.kinds import not_a
+from tactile_bayes.files.kinds import MCAP_MAGIC, not_a
 from tactile_bayes.files.mcap_chunks import Unpacker, damage
 from tactile_bayes.files.reading import open_input, unreadable
 
-_MAGIC: Final = b"\x89MCAP0\r\n"
 _RECORD: Final = struct.Struct("<BQ")  # opcode, length
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHECKSUM: Final = struct.Struct("<I")
@@ -176,7 +175,7 @@ def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapReco
         try:
             _check_magic(stream, path)
             size = stream.seek(0, io.SEEK_END)
-            stream.seek(len(_MAGIC))
+            stream.seek(len(MCAP_MAGIC))
             _collect(records, stream, size=size)
         except OSError as error:
             raise unreadable(path, error) from None
@@ -186,10 +185,10 @@ def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapReco
 
 
 def _check_magic(stream: IO[bytes], path: Path) -> None:
-    start = stream.read(len(_MAGIC))
-    if start == _MAGIC:
+    start = stream.read(len(MCAP_MAGIC))
+    if start == MCAP_MAGIC:
         return
-    if _MAGIC.startswith(start):
+    if MCAP_MAGIC.startswith(start):
         what = "is empty" if not start else f"is cut off in its header ({len(start)} bytes)"
     else:
         what = f"is not an MCAP file (it starts with {start!r})"
@@ -199,7 +198,7 @@ def _check_magic(stream: IO[bytes], path: Path) -> None:
 def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
     """Fill `records` up to the end of the file or the first record that cannot be read."""
     unpacker = Unpacker(size)
-    checksum = zlib.crc32(_MAGIC)
+    checksum = zlib.crc32(MCAP_MAGIC)
     while True:
         start = stream.tell()
         head = stream.read(_RECORD.size)
@@ -214,7 +213,7 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
         if opcode == Opcode.DATA_END:
             _end_data(records, body, checksum)
         if opcode == Opcode.FOOTER:
-            records.finished = stream.read(len(_MAGIC)) == _MAGIC
+            records.finished = stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
             if not records.finished:
                 _tell_cut(records, size=size)
             return

@@ -17,7 +17,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.hdf5_heaps import check_heaps
-from tactile_bayes.files.kinds import not_a
+from tactile_bayes.files.kinds import HDF5_MAGIC, not_a
 from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, open_input, unpacked_limit
 from tactile_bayes.records import dataclass
 
@@ -26,7 +26,6 @@ _PACKING: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True
 _DEFLATE, _SHUFFLE, _CHECKSUM = 1, 2, 3  # HDF5's numbers of the filters above
 _CHECKSUM_BYTES: Final = 4
 _DAMAGED: Final = "not a readable netCDF file"
-_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +274,7 @@ def open_netcdf(path: Path, *, way_out: str) -> Iterator[Group]:
 
     try:
         with open_input(path) as stream, decoding(_DAMAGED, way_out=way_out):
-            if stream.read(len(_MAGIC)) != _MAGIC:
+            if stream.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                 raise not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
             check_limit(stream.seek(0, io.SEEK_END), NETCDF_BYTES, what="it has {} bytes")
             stream.seek(0)

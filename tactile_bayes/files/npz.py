@@ -12,6 +12,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.kinds import ZIP_MAGIC
 from tactile_bayes.files.reading import check_limit, decoding, open_input, unpacked_limit
 
 Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
@@ -58,9 +59,9 @@ def _check_zip(stream: IO[bytes]) -> None:
     start = stream.read(6)
     if zipfile.is_zipfile(stream):
         return
-    if start.startswith(b"PK"):
+    if start.startswith(ZIP_MAGIC[:2]):
         raise BadDataError("is a zip archive that is cut off (no directory at its end)", way_out="copy it again")
-    if start == b"\x93NUMPY":
+    if start == np.lib.format.MAGIC_PREFIX:
         raise BadDataError("is a single .npy array", way_out="save all arrays in one file with numpy.savez_compressed")
     raise BadDataError(f"is not an .npz file (it starts with {start!r})", way_out="save it with numpy.savez_compressed")
 

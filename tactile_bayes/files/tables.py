@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.kinds import ZIP_MAGIC
 from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
 from tactile_bayes.files.schema import load_schema
 
@@ -33,7 +34,7 @@ _EXPORT = "export the sheet as CSV UTF-8, comma-separated"
 # First bytes of files that are no UTF-8 text, what they are, and the way out.
 _NOT_TEXT = (
     (_BYTE_ORDER_MARKS, "is UTF-16 text", _AS_UTF8),
-    ((b"PK\x03\x04",), "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
+    ((ZIP_MAGIC,), "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
     ((b"\xd0\xcf\x11\xe0",), "is an old Office file (xls), not CSV", _EXPORT),
     ((b"\x1f\x8b",), "is compressed with gzip", "decompress it first"),
 )
