@@ -12,26 +12,11 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL
+from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL, Shape, in_words
 from tactile_bayes.files.npz import Arrays, load_npz
 from tactile_bayes.geometry import check_rigid
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
-# Letters are lengths that must agree between arrays.
-_SHAPES: Final[Mapping[str, tuple[str | int, ...]]] = {
-    "counts": ("n", "rows", "columns"),
-    "frame_time_s": ("n",),
-    "position_mm": ("m", 3),
-    "quaternion_wxyz": ("m", 4),
-    "pose_time_s": ("m",),
-    "gain_kpa_per_count": ("rows", "columns"),
-    "offset_kpa": ("rows", "columns"),
-    "pitch_mm": (),
-    "array_from_tracker": (4, 4),
-    "head_surface_mm": ("rows", "columns", 3),
-    "landmarks_mm": (2, 3),
-    "saturation_count": (),
-}
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12
 
@@ -45,8 +30,8 @@ def read_arrays(path: Path) -> Scan:
         Naming the file, the array, its value and the way out.
     """
     try:
-        required = [name for name in _SHAPES if name not in OPTIONAL]
-        shapes = {name: shape for name, (shape, _) in LAYOUT.items()}
+        required = [name for name in LAYOUT if name not in OPTIONAL]
+        shapes = {name: in_words(shape) for name, (shape, _) in LAYOUT.items()}
         arrays = load_npz(path, required=required, optional=OPTIONAL, shapes=shapes)
         _check_shapes(arrays)
         _check_numbers(arrays)
@@ -59,7 +44,7 @@ def read_arrays(path: Path) -> Scan:
 def _check_shapes(arrays: Arrays) -> None:
     lengths: dict[str, tuple[int, str]] = {}  # letter -> length, and the array that set it
     for name, array in arrays.items():
-        want = _SHAPES[name]
+        want, _ = LAYOUT[name]
         fits = array.ndim == len(want)
         for letter, have in zip(want, array.shape, strict=False):
             length = letter if isinstance(letter, int) else lengths.setdefault(letter, (have, name))[0]
@@ -70,7 +55,7 @@ def _check_shapes(arrays: Arrays) -> None:
             raise BadDataError(f"{name} is empty (shape {array.shape})", way_out="give at least one frame and one pose")
 
 
-def _spoken(want: tuple[str | int, ...], lengths: Mapping[str, tuple[int, str]]) -> str:
+def _spoken(want: Shape, lengths: Mapping[str, tuple[int, str]]) -> str:
     letters = [item for item in want if isinstance(item, str) and item in lengths]
     known = [f"{letter} = {lengths[letter][0]} as in {lengths[letter][1]}" for letter in letters]
     shape = "(" + ", ".join(map(str, want)) + ("," if len(want) == 1 else "") + ")"

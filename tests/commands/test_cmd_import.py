@@ -15,8 +15,7 @@ from in_process import run_here
 
 import tactile_bayes
 from tactile_bayes.commands.import_ import command
-from tactile_bayes.files.arrays_layout import LAYOUT
-from tactile_bayes.files.arrays_npz import _SHAPES
+from tactile_bayes.files.arrays_layout import LAYOUT, in_words
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 
@@ -127,10 +126,10 @@ def test_a_grid_in_npz_becomes_a_map_where_the_output_says_so(run_cli: Run, tmp_
 
 def test_the_help_has_the_layout_that_the_reader_checks() -> None:
     said = command.help or ""
-    assert set(LAYOUT) == set(_SHAPES)
-    for name, shape in _SHAPES.items():
-        assert LAYOUT[name][0] == (", ".join(map(str, shape)) or "one number")
-        assert f"- {name} ({LAYOUT[name][0]}" in said
+    for name, (shape, _) in LAYOUT.items():
+        assert f"- {name} ({in_words(shape)}" in said
+    for line in ("- head_surface_mm (rows, columns, 3): ", "- pitch_mm (one number): ", "- frame_time_s (n): "):
+        assert line in said
 
 
 @pytest.mark.parametrize("name", ["import", "simulate"])
