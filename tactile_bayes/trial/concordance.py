@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.trial.jackknife import UndefinedError
+from tactile_bayes.trial.lines import all_equal
 from tactile_bayes.trial.readings import FloatArray
 
 
@@ -53,7 +54,7 @@ def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Co
         When x or y does not vary.
     """
     n = len(x)
-    if n < 2 or np.ptp(x) <= 1e-12 * np.abs(x).max() or np.ptp(y) <= 1e-12 * np.abs(y).max():
+    if n < 2 or all_equal(x) or all_equal(y):
         raise UndefinedError("concordance needs sizes and ex-vivo sizes that vary")
     sx2, sy2 = float(np.var(x)), float(np.var(y))
     sxy = float(np.mean((x - x.mean()) * (y - y.mean())))

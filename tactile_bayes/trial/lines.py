@@ -17,7 +17,7 @@ from tactile_bayes.trial.readings import FloatArray
 
 MAX_ITERATIONS = 30
 THRESHOLD = 1e-6
-# Differences below this share of the numbers themselves are rounding.
+# Differences below this share of the numbers themselves are rounding, as between averages of equal replicates.
 EQUAL = 1e-12
 
 
@@ -171,6 +171,17 @@ def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
     return (d + root) / (2 * error_ratio * p)
 
 
+def all_equal(values: FloatArray) -> bool:
+    """Whether (n,) values, at least one, differ by no more than rounding."""
+    return bool(np.ptp(values) <= EQUAL * np.abs(values).max())
+
+
+def centred(values: FloatArray, mean: float) -> FloatArray:
+    """(n,) values about their mean, or zeros where they differ by rounding only."""
+    off = values - mean
+    return np.zeros_like(off) if all_equal(values) else off
+
+
 def student(freedom: float, *, confidence: float) -> float:
     """Quantile of Student's t for a two-sided interval."""
     from scipy.special import stdtrit
@@ -192,15 +203,8 @@ def _moments(x: FloatArray, y: FloatArray, w: FloatArray) -> tuple[float, float,
     """Weighted means of x and y, and sums of squares and products about them."""
     total = w.sum()
     mean_x, mean_y = float(w @ x / total), float(w @ y / total)
-    dx, dy = _without_rounding(x - mean_x, x), _without_rounding(y - mean_y, y)
+    dx, dy = centred(x, mean_x), centred(y, mean_y)
     return mean_x, mean_y, float(w @ dx**2), float(w @ dy**2), float(w @ (dx * dy))
-
-
-def _without_rounding(differences: FloatArray, values: FloatArray) -> FloatArray:
-    """The differences, or zeros where all of them are rounding."""
-    if np.ptp(values) <= EQUAL * np.abs(values).max():
-        return np.zeros_like(differences)
-    return differences
 
 
 def _need_pairs(x: FloatArray, least: int) -> None:

@@ -15,7 +15,7 @@ from tactile_bayes.trial.bootstrap import method_of
 from tactile_bayes.trial.concordance import Concordance, concordance
 from tactile_bayes.trial.figures import Figure, Statistic, figure
 from tactile_bayes.trial.jackknife import Scale, UndefinedError
-from tactile_bayes.trial.lines import EQUAL, Line, deming, jackknife_errors, least_squares, weighted_deming
+from tactile_bayes.trial.lines import EQUAL, Line, centred, deming, jackknife_errors, least_squares, weighted_deming
 from tactile_bayes.trial.passing_bablok import PassingBablok, passing_bablok
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic, columns, ratio
@@ -124,13 +124,8 @@ def _terms(sizes: ModalitySizes) -> FloatArray:
     x, y = sizes.ex_vivo_mm, sizes.size_mm
     if len(x) == 0:
         raise UndefinedError("no mass was detected")
-    dx, dy = _centred(x), _centred(y)
+    dx, dy = centred(x, x.mean()), centred(y, y.mean())
     return columns(1.0, x, y, dx, dy, dx * dx, dx * dy, dy * dy)
-
-
-def _centred(values: FloatArray) -> FloatArray:
-    off = values - values.mean()
-    return np.zeros_like(off) if np.ptp(values) <= 1e-12 * np.abs(values).max() else off
 
 
 def _squares(sums: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

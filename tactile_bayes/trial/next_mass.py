@@ -296,7 +296,7 @@ def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     from scipy.special import expit
 
-    total2 = np.exp(2 * np.clip(theta[:, 2], -14, 5))
+    total2 = _total_variance(theta[:, 2])
     # at least 1e-12 of the variance is the readings' own, so that no logarithm of 0 is taken
     of_readings, of_patients = np.clip(expit(theta[:, 3]), 1e-12, 1.0), expit(theta[:, 4])
     rest = total2 * expit(-theta[:, 3])
@@ -323,7 +323,7 @@ def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray
 
     bias, slope, log_total, *logits = theta.T
     off = slope - 1
-    square = bias**2 + (off * spread) ** 2 + np.exp(2 * np.clip(log_total, -14, 5)) + caliper**2
+    square = bias**2 + (off * spread) ** 2 + _total_variance(log_total) + caliper**2
     prior = log_total - 1.5 * np.log(square) - 0.5 * ((bias / PRIOR_BIAS) ** 2 + (off / PRIOR_SLOPE) ** 2)
     for one in logits:
         prior = prior + log_expit(one) + log_expit(-one)
@@ -342,6 +342,11 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
     folded = np.exp(mean + sd**2 / 2) * _erf((mean / sd + sd) / math.sqrt(2)) - _erf(mean / sd / math.sqrt(2))
     error: FloatArray = 100 * ((1 - misses) * (folded @ weight / weight.sum()) + misses)
     return error
+
+
+def _total_variance(log_sd: FloatArray) -> FloatArray:
+    """The variance of ln size; logarithms so far out that the prior excludes them are clipped, against overflow."""
+    return np.asarray(np.exp(2 * np.clip(log_sd, -14, 5)))
 
 
 def _erf(values: FloatArray) -> FloatArray:

@@ -11,12 +11,10 @@ import numpy as np
 from tactile_bayes.trial.accuracy import some
 from tactile_bayes.trial.figures import Figure, figure
 from tactile_bayes.trial.jackknife import UndefinedError
+from tactile_bayes.trial.lines import all_equal
 from tactile_bayes.trial.misses import by_square, figure_with_misses
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic, columns, ratio
-
-# Replicates averaged in floating point differ by this much, relatively, when they are equal.
-_EQUAL = 1e-12
 
 
 def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
@@ -96,5 +94,5 @@ def _scaled(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
 
 def _need_spread(values: FloatArray, reason: str) -> None:
     some(values)
-    if np.ptp(values) <= _EQUAL * np.abs(values).max():
+    if all_equal(values):
         raise UndefinedError("one mass has no spread" if len(values) == 1 else reason)

@@ -16,6 +16,7 @@ import numpy as np
 from tactile_bayes.trial.bootstrap import method_of
 from tactile_bayes.trial.figures import Figure, Sample, figure
 from tactile_bayes.trial.jackknife import Scale, UndefinedError, interval_from_values, kurtosis_freedom, on_scale
+from tactile_bayes.trial.lines import centred
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
@@ -83,9 +84,7 @@ def _terms(differences: FloatArray, replicates: tuple[FloatArray, ...]) -> Float
     """1, d, d', d'd', 1/m, squares about the mass's mean and their degrees of freedom; ' about the mean of all d."""
     if len(differences) == 0:
         raise UndefinedError("no mass was detected")
-    off = differences - differences.mean()
-    if np.ptp(differences) <= 1e-12 * np.abs(differences).max():
-        off = np.zeros_like(off)
+    off = centred(differences, differences.mean())
     number = np.array([max(len(group), 1) for group in replicates], dtype=np.float64)
     squares = np.array([float(np.sum((group - group.mean()) ** 2)) if len(group) > 1 else 0.0 for group in replicates])
     return columns(1.0, differences, off, off * off, 1 / number, squares, number - 1)
