@@ -28,6 +28,14 @@ _LEAST_COLOURS = (0.9, 1.3)
 # With a fit they end so many amplitudes above the level, so that a rib beside the lump does not take them all.
 _AMPLITUDES_SHOWN = 1.25
 _AXIS_WORDS: Final = {"x": "across the head, x (mm)", "y": "along the head, y (mm)"}
+# Words above a mark, so many points away.
+_ABOVE: Final[dict[str, Any]] = {
+    "textcoords": "offset points",
+    "ha": "center",
+    "va": "bottom",
+    "color": "white",
+    "fontsize": 8,
+}
 # Places that were looked at in vain: so many are explained, the others are only marked.
 _EXPLAINED_PLACES: Final = 4
 
@@ -178,7 +186,6 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
     """White lines with black edges over the cells with few readings: to be seen on every colour, and without any."""
     if not tactile_map.few.any():
         return
-    from matplotlib import patheffects
     from matplotlib.collections import LineCollection
     from matplotlib.path import Path as Outline
 
@@ -195,7 +202,7 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
         [[(start, bottom), (start + height, top)] for start in starts],
         colors="white",
         linewidths=0.7,
-        path_effects=[patheffects.withStroke(linewidth=1.6, foreground="black")],
+        path_effects=_outlined(1.6),
     )
     axes.add_collection(lines, autolim=False)
     lines.set_clip_path(cells, axes.transData)
@@ -333,12 +340,8 @@ def _draw_scale_bar(axes: Axes) -> None:
         f"{_SCALE_BAR_MM:g} mm",
         (start + sign * _SCALE_BAR_MM / 2, height),
         xytext=(0, 4),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        color="white",
-        fontsize=8,
         path_effects=_outlined(2),
+        **_ABOVE,
     )
 
 
@@ -362,12 +365,8 @@ def _draw_notch(axes: Axes, view: Orientation) -> None:
         tip,
         xycoords="axes fraction",
         xytext=(0, 3),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        color="white",
-        fontsize=8,
         path_effects=_outlined(2),
+        **_ABOVE,
     )
 
 
