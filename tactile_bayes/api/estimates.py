@@ -201,18 +201,10 @@ class SizeEstimate(_Sized):
         """
         from tactile_bayes.report.estimate_figures import draw_size
 
-        found = self.outcome.estimate
-        if found.size is None or found.draws is None:
+        size = self.outcome.estimate.size
+        if size is None:
             return self.plot_map(path, force=force)
-        draws = {"max": found.size.max_size_mm.ravel(), "min": found.size.min_size_mm.ravel()}
-        return draw_size(
-            draws,
-            path_of(path),
-            name=self.name,
-            probability=self.probability,
-            effective_draws=found.draws.effective_draws,
-            force=force,
-        )
+        return draw_size(size, path_of(path), name=self.name, probability=self.probability, force=force)
 
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
@@ -281,9 +273,8 @@ class PooledSize(_Sized):
         size = self._size
         if size is None:
             raise UsageError(f"there is no size to draw: {self.why}")
-        draws = {"max": size.max_size_mm.ravel(), "min": size.min_size_mm.ravel()}
         name = self.name or f"{len(self.maps)} maps pooled"
-        return draw_size(draws, path_of(path), name=name, probability=self.probability, force=force)
+        return draw_size(size, path_of(path), name=name, probability=self.probability, force=force)
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:

@@ -68,5 +68,4 @@ def _write(
     if figure is not None:
         from tactile_bayes.report.estimate_figures import draw_size
 
-        draws = {"max": size.max_size_mm.ravel(), "min": size.min_size_mm.ravel()}
-        draw_size(draws, figure, name=f"{len(maps)} maps pooled", probability=settings.interval, force=force)
+        draw_size(size, figure, name=f"{len(maps)} maps pooled", probability=settings.interval, force=force)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.result import Estimate
     from tactile_bayes.report.map_figure import FitContour
+    from tactile_bayes.size.posterior import SizePosterior
 
 
 def draw_figures(
@@ -36,10 +35,8 @@ def draw_figures(
     probability
         Of the interval of the size.
     """
-    if figure is not None and estimate.size is not None and estimate.draws is not None:
-        draws = {"max": estimate.size.max_size_mm.ravel(), "min": estimate.size.min_size_mm.ravel()}
-        worth = estimate.draws.effective_draws
-        draw_size(draws, figure, name=name, probability=probability, effective_draws=worth, force=force)
+    if figure is not None and estimate.size is not None:
+        draw_size(estimate.size, figure, name=name, probability=probability, force=force)
         figure = None
     if tactile_map.covered.any():
         for path in (figure, map_figure):
@@ -47,26 +44,20 @@ def draw_figures(
                 draw_map(tactile_map, estimate, path, name=name, force=force)
 
 
-def draw_size(
-    draws_mm: Mapping[str, FloatArray],
-    path: Path | None,
-    *,
-    name: str,
-    probability: float,
-    effective_draws: float | None = None,
-    force: bool,
-) -> Figure:
-    """The posterior of the largest (``max``) and the smallest (``min``) size with their intervals."""
-    from tactile_bayes.inference.summary import summarise
+def draw_size(size: SizePosterior, path: Path | None, *, name: str, probability: float, force: bool) -> Figure:
+    """The posterior of the largest and the smallest size with their intervals of this probability."""
     from tactile_bayes.report.size_figure import SizeInterval, size_figure
 
-    quantities = {
-        which: summarise(draws, probability=probability, effective_draws=effective_draws or len(draws))
-        for which, draws in draws_mm.items()
-    }
+    quantities = {which: size.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
     intervals = {which: SizeInterval(q.low, q.high, q.probability, q.kind) for which, q in quantities.items()}
-    title = f"Size of the lump: {name}"
-    return size_figure(draws_mm["max"], draws_mm["min"], path, intervals=intervals, title=title, force=force)
+    return size_figure(
+        size.max_size_mm.ravel(),
+        size.min_size_mm.ravel(),
+        path,
+        intervals=intervals,
+        title=f"Size of the lump: {name}",
+        force=force,
+    )
 
 
 def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
