@@ -17,7 +17,6 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_parts import (
     calibration_document,
     calibration_from_document,
-    head_document,
     head_from_document,
 )
 from tactile_bayes.files.schema import dump_json
@@ -88,11 +87,6 @@ def read_array_calibration(path: Path) -> ArrayCalibrationFile:
         raise BadDataError(f"lacks a head_id or a date ({error})", way_out="calibrate again", path=str(path)) from None
 
 
-def write_head_geometry(path: Path, head: HeadGeometry, *, force: bool = False) -> None:
-    """Write where the taxels sit and how the tracker is mounted."""
-    write_text(path, dump_json({"schema": HEAD_SCHEMA, **head_document(head)}), force=force)
-
-
 def read_head_geometry(path: Path) -> HeadGeometry:
     """Read where the taxels sit and how the tracker is mounted."""
     document = _read(path, HEAD_SCHEMA, way_out="give surface_mm, pitch_mm and scanhead_from_tracker")
@@ -100,12 +94,6 @@ def read_head_geometry(path: Path) -> HeadGeometry:
         return head_from_document(document)
     except BadDataError as error:
         raise error.at(path) from None
-
-
-def write_landmarks(path: Path, landmarks: Landmarks, *, force: bool = False) -> None:
-    """Write two points in `base`."""
-    points = {name: getattr(landmarks, name).tolist() for name in ("sternal_notch_mm", "xiphoid_mm")}
-    write_text(path, dump_json({"schema": LANDMARKS_SCHEMA, **points}), force=force)
 
 
 def read_landmarks(path: Path) -> Landmarks:
