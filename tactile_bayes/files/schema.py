@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.kinds import schema_kind
 
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -60,14 +59,6 @@ def _validator(schema_name: str) -> Any:
     # our ids are names, not addresses: with one in place the compiler would try to fetch what "$ref" points to
     document = {key: value for key, value in load_schema(schema_name).items() if key != "$id"}
     return fastjsonschema.compile(document)
-
-
-def read_json(path: Path, schema_name: str) -> dict[str, Any]:
-    """Read a JSON file and check it against its schema; see `check_document` for the errors."""
-    document = load_json(path)
-    check_document(document, schema_name, path=path)
-    assert isinstance(document, dict)
-    return document
 
 
 def dump_json(document: object) -> str:

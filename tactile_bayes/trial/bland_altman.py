@@ -129,19 +129,6 @@ def limits_unlinked(
     return _from_means(means, parts, names=("reference_within", "within"), share=share, confidence=confidence)
 
 
-def limits_linked(
-    x: Sequence[FloatArray], y: Sequence[FloatArray], *, share: float = 0.95, confidence: float = 0.95
-) -> Limits:
-    """Limits for single readings from replicates read in pairs, while the true size may vary between pairs.
-
-    Bland & Altman (2007), J. Biopharm. Stat. 17, 571, section 3: one-way analysis of variance of the differences, by
-    mass; between-mass variance by the harmonic mean number of pairs.
-    """
-    pairs = [b - a for a, b in zip(x, y, strict=True)]
-    means = np.array([d.mean() for d in pairs])
-    return _from_means(means, [_within(pairs)], names=("within",), share=share, confidence=confidence)
-
-
 @dataclass(frozen=True, slots=True)
 class Trend:
     """How differences change with size: slope of a least-squares line, per unit of size, with its t test."""

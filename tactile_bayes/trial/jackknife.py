@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -22,39 +22,6 @@ class UndefinedError(Exception):
     """A figure, or its interval, that the data leave undefined; the message is the reason."""
 
 
-def jackknife_interval(
-    value: float, left_out: Sequence[Callable[[], float]], *, scale: Scale, confidence: float
-) -> tuple[float, float]:
-    r"""Two-sided interval of a statistic from its values with one patient left out.
-
-    Parameters
-    ----------
-    value
-        The statistic on all patients.
-    left_out
-        One function a patient, giving the statistic without that patient.
-    scale
-        ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear`` on the figure,
-        ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1), ``slope`` as ``log`` where the
-        figure is above 0 with every patient left out, else as ``linear``.
-    confidence
-        Probability of the interval.
-
-    Raises
-    ------
-    UndefinedError
-        With fewer than `MIN_PATIENTS` patients, or where the leave-one-out values do not exist or do not differ.
-
-    Notes
-    -----
-    .. math:: \hat\theta \pm t_{G-1}\sqrt{\tfrac{G-1}{G}\sum_g (\hat\theta_{(g)} - \bar\theta_{(\cdot)})^2}
-
-    for G patients: Tukey (1958), Ann. Math. Statist. 29, 614; Efron & Tibshirani (1993), ch. 11.
-    """
-    need_patients(len(left_out))
-    return interval_from_values(value, [one() for one in left_out], scale=scale, confidence=confidence)
-
-
 def need_patients(groups: int) -> None:
     """Raise `UndefinedError` with fewer than `MIN_PATIENTS`."""
     if groups < MIN_PATIENTS:
@@ -69,12 +36,33 @@ def interval_from_values(
     confidence: float,
     freedom: float | None = None,
 ) -> tuple[float, float]:
-    """The interval of `jackknife_interval` from the leave-one-out values themselves.
+    r"""Two-sided interval of a statistic from its values with one patient left out.
 
     Parameters
     ----------
+    value
+        The statistic on all patients.
+    values : (G,) array
+        The statistic without each patient.
+    scale
+        ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear`` on the figure,
+        ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1), ``slope`` as ``log`` where the
+        figure is above 0 with every patient left out, else as ``linear``.
+    confidence
+        Probability of the interval.
     freedom
         Degrees of freedom of Student's t where they are fewer than G - 1.
+
+    Raises
+    ------
+    UndefinedError
+        With fewer than `MIN_PATIENTS` patients, or where the leave-one-out values do not exist or do not differ.
+
+    Notes
+    -----
+    .. math:: \hat\theta \pm t_{G-1}\sqrt{\tfrac{G-1}{G}\sum_g (\hat\theta_{(g)} - \bar\theta_{(\cdot)})^2}
+
+    for G patients: Tukey (1958), Ann. Math. Statist. 29, 614; Efron & Tibshirani (1993), ch. 11.
     """
     from scipy.special import stdtrit
 

@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 import tactile_bayes
 from tactile_bayes.commands.validate import command
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError, UsageError
-from tactile_bayes.files.schema import check_document, read_json
+from tactile_bayes.files.schema import check_document
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.trial.synthetic import excision_csv, trial_csv
 
@@ -49,7 +49,8 @@ def test_json_printed_and_written_are_the_same_bytes_every_time(tmp_path: Path) 
     again = validate(TRIAL, "--excision", EXCISION, "-o", tmp_path / "b.json")
     assert (printed.exit_code, again.exit_code) == (0, 0)
     assert printed.stdout_bytes == (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
-    document = read_json(tmp_path / "a.json", "validate.schema.json")
+    document = json.loads(printed.stdout)
+    check_document(document, "validate.schema.json", path=tmp_path / "a.json")
     assert document["schema"] == "tactile-bayes/validate/1"
     assert document["research_use"] == RESEARCH_USE
     assert [one["role"] for one in document["provenance"]["inputs"]] == ["trial", "excision"]

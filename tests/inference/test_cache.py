@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from posterior_maps import bump_map
+from posterior_maps import bump_map, find_bump
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.inference.cache import Solution, Solved
@@ -15,7 +15,6 @@ from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.lump.bump import Bump, BumpPrior
 from tactile_bayes.posterior.lump.cells import window_cells
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.white.fit import find_bump
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 
 

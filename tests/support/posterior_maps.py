@@ -8,6 +8,8 @@ import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.white.fit import Candidate, fitted_candidates
 
 TRUTH = {"amplitude": 0.3, "x": 1.3, "y": -0.8, "sigma_x": 6.0, "sigma_y": 4.5}
 
@@ -82,3 +84,20 @@ def correlated_field(rng: np.random.Generator, n: int, *, length_cells: float) -
     spectrum = _field_spectrum(n, length_cells)
     white = rng.standard_normal(spectrum.shape)
     return np.fft.ifft2(np.fft.fft2(white) * np.sqrt(spectrum)).real[:n, :n]
+
+
+def find_bump(tactile_map: TactileMap, options: FitOptions) -> list[Candidate]:
+    """Fit the candidates, highest first, up to and including the first that can be a lump.
+
+    Returns
+    -------
+    list of Candidate
+        All that were tried. The last has no fault when a bump was found. Empty when nothing rises above the
+        background.
+    """
+    tried: list[Candidate] = []
+    for candidate in fitted_candidates(tactile_map, options):
+        tried.append(candidate)
+        if not candidate.fault:
+            break
+    return tried

@@ -136,23 +136,6 @@ class Candidate:
     detection: Detection | None = None
 
 
-def find_bump(tactile_map: TactileMap, options: FitOptions) -> list[Candidate]:
-    """Fit the candidates, highest first, up to and including the first that can be a lump.
-
-    Returns
-    -------
-    list of Candidate
-        All that were tried. The last has no fault when a bump was found. Empty when nothing rises above the
-        background.
-    """
-    tried: list[Candidate] = []
-    for candidate in fitted_candidates(tactile_map, options):
-        tried.append(candidate)
-        if not candidate.fault:
-            break
-    return tried
-
-
 def fitted_candidates(tactile_map: TactileMap, options: FitOptions) -> Iterator[Candidate]:
     """The places where a lump could be, highest first, each fitted when it is asked for."""
     centres = [options.centre_mm] if options.centre_mm is not None else candidate_centres(tactile_map)

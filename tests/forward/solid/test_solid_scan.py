@@ -11,6 +11,7 @@ from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
+from posterior_maps import find_bump
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
@@ -31,7 +32,6 @@ from tactile_bayes.geometry import (
 )
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.posterior.options import FitOptions
-from tactile_bayes.posterior.white.fit import find_bump
 
 Run = Callable[..., "CompletedProcess[str]"]
 SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mapping_scans import shared_scan
-from posterior_maps import bump_map, correlated_field, grid_map
+from posterior_maps import bump_map, correlated_field, find_bump, grid_map
 
 import tactile_bayes
 from tactile_bayes.files.scene_toml import read_scene
@@ -20,7 +20,7 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white.detection import detect
-from tactile_bayes.posterior.white.fit import find_bump, fitted_candidates
+from tactile_bayes.posterior.white.fit import fitted_candidates
 
 SIZE = 51
 NOISE = 0.02
