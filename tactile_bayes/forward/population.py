@@ -124,13 +124,11 @@ def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
     )
 
 
-def draw_mass(
-    index: int, *, scans: int, seed: int, bodies: BodyPrior | None = None, exams: ExamPrior | None = None
-) -> list[Scene]:
+def draw_mass(index: int, *, scans: int, seed: int, bodies: BodyPrior | None = None) -> list[Scene]:
     """The scenes of one mass, examined several times; the same for one index and seed wherever it is drawn."""
     rng = np.random.default_rng([seed, index])
     body, lump = draw_body(bodies or BodyPrior(), rng)
-    exam_prior = exams or ExamPrior()
+    exam_prior = ExamPrior()
     scenes = []
     for number in range(scans):
         exam = draw_exam(exam_prior, rng)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import emcee
 import numpy as np
@@ -16,6 +16,8 @@ from tactile_bayes.inference.draws import ParameterDraws, student_draws
 from tactile_bayes.inference.laplace import LogDensity
 
 Progress = Callable[[int, int], None]
+WALKERS_PER_PARAMETER = 4
+"""Of each ensemble."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +28,6 @@ class EnsembleOptions:
     ----------
     ensembles
         Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles.
-    walkers_per_parameter
-        Walkers of each ensemble, a parameter.
     block
         Steps between two looks at the diagnostics.
     max_steps
@@ -39,7 +39,6 @@ class EnsembleOptions:
     """
 
     ensembles: int = 4
-    walkers_per_parameter: int = 4
     block: int = 150
     max_steps: int = 6000
     least_ess: float = 800.0
@@ -48,8 +47,7 @@ class EnsembleOptions:
 
     def identity(self) -> str:
         """What a checkpoint is bound to: everything but how long to go on."""
-        said = asdict(self)
-        return str({name: said[name] for name in ("ensembles", "walkers_per_parameter", "block")})
+        return str({"ensembles": self.ensembles, "walkers_per_parameter": WALKERS_PER_PARAMETER, "block": self.block})
 
 
 def ensemble(
@@ -91,10 +89,7 @@ def ensemble(
     ensemble's steps is dropped. Diagnostics are rank-normalised (Vehtari et al. 2021).
     """
     options = options or EnsembleOptions()
-    samplers = [
-        _Ensemble(log_density, centre, covariance, rng=rng, options=options, start=start)
-        for _ in range(options.ensembles)
-    ]
+    samplers = [_Ensemble(log_density, centre, covariance, rng=rng, start=start) for _ in range(options.ensembles)]
     kept = None if store is None else store.load(key)
     if kept is not None:
         for index, sampler in enumerate(samplers):
@@ -132,12 +127,11 @@ class _Ensemble:
         covariance: FloatArray,
         *,
         rng: np.random.Generator,
-        options: EnsembleOptions,
         start: FloatArray | None,
     ) -> None:
         p = len(centre)
         self._centre, self._scale = centre, np.sqrt(np.diag(covariance))
-        self.walkers = max(2 * ((options.walkers_per_parameter * p + 1) // 2), 2 * p + 2)
+        self.walkers = max(2 * ((WALKERS_PER_PARAMETER * p + 1) // 2), 2 * p + 2)
         self._sampler = emcee.EnsembleSampler(
             self.walkers, p, self._standardised(log_density), vectorize=True, moves=[(emcee.moves.DEMove(), 1.0)]
         )

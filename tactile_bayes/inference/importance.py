@@ -23,6 +23,8 @@ HEAVY_TAIL = 0.3
 POOR = 0.5
 """Below this share of effective draws the proposal is moved to the weighted moments of the points so far."""
 MOST_MOVES = 4
+LEAST_KEPT = 8192
+"""Equal-weight draws returned, at least: twice the points where those are more."""
 HEAVY_POINTS, HEAVY = 2048, 0.1
 """With as many points a replicate and a tail heavier than trusted by this, more points do not help."""
 
@@ -35,19 +37,13 @@ class ImportanceOptions:
     ----------
     accuracy_sd
         Wanted Monte-Carlo error of the ends of a 95 % interval, in posterior standard deviations.
-    replicates
-        Independent random shifts of the point set; their spread is the error.
     first, most
         Points of a replicate to begin with, and at most.
-    keep
-        Equal-weight draws returned, at least: twice the points where those are more.
     """
 
     accuracy_sd: float = 0.02
-    replicates: int = REPLICATES
     first: int = 256
     most: int = 16384
-    keep: int = 8192
 
 
 def importance_options(accuracy_sd: float | None) -> ImportanceOptions:
@@ -102,7 +98,7 @@ def importance(
                 diagnostics={"pareto_k": float(shape), "end_error_sd": error},
             )
         sampler.extend(sampler.points)
-    keep = max(options.keep, 2 * sampler.number)
+    keep = max(LEAST_KEPT, 2 * sampler.number)
     chosen = systematic(weights, keep, rng)
     figures = {
         "pareto_k": float(shape),
@@ -127,9 +123,7 @@ def _settled(
     """The first points, from a proposal that was moved while it was poor."""
     spent, stretch = 0, STRETCH
     for _ in range(MOST_MOVES):
-        sampler = _Sampler(
-            log_density, mode, covariance, stretch=stretch, replicates=options.replicates, rng=rng, spent=spent
-        )
+        sampler = _Sampler(log_density, mode, covariance, stretch=stretch, rng=rng, spent=spent)
         sampler.extend(options.first)
         weights, shape = sampler.weights()
         if not np.isfinite(weights).all():
@@ -151,7 +145,10 @@ def _settled(
 
 
 class _Sampler:
-    """Points, their densities and weights, kept in order of the replicates."""
+    """Points, their densities and weights, kept in order of the replicates.
+
+    Replicates are independent random shifts of the point set; their spread is the error.
+    """
 
     def __init__(
         self,
@@ -160,17 +157,16 @@ class _Sampler:
         covariance: FloatArray,
         *,
         stretch: float,
-        replicates: int,
         rng: np.random.Generator,
         spent: int,
     ) -> None:
         p = len(mode)
         self._log_density, self._mode, self._stretch = log_density, mode, stretch
         self._root = np.linalg.cholesky(covariance)
-        self._shifts = rng.integers(2**BITS, size=(replicates, p), dtype=np.uint32)
+        self._shifts = rng.integers(2**BITS, size=(REPLICATES, p), dtype=np.uint32)
         self._spent = spent
-        self._theta = np.empty((replicates, 0, p))
-        self._log_weights = np.empty((replicates, 0))
+        self._theta = np.empty((REPLICATES, 0, p))
+        self._log_weights = np.empty((REPLICATES, 0))
 
     @property
     def number(self) -> int:

@@ -135,7 +135,7 @@ def test_a_trial_without_a_miss_does_not_rule_misses_out() -> None:
 
 def rough(log_density, centre, covariance, *, rng):
     mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))
-    options = ImportanceOptions(accuracy_sd=0.2, replicates=2, keep=1024)
+    options = ImportanceOptions(accuracy_sd=0.2)
     try:
         return importance(log_density, mode, about, rng=rng, options=options)
     except NotConvergedError:
