@@ -86,28 +86,6 @@ def element_stiffness(corners: FloatArray, *, poisson: float) -> FloatArray:
     return np.asarray(parts.reshape(-1, 18, 18) + lam * mixed.transpose(0, 2, 1) @ np.linalg.solve(mass, mixed))
 
 
-def body_force(mesh: QuadMesh, force: FloatArray) -> FloatArray:
-    """(2n,) nodal forces of a force density given at the points of `quadrature_points`, (m, 9, 2)."""
-    _, weight, _ = _shape_gradients(mesh.nodes[mesh.elements])
-    values, _ = _shape_functions()
-    local = np.einsum("qa,eqc,eq->eac", values, force, weight)
-    load = np.zeros((len(mesh.nodes), 2))
-    np.add.at(load, mesh.elements, local)
-    return load.reshape(-1)
-
-
-def quadrature_points(mesh: QuadMesh) -> tuple[FloatArray, FloatArray]:
-    """Positions (m, 9, 2) and weights (m, 9) in mm^2 of the integration points."""
-    _, weight, place = _shape_gradients(mesh.nodes[mesh.elements])
-    return place, weight
-
-
-def interpolate(mesh: QuadMesh, values: FloatArray) -> FloatArray:
-    """(m, 9, ...) values at the integration points of (n, ...) values at the nodes."""
-    shape, _ = _shape_functions()
-    return np.asarray(np.einsum("qa,ea...->eq...", shape, values[mesh.elements]))
-
-
 def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> FloatArray:
     """Matrix that takes displacements of the skin's nodes to their averages over surface cells.
 
