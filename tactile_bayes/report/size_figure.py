@@ -40,7 +40,6 @@ def size_figure(
     path: Path | None,
     *,
     intervals: Mapping[str, SizeInterval],
-    truth: tuple[float, float] | None = None,
     title: str = "",
     force: bool = False,
 ) -> Figure:
@@ -52,8 +51,6 @@ def size_figure(
         Posterior draws; those that are not finite are left out.
     intervals
         For ``"max"`` and ``"min"``, drawn as bars labelled with probability and kind.
-    truth
-        Known (largest, smallest) size in mm, drawn as lines.
     title
         Above the figure; nothing that identifies a person.
 
@@ -71,22 +68,17 @@ def size_figure(
             _draw_density(axes, name, draws, colour=colour, dash=dash)
             if name in intervals:
                 _draw_interval(axes, intervals[name], row=row, colour=colour)
-            if truth is not None:
-                known = "known size" if row == 0 else None
-                axes.axvline(truth[row], color=colour, linestyle=":", linewidth=1.2, label=known)
         axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
-        axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals, truth or ()))
+        axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
         _finish_size(axes)
         figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")
     return figure
 
 
-def _span(
-    draws_mm: Sequence[FloatArray], intervals: Mapping[str, SizeInterval], known_mm: Sequence[float]
-) -> tuple[float, float]:
-    """Ends of the axis: nearly all draws, all intervals and the known sizes, not a heavy tail's last draw."""
+def _span(draws_mm: Sequence[FloatArray], intervals: Mapping[str, SizeInterval]) -> tuple[float, float]:
+    """Ends of the axis: nearly all draws and all intervals, not a heavy tail's last draw."""
     ends = [float(end) for one in draws_mm for end in np.quantile(one[np.isfinite(one)], _SHOWN)]
-    ends += [*known_mm, *(end for one in intervals.values() for end in (one.low_mm, one.high_mm))]
+    ends += [end for one in intervals.values() for end in (one.low_mm, one.high_mm)]
     margin = 0.05 * (max(ends) - min(ends)) or 1.0
     return max(0.0, min(ends) - margin) if min(ends) >= 0 else min(ends) - margin, max(ends) + margin
 
