@@ -15,6 +15,8 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.records import dataclass
 
 FloatArray = NDArray[np.float64]
+# A rotation's R R^T departs from the identity by no more.
+NOT_RIGID = 1e-6
 
 
 def rotation_from_quaternion(quaternion_wxyz: FloatArray) -> FloatArray:
@@ -84,13 +86,13 @@ def apply(transform: FloatArray, points_mm: FloatArray) -> FloatArray:
     return moved
 
 
-def check_rigid(transform: FloatArray, *, name: str, tolerance: float = 1e-6) -> None:
+def check_rigid(transform: FloatArray, *, name: str) -> None:
     """Raise `BadDataError` unless `transform` is a (4, 4) proper rigid motion."""
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         raise BadDataError(f"{name} must be a finite (4, 4) matrix (shape {transform.shape})")
     rotation = transform[:3, :3]
     departure = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if departure > tolerance or np.linalg.det(rotation) < 0 or not np.array_equal(transform[3], [0, 0, 0, 1]):
+    if departure > NOT_RIGID or np.linalg.det(rotation) < 0 or not np.array_equal(transform[3], [0, 0, 0, 1]):
         raise BadDataError(
             f"{name} is not a rigid transform (R R^T departs from 1 by {departure:.1e})",
             way_out="give a proper rotation and a translation in mm, last row 0 0 0 1",

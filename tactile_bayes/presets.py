@@ -11,7 +11,6 @@ HEAD_ROWS: Final = 16  # across the head, x of the scanhead frame
 HEAD_COLUMNS: Final = 26  # along the head, y of the scanhead frame
 HEAD_PITCH_MM: Final = 1.5
 PRESSURE_RANGE_KPA: Final = (0.0, 34.0)
-FRAME_INTERVAL_S: Final = 0.005
 
 # "Anticipated user-applied pressures", section 2.1; the paper gives the gate no number of its own.
 PRESSURE_WINDOW_KPA: Final = (5.0, 14.0)

@@ -47,8 +47,7 @@ def command() -> None:
 @click.option(
     "--fit-radius-mm",
     type=FiniteRange(min=0.0, min_open=True),
-    help="Radius of the table's fit windows, mm, if the table does not state it. "
-    f"Default: {FIT_RADIUS_MM:g}.",
+    help=f"Radius of the table's fit windows, mm, if the table does not state it. Default: {FIT_RADIUS_MM:g}.",
 )
 @click.option(
     "--noise",

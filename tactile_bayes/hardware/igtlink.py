@@ -15,7 +15,6 @@ from tactile_bayes.geometry import quaternion_from_rotation
 from tactile_bayes.hardware.crc64 import crc64
 from tactile_bayes.hardware.readings import PoseReading, Reading
 
-PORT: Final = 18944
 _HEADER: Final = struct.Struct(">H12s20sIIQQ")  # version, type, device, s, fraction, body size, CRC
 _BODY: Final = struct.Struct(">12f")
 _KIND_AT: Final = 2

@@ -12,6 +12,7 @@ from tactile_bayes.inference.derivatives import finite_differences, stencil
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
 
 LogDensity = Callable[[FloatArray], FloatArray]
+MOST_STEPS = 100
 
 
 def laplace(
@@ -21,7 +22,6 @@ def laplace(
     scale: FloatArray,
     dof: float,
     rng: np.random.Generator,
-    draws: int = INDEPENDENT_DRAWS,
 ) -> ParameterDraws:
     """Draws from the t density with the mode and the curvature of a log density.
 
@@ -31,12 +31,12 @@ def laplace(
     """
     mode, covariance, steps = mode_and_covariance(log_density, start, scale=scale)
     widened = covariance if np.isinf(dof) else covariance * (dof + len(mode)) / dof
-    flat = student_draws(mode, widened, dof=dof, number=draws, rng=rng)
-    return ParameterDraws(flat[None], "laplace", {"draws": float(draws), "newton_steps": float(steps)})
+    flat = student_draws(mode, widened, dof=dof, number=INDEPENDENT_DRAWS, rng=rng)
+    return ParameterDraws(flat[None], "laplace", {"draws": float(INDEPENDENT_DRAWS), "newton_steps": float(steps)})
 
 
 def mode_and_covariance(
-    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4, max_steps: int = 100
+    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
 ) -> tuple[FloatArray, FloatArray, int]:
     """Mode of a log density by damped Newton steps, and the inverse of its negative Hessian there.
 
@@ -61,12 +61,12 @@ def mode_and_covariance(
     NotConvergedError
         When no mode is found or the curvature there is not that of a maximum.
     """
-    mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance, max_steps=max_steps)
+    mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance)
     return mode, _covariance(log_density, mode, scale=scale), taken
 
 
 def find_mode(
-    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4, max_steps: int = 100
+    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
 ) -> tuple[FloatArray, int]:
     """As `mode_and_covariance`, without the curvature.
 
@@ -79,7 +79,7 @@ def find_mode(
     theta = np.array(start, dtype=np.float64)
     value = float(log_density(theta[None])[0])
     damping = 1e-8
-    for taken in range(1, max_steps + 1):
+    for taken in range(1, MOST_STEPS + 1):
         gradient, hessian = _slopes(log_density, theta, step=1e-2 * scale)
         step = scale * _newton_step(gradient * scale, -hessian * np.outer(scale, scale), damping)
         trial = theta + step
@@ -93,7 +93,7 @@ def find_mode(
             return theta, taken
         else:
             damping = max(damping * 10, 1e-4)
-    raise NotConvergedError(f"no posterior mode found in {max_steps} Newton steps; try --method ensemble")
+    raise NotConvergedError(f"no posterior mode found in {MOST_STEPS} Newton steps; try --method ensemble")
 
 
 def _slopes(log_density: LogDensity, theta: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from tactile_bayes.records import dataclass
 ModelFunction = Callable[[FloatArray], FloatArray]
 """Maps (m, p) parameter vectors to (m, k) predictions, all m at once."""
 
+MOST_ITERATIONS = 200
 SETTLED = 0.01
 """Of the residual variance: a step that lowers the sum of squares by less moves nothing that the data could tell."""
 
@@ -78,7 +79,6 @@ def fit_least_squares(
     weight: FloatArray,
     scale: FloatArray,
     tolerance: float = 1e-10,
-    max_iterations: int = 200,
     abandon: Callable[[FloatArray], bool] | None = None,
     patience: int | None = None,
 ) -> LeastSquaresFit:
@@ -109,7 +109,7 @@ def fit_least_squares(
     sse = float(weight @ residual**2)
     damping, grow = 1e-3, 2.0
     jacobian = numerical_jacobian(model, theta, scale=scale)
-    for iteration in range(1, max_iterations + 1):
+    for iteration in range(1, MOST_ITERATIONS + 1):
         step = _damped_step(jacobian, residual, weight=weight, scale=scale, damping=damping)
         if not np.isfinite(step).all():
             break
@@ -130,7 +130,7 @@ def fit_least_squares(
             if float(np.abs(step).max()) < tolerance:
                 return LeastSquaresFit(theta, jacobian, residual, sse, True, iteration)
             damping, grow = damping * grow, grow * 2.0
-    return LeastSquaresFit(theta, jacobian, residual, sse, False, max_iterations)
+    return LeastSquaresFit(theta, jacobian, residual, sse, False, MOST_ITERATIONS)
 
 
 def _damped_step(

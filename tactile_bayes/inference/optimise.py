@@ -14,7 +14,6 @@ def optimise(
     *,
     dof: float,
     rng: np.random.Generator,
-    draws: int = INDEPENDENT_DRAWS,
 ) -> ParameterDraws:
     """Draws about the least-squares estimate with its covariance and the t tails of an estimated noise.
 
@@ -30,5 +29,5 @@ def optimise(
     Wellman & Howe (1999), section 2.4, minimise the squared error between map and Eq 7; the covariance of that
     estimate is this program's addition.
     """
-    flat = student_draws(theta, covariance, dof=dof, number=draws, rng=rng)
-    return ParameterDraws(flat[None], "optimise", {"draws": float(draws)})
+    flat = student_draws(theta, covariance, dof=dof, number=INDEPENDENT_DRAWS, rng=rng)
+    return ParameterDraws(flat[None], "optimise", {"draws": float(INDEPENDENT_DRAWS)})

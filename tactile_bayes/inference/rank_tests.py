@@ -134,20 +134,20 @@ def stray(counts: IntArray, n: int) -> FloatArray:
     return np.asarray(np.min(tails[counts, np.arange(len(at))], axis=-1))
 
 
-def uniform_strays(n: int, draws: int, *, simulations: int = BAND_SIMULATIONS) -> FloatArray:
-    """(simulations,) `stray` of n uniform ranks, from random numbers of their own: the same each time."""
+def uniform_strays(n: int, draws: int) -> FloatArray:
+    """(BAND_SIMULATIONS,) `stray` of n uniform ranks, from random numbers of their own: the same each time."""
     rng = np.random.default_rng([n, draws])
-    number = rng.multinomial(n, np.full(draws + 1, 1.0 / (draws + 1)), size=simulations)
+    number = rng.multinomial(n, np.full(draws + 1, 1.0 / (draws + 1)), size=BAND_SIMULATIONS)
     return stray(np.cumsum(number, axis=1)[:, :-1], n)
 
 
-def ecdf_band(n: int, draws: int, *, probability: float = BAND) -> tuple[FloatArray, FloatArray]:
+def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
     """(draws,) lowest and highest share of n ranks below 1, 2 ... that uniform ranks keep to everywhere at once.
 
-    Each point's binomial limits are as wide as makes the whole path stay inside with `probability`.
+    Each point's binomial limits are as wide as makes the whole path stay inside with probability `BAND`.
     """
     from scipy.stats import binom
 
-    level = float(np.quantile(uniform_strays(n, draws), 1.0 - probability))
+    level = float(np.quantile(uniform_strays(n, draws), 1.0 - BAND))
     at = np.arange(1, draws + 1) / (draws + 1)
     return np.asarray(binom.ppf(level / 2.0, n, at) / n), np.asarray(binom.isf(level / 2.0, n, at) / n)

@@ -260,8 +260,8 @@ class MapAccumulator:
         moments = self._moments.moments()
         return self._merged + moments if self._merged.count else moments
 
-    def rebuild(self, plane: Plane | None = None) -> MapAccumulator:
-        """A new one with the frames kept so far, on another plane: by default the best-fit plane of them.
+    def rebuild(self) -> MapAccumulator:
+        """A new one with the frames kept so far, on the best-fit plane of them.
 
         Raises
         ------
@@ -270,7 +270,7 @@ class MapAccumulator:
         """
         if self._kept is None:
             raise UsageError("the frames were not kept; make the accumulator with keep_frames=True")
-        grid = MapGrid((plane or self.plane()).plane_from_base, self.grid.cell_mm)
+        grid = MapGrid(self.plane().plane_from_base, self.grid.cell_mm)
         anew = MapAccumulator(grid, self.instrument, engine=self._engine)
         for counts, poses in self._kept:
             anew.add(counts, poses)

@@ -13,7 +13,7 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
-from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, scene_asked
+from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection, detect
 from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.white.fit import BumpFit
@@ -180,7 +180,7 @@ def _correlated(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions)
         # no mode: under these errors nothing stands out that could be weighed
         return _Correlated(tactile_map, fit, Detection(0.0, -np.inf), None)
     fault = _field_fault(tactile_map, seen)
-    if not fault and seen.detection.probability >= options.least_probability:
+    if not fault and seen.detection.probability >= DETECTED:
         seen = with_neighbours(seen, tactile_map, scene=scene)
     return _Correlated(tactile_map, fit, seen.detection, seen, fault)
 

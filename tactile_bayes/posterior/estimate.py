@@ -14,7 +14,7 @@ from tactile_bayes.posterior.assessment import MapDraws
 from tactile_bayes.posterior.drawn import draw_sized
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
-from tactile_bayes.posterior.options import ROTATION_ODDS, EstimateOptions, FitOptions, check_options
+from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.search import best_chance, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
@@ -71,8 +71,8 @@ def estimate_map(
         why = no_bump(tactile_map, candidates, likeliest, where=where)
         return _none(why, candidates, None if likeliest is None else likeliest[1])
     detection = seen.detection
-    if detection.probability < options.least_probability:
-        return _none(undetected(detection, options.least_probability, where=where), candidates, detection)
+    if detection.probability < DETECTED:
+        return _none(undetected(detection, DETECTED, where=where), candidates, detection)
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)

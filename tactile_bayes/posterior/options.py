@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tactile_bayes.inference.chain_state import ChainStore
 
 DETECTED = 0.95
+"""Below this probability of a lump there is no estimate."""
 ROTATION_ODDS = 3.0
 """A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
 
@@ -71,8 +72,6 @@ class EstimateOptions:
         Background, window, rotation, centre, noise.
     prior
         On the bump.
-    least_probability
-        Below this probability of a lump there is no estimate.
     max_steps
         Of the ensemble; None for its default.
     accuracy_sd
@@ -93,7 +92,6 @@ class EstimateOptions:
     method: Method = "importance"
     fit: FitOptions = field(default_factory=FitOptions)
     prior: BumpPrior = field(default_factory=BumpPrior)
-    least_probability: float = DETECTED
     max_steps: int | None = None
     accuracy_sd: float | None = None
     size_priors: SizePriors = field(default_factory=SizePriors)

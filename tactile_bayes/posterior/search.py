@@ -8,7 +8,7 @@ from dataclasses import replace
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.assessment import Assessment, assess
 from tactile_bayes.posterior.lump.cells import levelled, window_cells
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import (
     LEAST_WIDTH_IN_CELLS,
@@ -45,7 +45,7 @@ def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Can
         if seen.fault:
             tried[-1] = replace(candidate, fault=seen.fault, detection=detection)
             continue
-        if detection.probability >= options.least_probability:
+        if detection.probability >= DETECTED:
             return tuple(tried), seen
         first, looks = first or (candidate, seen), looks + 1
         if looks == MOST_LOOKS:
@@ -104,7 +104,7 @@ def _close_search(
         tried[i] = replace(candidate, detection=seen.detection)
         if seen.scene is None or seen.fault:
             continue
-        if seen.detection.probability >= options.least_probability:
+        if seen.detection.probability >= DETECTED:
             return (*tried[:i], *tried[i + 1 :], replace(candidate, fit=fit, fault="")), seen
         looks += 1
         if looks == MOST_LOOKS:

@@ -18,6 +18,8 @@ from tactile_bayes.trial.readings import FloatArray
 from tactile_bayes.trial.tolerance import content_factor, percentile_factor
 
 Ends = tuple[float, float]
+# Share of the differences that lie between the limits.
+SHARE = 0.95
 # Times that errors proportional to size must be likelier than constant ones, and masses needed to judge it.
 LIKELIER = 3.0
 LEAST_MASSES = 8
@@ -56,15 +58,13 @@ class Limits:
     components: dict[str, float] | None = None
 
 
-def limits(differences: FloatArray, *, share: float = 0.95, confidence: float = 0.95) -> Limits:
-    r"""Limits of agreement of single readings.
+def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
+    r"""Limits of agreement of single readings, between which `SHARE` of the differences lie.
 
     Parameters
     ----------
     differences : (n,) array
         y - x of each mass.
-    share
-        Of differences to lie between the limits.
 
     Notes
     -----
@@ -81,11 +81,11 @@ def limits(differences: FloatArray, *, share: float = 0.95, confidence: float = 
     if n < 2:
         raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
     bias, sd = float(differences.mean()), float(differences.std(ddof=1))
-    z, tail = _normal(0.5 + 0.5 * share), 0.5 + 0.5 * confidence
+    z, tail = _normal(0.5 + 0.5 * SHARE), 0.5 + 0.5 * confidence
     t = student(n - 1, confidence=confidence)
-    inner = percentile_factor(n, percentile=0.5 + 0.5 * share, confidence=1 - tail)
-    outer = percentile_factor(n, percentile=0.5 + 0.5 * share, confidence=tail)
-    pair = [content_factor(n, content=share, confidence=c) for c in (1 - tail, tail)]
+    inner = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
+    outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
+    pair = [content_factor(n, content=SHARE, confidence=c) for c in (1 - tail, tail)]
     reach = t * math.sqrt(1 / n + z * z / (2 * (n - 1)))
     return Limits(
         n=n,
@@ -104,9 +104,7 @@ def limits(differences: FloatArray, *, share: float = 0.95, confidence: float = 
     )
 
 
-def limits_unlinked(
-    x: Sequence[FloatArray], y: Sequence[FloatArray], *, share: float = 0.95, confidence: float = 0.95
-) -> Limits:
+def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confidence: float = 0.95) -> Limits:
     r"""Limits for single readings from replicates of an unchanging true size, x and y not paired one by one.
 
     Parameters
@@ -126,7 +124,7 @@ def limits_unlinked(
     """
     means = np.array([b.mean() - a.mean() for a, b in zip(x, y, strict=True)])
     parts = [_within(x), _within(y)]
-    return _from_means(means, parts, names=("reference_within", "within"), share=share, confidence=confidence)
+    return _from_means(means, parts, names=("reference_within", "within"), confidence=confidence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,18 +198,16 @@ def _within(groups: Sequence[FloatArray]) -> _Within:
     return _Within(squares / freedom if freedom else 0.0, freedom, len(groups) / float(np.sum(1 / numbers)))
 
 
-def _from_means(
-    means: FloatArray, within: Sequence[_Within], *, names: Sequence[str], share: float, confidence: float
-) -> Limits:
+def _from_means(means: FloatArray, within: Sequence[_Within], *, names: Sequence[str], confidence: float) -> Limits:
     n = len(means)
     if n < 2:
         raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
     between = float(means.var(ddof=1))
     total = between + sum(one.restored for one in within)
-    bias, z = float(means.mean()), _normal(0.5 + 0.5 * share)
+    bias, z = float(means.mean()), _normal(0.5 + 0.5 * SHARE)
     low, high = bias - z * math.sqrt(total), bias + z * math.sqrt(total)
     parts = [(between, n - 1), *((one.restored, one.freedom) for one in within)]
-    wide, narrow = _recovered(parts, total, share=z, bias_variance=between / n, confidence=confidence)
+    wide, narrow = _recovered(parts, total, z=z, bias_variance=between / n, confidence=confidence)
     t = student(n - 1, confidence=confidence) * math.sqrt(between / n)
     return Limits(
         n=n,
@@ -227,7 +223,7 @@ def _from_means(
 
 
 def _recovered(
-    parts: Sequence[tuple[float, int]], total: float, *, share: float, bias_variance: float, confidence: float
+    parts: Sequence[tuple[float, int]], total: float, *, z: float, bias_variance: float, confidence: float
 ) -> Ends:
     """Outer and inner reach of the interval of a limit, from chi-squared intervals of each variance (Zou 2013)."""
     from scipy.special import chdtri
@@ -241,8 +237,8 @@ def _recovered(
         above += (variance * (1 - freedom / float(chdtri(freedom, 1 - tail)))) ** 2
     low, high = math.sqrt(max(0.0, total - math.sqrt(below))), math.sqrt(total + math.sqrt(above))
     of_bias = _normal(1 - tail) ** 2 * bias_variance
-    wide = math.sqrt(of_bias + (share * (high - math.sqrt(total))) ** 2)
-    narrow = math.sqrt(of_bias + (share * (math.sqrt(total) - low)) ** 2)
+    wide = math.sqrt(of_bias + (z * (high - math.sqrt(total))) ** 2)
+    narrow = math.sqrt(of_bias + (z * (math.sqrt(total) - low)) ** 2)
     return wide, narrow
 
 

@@ -24,6 +24,8 @@ from tactile_bayes.presets import HEAD_PITCH_MM
 RANK_TOLERANCE: Final = 1e-5
 # Step of the tables in r: linear interpolation between entries is then off by less than 1e-4 of a function.
 _STEP_MM: Final = 0.05
+# Largest r in the tables.
+_REACH_MM: Final = 75.0
 # Functions with a sum of squares under the face below this share of a square's own compliance are left out of a frame.
 _LEAST_WEIGHT: Final = 1e-6
 # Directions of the ring that stands for a square when a function is averaged over it.
@@ -80,7 +82,6 @@ def skin_perturbation(
     lump_kpa: float,
     *,
     square_mm: float = HEAD_PITCH_MM,
-    reach_mm: float = 75.0,
     tolerance: float = RANK_TOLERANCE,
 ) -> SkinPerturbation:
     """Condense a lump's perturbation to the functions that matter.
@@ -91,15 +92,13 @@ def skin_perturbation(
         The lump's surroundings, and its modulus.
     square_mm
         Side of the squares over which load and displacement are averaged; 0 for points.
-    reach_mm
-        Radius of the tables.
     tolerance
         Share of the largest eigenvalue below which a function is left out.
     """
     parts = [(mode.order, *np.linalg.eigh(mode.matrix)) for mode in condensed.perturbation(lump_kpa)]
     largest = max(float(np.abs(value).max()) for _, value, _ in parts)
     r: FloatArray = (
-        np.arange(int(np.ceil(min(reach_mm, condensed.radius_mm[-1]) / _STEP_MM)) + 1, dtype=np.float64) * _STEP_MM
+        np.arange(int(np.ceil(min(_REACH_MM, condensed.radius_mm[-1]) / _STEP_MM)) + 1, dtype=np.float64) * _STEP_MM
     )
     tables, orders, signs = [np.zeros((len(r), 0))], [], []
     for order, value, vector in parts:

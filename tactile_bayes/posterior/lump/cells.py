@@ -185,7 +185,7 @@ def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: in
 
 
 @lru_cache(maxsize=MAPS_AT_HAND)
-def smoothed_excess(tactile_map: TactileMap, *, width_mm: float = SMOOTHING_MM) -> FloatArray:
+def smoothed_excess(tactile_map: TactileMap) -> FloatArray:
     """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data.
 
     Worked out once per map, and read-only.
@@ -194,8 +194,8 @@ def smoothed_excess(tactile_map: TactileMap, *, width_mm: float = SMOOTHING_MM) 
     excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
     weight = np.where(covered, np.sqrt(tactile_map.count.astype(np.float64)), 0.0)
     cell = tactile_map.recipe.cell_mm
-    top = _smooth(excess * weight, width_mm / cell)
-    bottom = _smooth(weight, width_mm / cell)
+    top = _smooth(excess * weight, SMOOTHING_MM / cell)
+    bottom = _smooth(weight, SMOOTHING_MM / cell)
     with np.errstate(invalid="ignore", divide="ignore"):
         smoothed = np.where(covered & (bottom > 0), top / bottom, -np.inf)
     smoothed.setflags(write=False)
