@@ -1,8 +1,8 @@
 """Ordered, resumable work over an executor: in this process, over local processes or on a dask cluster.
 
 Everything that repeats (many maps, many cases, many simulated scans) goes through `run_batch`. An item must carry all
-that its result depends on, its seed included; then the results are the same wherever and in whatever order they are
-made.
+that its result depends on, its seed included; then, on one machine and its libraries, the results are the same in
+whatever order and by however many processes they are made.
 """
 
 from __future__ import annotations

@@ -42,8 +42,8 @@ def command(
     dimensions. Cheaper for one lump: plane-strain solves the contact in two dimensions, empirical takes Eqs 1 to 4 of
     the paper. To both a lump is a cylinder along y, and a frame's profile across the head is repeated along it.
 
-    The truth goes into the scan file beside the data; no other command reads it. The same scene and seed give the
-    same bytes.
+    The truth goes into the scan file beside the data; no other command reads it. On one machine and its libraries
+    the same scene and seed give the same bytes.
     """
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.presets import RESEARCH_USE

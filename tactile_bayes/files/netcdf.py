@@ -51,7 +51,7 @@ class Variable:
 
 
 def netcdf_bytes(variables: Mapping[str, Variable], *, attributes: Mapping[str, str], group: str = "/") -> bytes:
-    """A netCDF-4 file as bytes; equal contents give equal bytes.
+    """A netCDF-4 file as bytes; equal contents give equal bytes under one version of HDF5 and zlib.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ SCHEMA = "tactile-bayes/posterior/1"
 
 
 def write_posterior(path: Path, estimate: Estimate, *, provenance: Provenance, force: bool = False) -> None:
-    """Write the draws of an estimate atomically; equal inputs give equal bytes.
+    """Write the draws of an estimate atomically; equal draws give equal bytes, see `netcdf_bytes`.
 
     Raises
     ------

@@ -221,7 +221,7 @@ def write_scan(
     truth: Mapping[str, Any] | None = None,
     force: bool = False,
 ) -> None:
-    """Write a scan; equal scans give equal bytes.
+    """Write a scan; equal scans give equal bytes under one version of zstd and protobuf.
 
     A `Scan` knows no host times: ``log_time`` is then the device time. Landmarks, which have no time, carry the first.
 

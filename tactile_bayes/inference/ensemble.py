@@ -76,7 +76,7 @@ def ensemble(
         Draws of about this density; walkers begin at some of them.
     store, key
         Where the state is kept after each block, and what it is bound to. A run goes on from a state that it finds,
-        and ends in the same draws as a run that was never stopped.
+        and on one machine ends in the same draws as a run that was never stopped.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Figures as files: PNG, PDF or SVG by the name's suffix, equal input in equal bytes."""
+"""Figures as files: PNG, PDF or SVG by the name's suffix; with the same libraries equal input gives equal bytes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Figures 5 to 8 of the paper for balls in three dimensions: what the whole head shows, along both of its axes.
 
-The empirical model (Eqs 1 to 4) is one of cylinders and is not drawn here. Equal input, equal bytes.
+The empirical model (Eqs 1 to 4) is one of cylinders and is not drawn here. On one machine and its libraries equal
+input gives equal bytes.
 """
 
 from __future__ import annotations

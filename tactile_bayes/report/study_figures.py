@@ -1,4 +1,7 @@
-"""Figures 5 to 8 of the paper, drawn from this program's own forward models. Equal input, equal bytes."""
+"""Figures 5 to 8 of the paper, drawn from this program's own forward models.
+
+On one machine and its libraries equal input gives equal bytes.
+"""
 
 from __future__ import annotations
 
