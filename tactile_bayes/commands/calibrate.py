@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.number_or import FiniteRange
+from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
@@ -62,8 +62,8 @@ def command() -> None:
     show_default=True,
     help="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed.")
-@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+@seed_option(1)
+@FORCE
 @click.pass_context
 def size(
     ctx: click.Context,
@@ -158,7 +158,7 @@ def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
 @click.option(
     "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="Day of the measurement. Default: today."
 )
-@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+@FORCE
 def array(
     steps: tuple[tuple[float, Path], ...], output: Path, head_id: str | None, day: datetime | None, force: bool
 ) -> None:

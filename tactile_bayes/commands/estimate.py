@@ -13,7 +13,7 @@ import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.moved_options import MovedOptions
-from tactile_bayes.commands.number_or import FiniteRange
+from tactile_bayes.commands.options import FORCE, FiniteRange, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.pipeline.one_map import Answer, answer_file, answer_of, estimate_file
@@ -47,7 +47,7 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     show_default=True,
     help="importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True, help="Random seed.")
+@seed_option(_DEFAULTS.seed)
 @click.option(
     "--interval", type=_PROBABILITY, default=_DEFAULTS.interval, show_default=True, help="Probability of the intervals."
 )
@@ -104,8 +104,8 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     show_default=True,
     help="Number of worker processes, for several maps.",
 )
-@click.option("--scheduler", metavar="ADDRESS", help="Send several maps to a dask scheduler (extra [cluster]).")
-@click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+@scheduler_option("several maps")
+@FORCE
 @click.option(
     "-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines, and the time taken on stderr."
 )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.options import FORCE
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.files.arrays_layout import layout_lines
 from tactile_bayes.presets import NORMALISE, RESEARCH_USE
@@ -37,7 +38,7 @@ _LONGEST_UNITS = 20
 @click.option(
     "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."
 )
-@click.option("--force", is_flag=True, help="Overwrite the output.")
+@FORCE
 def command(
     *,
     source: Path,

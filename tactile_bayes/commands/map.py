@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.number_or import NumberOr
+from tactile_bayes.commands.options import FORCE, NumberOr
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
@@ -61,7 +61,7 @@ _FILE = FilePath()
     "--register-strokes", is_flag=True, help="Align the strokes with each other, for a lump that moves with the head."
 )
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the map and its coverage.")
-@click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+@FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print the time of each step on stderr.")
 def command(
     scans: tuple[Path, ...],

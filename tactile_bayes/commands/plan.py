@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.number_or import FiniteRange
+from tactile_bayes.commands.options import FORCE, JSON, WORKERS, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 
@@ -70,11 +70,11 @@ _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other
 @click.option(
     "--trials", type=click.IntRange(50), default=1000, show_default=True, help="Number of simulated trials per design."
 )
-@click.option("--seed", type=click.IntRange(0), default=1999, show_default=True, help="Random seed.")
-@click.option("--workers", type=click.IntRange(0), default=1, show_default=True, help="Number of worker processes.")
-@click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
+@seed_option(1999)
+@WORKERS
+@JSON
 @click.option("-o", "--output", metavar="PLAN.json", type=_FILE, help="Write the plan as JSON to this file.")
-@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+@FORCE
 def command(
     patients: tuple[int, ...],
     maps: tuple[int, ...],

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.options import FORCE, WORKERS, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
@@ -36,10 +37,10 @@ _FILE = FilePath()
     show_default=True,
     help="Normalisation of the maps, as in `map`; the calibration is for maps made the same way.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=7, show_default=True, help="Random seed.")
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
-@click.option("--scheduler", metavar="ADDR", help="Send the masses to a dask scheduler (extra [cluster]).")
-@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+@seed_option(7)
+@WORKERS
+@scheduler_option("the masses")
+@FORCE
 def command(
     output: Path,
     masses: int,

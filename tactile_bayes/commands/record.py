@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
+from tactile_bayes.commands.options import FORCE
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.commands.record_request import Request
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
@@ -110,7 +111,7 @@ _CODE = "A code, not a name."
     metavar="solid-mean|plane-strain|none|SIZE.json",
     help="Size calibration of the live view, whose frames are divided by their means.",
 )
-@click.option("--force", is_flag=True, help="Overwrite the output.")
+@FORCE
 @click.pass_context
 def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
     """Record a scan head and a tracker.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from tactile_bayes.commands.options import FORCE
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -15,7 +16,7 @@ from tactile_bayes.presets import RESEARCH_USE
 @click.option(
     "-o", "--output", metavar="OUT.mcap", type=FilePath(), help="Write to this file instead of replacing SCAN.mcap."
 )
-@click.option("--force", is_flag=True, help="Overwrite the output.")
+@FORCE
 def command(*, scan: Path, output: Path | None, force: bool) -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost.
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 
+from tactile_bayes.commands.options import FORCE
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import DeviceError
 
@@ -38,7 +39,7 @@ _FILE = FilePath()
     show_default=True,
     help="Playback speed; 1 is real time.",
 )
-@click.option("--force", is_flag=True, help="Overwrite the output.")
+@FORCE
 @click.pass_context
 def command(
     ctx: click.Context,

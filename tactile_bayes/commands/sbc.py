@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.number_or import WholeOrAuto
+from tactile_bayes.commands.options import FORCE, JSON, WORKERS, WholeOrAuto, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 
@@ -40,9 +40,9 @@ _FILE = FilePath()
     show_default=True,
     help="Basis functions of the noise field, as field_cosines of `estimate`.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed.")
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
-@click.option("--scheduler", metavar="ADDR", help="Send the maps to a dask scheduler (extra [cluster]).")
+@seed_option(1)
+@WORKERS
+@scheduler_option("the maps")
 @click.option(
     "-o",
     "--output",
@@ -51,8 +51,8 @@ _FILE = FilePath()
     help="Write truths and ranks; an interrupted run resumes from it.",
 )
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the ECDFs of the ranks with their bands.")
-@click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
-@click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+@JSON
+@FORCE
 def command(
     maps: int,
     method: Method,

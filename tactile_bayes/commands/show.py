@@ -8,13 +8,14 @@ from typing import Any
 
 import click
 
+from tactile_bayes.commands.options import JSON
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
 
 @click.command("show")
 @click.argument("file", type=FilePath())
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@JSON
 def command(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance.
 

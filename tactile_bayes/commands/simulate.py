@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.head_option import head_option
+from tactile_bayes.commands.options import FORCE
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     "Default: as the scene's [head] gives them for solid, shoulders-inside for plane-strain and empirical. "
     "empirical-gaussian has none."
 )
-@click.option("--force", is_flag=True, help="Overwrite the output.")
+@FORCE
 def command(
     *, scene: Path, output: Path, seed: int | None, fidelity: str | None, head: str | None, force: bool
 ) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.number_or import FiniteRange
+from tactile_bayes.commands.options import FORCE, WORKERS, FiniteRange, scheduler_option
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
@@ -88,9 +88,9 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
     default=None,
     help="Remove what the head reads of the same body without the lump, solid only. Default: on.",
 )
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
-@click.option("--scheduler", metavar="ADDR", help="Send the geometries to a dask scheduler (extra [cluster]).")
-@click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+@WORKERS
+@scheduler_option("the geometries")
+@FORCE
 def command(
     *,
     model: str,

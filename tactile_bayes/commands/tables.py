@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.head_option import head_option
+from tactile_bayes.commands.options import JSON, WORKERS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
     help="How far the lump stands out of the gland.",
 )
 @head_option("Default: shoulders-inside.")
-@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@WORKERS
+@JSON
 def command(*, seat: str, head: str | None, workers: int, as_json: bool) -> None:
     """Recompute Tables 1 and 2 of the paper beside the printed figures.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.number_or import FiniteRange
+from tactile_bayes.commands.options import FORCE, JSON, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM
 
@@ -37,9 +37,9 @@ _FILE = FilePath()
     help="Error of an interval end below which more accuracy is not worth its cost.",
 )
 @click.option("--runs", type=click.IntRange(min=1), default=4, show_default=True, help="Number of runs to average.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--force", is_flag=True, help="Overwrite an existing figure.")
+@seed_option(1)
+@JSON
+@FORCE
 def command(
     *,
     map_file: Path,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.number_or import FiniteRange
+from tactile_bayes.commands.options import FORCE, JSON, FiniteRange
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ LEARNED = "learned"
 @click.option(
     "--runs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of runs; the shortest time counts."
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--force", is_flag=True, help="Overwrite an existing figure.")
+@JSON
+@FORCE
 def command(
     *,
     scene: Path | None,

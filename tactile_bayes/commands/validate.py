@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from tactile_bayes.commands.number_or import FiniteRange
+from tactile_bayes.commands.options import FORCE, JSON, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.trial import TrialOutcome, TrialSettings, analyse
@@ -37,7 +37,7 @@ _DEFAULTS = TrialSettings()
     show_default=True,
     help="Number of bootstrap resamples.",
 )
-@click.option("--seed", type=click.IntRange(0), default=_DEFAULTS.seed, show_default=True, help="Random seed.")
+@seed_option(_DEFAULTS.seed)
 @click.option(
     "--error-ratio",
     type=FiniteRange(1e-6, 1e6),
@@ -56,13 +56,13 @@ _DEFAULTS = TrialSettings()
     "--bayes", is_flag=True, help="Predict the error of the next mass, by an errors-in-variables model and MCMC."
 )
 @click.option("--methods", is_flag=True, help="Also print lines, limits of agreement, repeatability and pairs.")
-@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+@JSON
 @click.option("-o", "--output", metavar="REPORT.json", type=_FILE, help="Write the report as JSON to this file.")
 @click.option("--html", metavar="REPORT.html", type=_FILE, help="Write tables and figures as one self-contained page.")
 @click.option(
     "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis; the report records its hash."
 )
-@click.option("--force", is_flag=True, help="Overwrite an existing output.")
+@FORCE
 def command(
     trial: Path,
     excision: Path,

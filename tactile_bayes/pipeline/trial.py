@@ -57,8 +57,8 @@ def analyse(
         File and title of the pre-specified analysis, where there is one.
     """
     from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.report.trial_document import as_document, checks_document
     from tactile_bayes.trial.check_intervals import check_all
-    from tactile_bayes.trial.document import as_document, checks_document
     from tactile_bayes.trial.summary import summarise
 
     confidence = intervals_of(settings)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tactile_bayes.files.schema import dump_json
+from tactile_bayes.report.trial_document import as_document
 from tactile_bayes.trial import accuracy, origin_line, spread
 from tactile_bayes.trial.comparison import mape_ratios
-from tactile_bayes.trial.document import as_document
 from tactile_bayes.trial.jackknife import UndefinedError
 from tactile_bayes.trial.readings import ModalitySizes, Reading
 from tactile_bayes.trial.summary import TrialReport, modality_report, summarise

@@ -69,12 +69,14 @@ class CollapsedTarget:
         self._lengths: dict[float, FieldColumns] = {}
         self._fields: list[FieldColumns] | None = None
         self._made_up = 0.0
+        self.dof = self._count_dof()
 
     def of_scene(self, scene: Scene) -> CollapsedTarget:
         """The same window and priors with another scene, fields not settled."""
         if scene.tilt == self.scene.tilt:
             other = copy(self)
             other.scene, other._fields, other._made_up = scene, None, 0.0
+            other.dof = other._count_dof()
             return other
         return CollapsedTarget(self.problem, scene)
 
@@ -93,8 +95,7 @@ class CollapsedTarget:
         """Amplitudes: the bump's, and that of what lies beside it."""
         return 2 if self.scene.extra else 1
 
-    @property
-    def dof(self) -> int:
+    def _count_dof(self) -> int:
         """Degrees of freedom of the noise scale."""
         return max(len(self.window.cells) - len(self._plain) + 1 - self.structures, 1)
 

@@ -5,8 +5,9 @@ Or a ridge in the bump's place: what a lump's evidence is held against where a r
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -39,6 +40,18 @@ STEP = {
 }
 """About one posterior standard deviation of each parameter: steps of the search for the mode."""
 
+_BUMP_NAMES: Final[Mapping[Shape, tuple[str, ...]]] = {
+    "round": ("u", "x", "y"),
+    "ellipse": ("u", "v", "x", "y"),
+    "rotated": ("u", "v", "x", "y", "r"),
+    "ridge": ("u", "along", "across"),
+}
+_NEIGHBOUR_NAMES: Final[Mapping[Extra, tuple[str, ...]]] = {
+    "": (),
+    "second lump": ("x2", "y2", "w2"),
+    "rib": ("angle", "offset", "w2"),
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Scene:
@@ -65,14 +78,7 @@ class Scene:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the shape parameters, the most important first (see `importance`)."""
-        bump = {
-            "round": ("u", "x", "y"),
-            "ellipse": ("u", "v", "x", "y"),
-            "rotated": ("u", "v", "x", "y", "r"),
-            "ridge": ("u", "along", "across"),
-        }
-        beside = {"": (), "second lump": ("x2", "y2", "w2"), "rib": ("angle", "offset", "w2")}
-        return bump[self.shape] + beside[self.extra]
+        return _BUMP_NAMES[self.shape] + _NEIGHBOUR_NAMES[self.extra]
 
     @property
     def steps(self) -> FloatArray:

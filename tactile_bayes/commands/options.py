@@ -1,8 +1,9 @@
-"""Options that take a finite number, or a number or one of a few words."""
+"""Options that several commands have, and types of values: a finite number, or a number or one of a few words."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,6 +12,9 @@ if TYPE_CHECKING:
     _ParamType = click.ParamType[Any]
 else:
     _ParamType = click.ParamType  # takes no parameter before click 8.4
+
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class WholeOrAuto(click.IntRange):
@@ -56,3 +60,20 @@ class NumberOr(_ParamType):
             return float(value)
         except ValueError:
             self.fail(f"{value!r} is not a number, nor {' nor '.join(map(repr, self.words))}", param, ctx)
+
+
+FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+WORKERS = click.option(
+    "--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes."
+)
+
+
+def seed_option(default: int) -> Decorator:
+    """``--seed`` with a command's default."""
+    return click.option("--seed", type=click.IntRange(min=0), default=default, show_default=True, help="Random seed.")
+
+
+def scheduler_option(what: str) -> Decorator:
+    """``--scheduler``; `what` is sent to it, in words."""
+    return click.option("--scheduler", metavar="ADDRESS", help=f"Send {what} to a dask scheduler (extra [cluster]).")
