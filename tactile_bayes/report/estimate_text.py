@@ -62,7 +62,13 @@ def estimate_text(
     lines = [*_cautions(estimate), *size_table(quantities, probability), ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
-    lines += [*_findings(estimate, quantities), *_scene(estimate), *warnings(estimate), *_left_out(estimate)]
+    lines += [
+        *_findings(estimate, quantities),
+        *_scene(estimate),
+        *warnings(estimate),
+        *passed_over(estimate),
+        *_left_out(estimate),
+    ]
     lines += [] if prior is None else [prior_line(prior, field=estimate.scene is not None)]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
@@ -149,7 +155,7 @@ def _cautions(estimate: Estimate) -> list[str]:
 
 
 def warnings(estimate: Estimate) -> list[str]:
-    """What a reader should check: the cells, the level about the lump, other places that were passed over."""
+    """What makes the size less certain than its interval says: coarse cells, a level about the lump that is off."""
     found, lines = estimate.diagnostics, []
     if found is not None and found.coarse_cells:
         lines.append("The cells are coarse for this width: map again with a smaller --cell-mm.")
@@ -159,7 +165,7 @@ def warnings(estimate: Estimate) -> list[str]:
             f"The level about the bump is {offset:+.3f} off the fixed background: something else bears on the head "
             "(a rib, a second mass), or the lump is large for it; the size is less certain than the interval says."
         )
-    return lines + passed_over(estimate)
+    return lines
 
 
 def passed_over(estimate: Estimate) -> list[str]:
