@@ -61,7 +61,9 @@ def simulate(
                 "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
                 way_out="leave --head out, or choose another --fidelity",
             )
-        scene = replace(scene, head=scene.head.with_shoulders(head))
+        # In two dimensions that is what the section is without a word, and the scan has the scene's own head.
+        if chosen == "solid" or head != SHOULDERS_INSIDE:
+            scene = replace(scene, head=scene.head.with_shoulders(head))
     if chosen == "solid":
         from tactile_bayes.forward.solid.scan import simulate_solid
 
