@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
+from tactile_bayes.commands.head_option import head_option
 from tactile_bayes.commands.options import FORCE, JSON, FiniteRange
 from tactile_bayes.commands.paths import FilePath
 
@@ -29,6 +30,9 @@ LEARNED = "learned"
     help="Calibration for the sizes: a shipped one, your own file, or Eq 6 learned in this run. Default: each "
     "model's own.",
 )
+@head_option(
+    "Default: shoulders-inside for plane-strain and the empirical model, as the scene's [head] gives them for solid."
+)
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error in size against time.")
 @click.option(
     "--tolerance-percent",
@@ -46,6 +50,7 @@ def command(
     *,
     scene: Path | None,
     size_calibration: str | None,
+    head: str | None,
     figure: Path | None,
     tolerance_percent: float,
     runs: int,
@@ -60,7 +65,8 @@ def command(
 
     Sizes come from the calibration that `estimate` uses, and the cylinder's from `plane-strain`. These maps have no
     noise and a background of 1, so a size may be off; what counts is how it changes, which is given in mm and percent.
-    With --size-calibration learned Eq 6 is learned from each model's own lumps in the same body, in most of a minute.
+    With --size-calibration learned Eq 6 is learned, in most of a minute, from each model's own lumps in the same body
+    and under the same head; the calibrations that come with the program are of the default heads.
 
     Example: tactile-bayes tradeoff forward --figure tradeoff.png
     """
@@ -76,7 +82,7 @@ def command(
         refuse_existing(figure, force=force)
     if size_calibration not in (None, "learned"):
         also_read(size_calibration_path(size_calibration))
-    report = run_tradeoff(_case(scene), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
+    report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
     if figure is not None:
         from tactile_bayes.report.tradeoff_figures import draw_tradeoff
 
@@ -90,7 +96,7 @@ def command(
     click.echo(RESEARCH_USE)
 
 
-def _case(path: Path | None) -> LumpCase:
+def _case(path: Path | None, head: str | None) -> LumpCase:
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.scene_toml import read_scene
     from tactile_bayes.forward.scene import Scene
@@ -98,9 +104,9 @@ def _case(path: Path | None) -> LumpCase:
     from tactile_bayes.studies.forward_tradeoff import case_of
 
     if path is None:
-        return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)))
+        return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
     try:
-        return case_of(read_scene(path))
+        return case_of(read_scene(path), head=head)
     except BadDataError as error:
         raise error.at(path) from None
 

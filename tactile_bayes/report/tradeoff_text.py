@@ -68,6 +68,7 @@ def tradeoff_text(report: TradeoffReport) -> str:
     lines = [
         f"ball of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat, "
         f"{seat_name(case.seat)}",
+        f"head: {', '.join(f'{where} ({model})' for model, where in case.heads.items())}",
         "",
         f"{'':<{_NAME}}{'element':>8}{'a lump':>8}{'a map':>8}{'':>8}{'sigma_x':>8}{'sigma_y':>8}{'size':>7}"
         f"   off from the model's finest, %       mm",
@@ -160,6 +161,7 @@ def tradeoff_document(report: TradeoffReport) -> dict[str, Any]:
             "stiffness_ratio": case.stiffness_ratio,
             "seat": case.seat,
         },
+        "head": case.heads,
         "tolerance": report.tolerance,
         "sizes": {model: {"source": rule.source, "sd_ln_d": rule.scatter} for model, rule in report.rules.items()},
         "settings": [_row(one, report) for one in report.found],

@@ -61,6 +61,11 @@ class LumpCase:
         """Geometry and tissues."""
         return self.plane.body(self.d_mm, self.depth_ratio, seat=self.seat)
 
+    @property
+    def heads(self) -> dict[str, str]:
+        """Where the shoulders of each model's head lie, of `presets.HEADS`."""
+        return {PLANE: self.plane.head.shoulders, SOLID: self.solid.head.shoulders}
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:
@@ -117,8 +122,14 @@ class Measured:
         return self.lump_s + self.map_s
 
 
-def case_of(scene: Scene) -> LumpCase:
+def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
     """The lump of a scene, and both models' settings for its body and head.
+
+    Parameters
+    ----------
+    head
+        One of `presets.HEADS`: where the shoulders of the scene's head lie, in both models. None: inside the array in
+        two dimensions, and as the scene gives them in three.
 
     Raises
     ------
@@ -133,14 +144,15 @@ def case_of(scene: Scene) -> LumpCase:
         raise BadDataError(f"lump[0].height_mm is {lump.vertical_mm:g}", way_out="leave it out: both models are round")
     seat = (fat_thickness(body, [lump]) - lump.depth_mm) / (lump.d_mm / 2)
     tissue = (scene.background.mean_kpa, body.nu, body.fat_kpa, body.gland_ratio, body.thickness_mm)
-    section = scene.head.section(SHOULDERS_INSIDE)
+    section = scene.head.section(head or SHOULDERS_INSIDE)
+    array = scene.head if head is None else scene.head.with_shoulders(head)
     case = LumpCase(
         lump.d_mm,
         lump.depth_ratio,
         lump.stiffness_ratio,
         round(seat, 9) + 0.0,
         StudySettings(section, *tissue),
-        SolidSettings(scene.head, *tissue, background="fixed", flat_field=False),
+        SolidSettings(array, *tissue, background="fixed", flat_field=False),
     )
     _ = case.body  # refuses what neither model can do
     return case
@@ -161,8 +173,9 @@ def settings_of(case: LumpCase) -> list[Setting]:
         found.append(Setting(SOLID, f"rank tolerance {rank:g}", replace(case.solid, rank_tolerance=rank), "rank"))
     for reach in _REACHES_MM:
         found.append(Setting(SOLID, f"mesh ends at {reach:g} mm", replace(case.solid, mesh_reach_mm=reach), "reach"))
-    bare = replace(case.solid, head=replace(case.solid.head, rim_mm=0.0))
-    found.append(Setting(SOLID, "head without its rim", bare, "rim"))
+    edge = "shoulders" if case.solid.head.shoulders == SHOULDERS_INSIDE else "rim"
+    bare = replace(case.solid, head=replace(case.solid.head, shoulder_mm=0.0, rim_mm=0.0))
+    found.append(Setting(SOLID, f"head without its {edge}", bare, "rim"))
     return [setting for setting in found if setting.kind != "reference"] + [
         setting for setting in found if setting.kind == "reference"
     ]

@@ -12,7 +12,9 @@ from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from tactile_bayes.commands import tradeoff_forward
 from tactile_bayes.commands.study import fit_line
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.files.shipped import size_calibration_path
@@ -20,6 +22,7 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.forward.plane.study import Geometry, StudyRow, StudySettings, run_geometry
 from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
+from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document, tradeoff_text
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
@@ -40,7 +43,8 @@ from tactile_bayes.studies.raster import fit_raster
 from tactile_bayes.studies.size_rules import SizeRule, calibrated_rule, learned_rule
 
 Run = Callable[..., "CompletedProcess[str]"]
-CASE = case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)))
+BALL = SolidLump(seat=0.0)
+CASE = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)))
 SETTINGS = settings_of(CASE)
 
 
@@ -88,6 +92,41 @@ def test_a_scene_gives_its_body_and_head_to_both_models() -> None:
             0.49,
         )
         assert settings.head.radius_mm == 40.0
+
+
+def test_the_head_is_that_of_both_models_and_moves_their_numbers() -> None:
+    scene = Scene(body=SceneBody(), solid_lumps=(SolidLump(depth_ratio=1.5, seat=0.0),))
+    cases = {head: case_of(scene, head=head) for head in (None, *HEADS)}
+    plain, inside, outside = cases.values()
+    assert (plain.plane, plain.solid) == (inside.plane, outside.solid)  # each model's default, by name
+    assert plain.heads == {PLANE: SHOULDERS_INSIDE, SOLID: SHOULDERS_OUTSIDE}
+    for head in HEADS:
+        assert cases[head].heads == dict.fromkeys((PLANE, SOLID), head)
+    assert inside.solid.head.surface_mm()[0, 0, 2] < outside.solid.head.surface_mm()[0, 0, 2]
+    seen = []
+    for case in (inside, outside):
+        setting = next(one for one in settings_of(case) if one.model == PLANE)
+        seen.append(measure(case, setting, fit=fit_line, raster_fit=fit_raster, clock=lambda: 0.0).amplitude)
+    assert seen[1] > 1.2 * seen[0]
+
+
+@pytest.mark.parametrize(("head", "edge"), [(None, "rim"), (SHOULDERS_INSIDE, "shoulders")])
+def test_the_head_without_its_edge_is_another_head(head: str | None, edge: str) -> None:
+    case = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head)
+    (bare,) = (one for one in settings_of(case) if one.kind == "rim")
+    assert bare.label == f"head without its {edge}"
+    assert (bare.settings.head.shoulder_mm, bare.settings.head.rim_mm) == (0.0, 0.0)
+    assert bare.settings != case.solid
+
+
+@pytest.mark.parametrize("head", [None, *HEADS])
+def test_the_command_hands_its_head_on_and_names_it(head: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tradeoff_forward, "run_tradeoff", lambda case, *_, **__: report(case))
+    words = [] if head is None else ["--head", head]
+    found = {form: CliRunner().invoke(tradeoff_forward.command, [*words, *form]) for form in ((), ("--json",))}
+    heads = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head).heads
+    assert json.loads(found[("--json",)].stdout)["head"] == heads
+    assert f"head: {heads[PLANE]} (plane-strain), {heads[SOLID]} (solid)" in found[()].stdout
 
 
 def test_eq_6_is_learned_axis_by_axis_and_says_what_it_leaves() -> None:
@@ -186,7 +225,6 @@ def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 
-BALL = SolidLump(seat=0.0)
 REFUSED = {
     "bumps": (Scene(lumps=(Lump(),)), "the scene has bumps; give one lump of tissue"),
     "none": (Scene(), "the scene has 0 lumps"),
