@@ -213,7 +213,9 @@ def _one_map(
     from tactile_bayes.commands.progress import progress_bar
 
     with progress_bar("effective draws") as progress:
-        outcome = estimate_file(path, settings, progress=progress)
+        outcome = estimate_file(
+            path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
+        )
     tactile_map, estimate = outcome.tactile_map, outcome.estimate
     if output and estimate.status == "estimate":
         from tactile_bayes.files.posterior_nc import write_posterior

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tactile_bayes.size.pooling import ShapeDraws, SizePriors
 
 Progress = Callable[[int, int], None]
+Notice = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +69,15 @@ def answer_file(path: Path, *, settings: Settings) -> Answer:
         return Answer(None, f"error: {text}", error.exit_code)
 
 
-def estimate_file(path: Path, settings: Settings, *, progress: Progress | None = None) -> Outcome:
-    """Read a map and estimate."""
+def estimate_file(
+    path: Path, settings: Settings, *, progress: Progress | None = None, notice: Notice | None = None
+) -> Outcome:
+    """Read a map and estimate; see `estimate_one`."""
     from tactile_bayes.files.map_nc import read_map
 
     tactile_map = read_map(path)
     try:
-        return estimate_one(tactile_map, settings, inputs={"map": path}, progress=progress)
+        return estimate_one(tactile_map, settings, inputs={"map": path}, progress=progress, notice=notice)
     except BadDataError as error:
         raise error.at(path) from None
 
@@ -85,6 +88,7 @@ def estimate_one(
     *,
     inputs: Mapping[str, Path] | None = None,
     progress: Progress | None = None,
+    notice: Notice | None = None,
 ) -> Outcome:
     """Choose the calibration and the options that fit a map, and estimate.
 
@@ -94,6 +98,8 @@ def estimate_one(
         Files that the map came from, by role, for the provenance.
     progress
         Called with draws done and wanted.
+    notice
+        Called before the work with a line that a user may want to read while waiting.
 
     Raises
     ------
@@ -108,6 +114,7 @@ def estimate_one(
 
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import SHIPPED, default_for
+    from tactile_bayes.mapping.fine_cells import many_cells
     from tactile_bayes.posterior.drawn import fitting_calibration
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
     from tactile_bayes.posterior.other_rises import other_rises
@@ -116,6 +123,8 @@ def estimate_one(
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
     options = _options(settings, calibration, tactile_map)
+    if notice is not None and (line := many_cells(tactile_map, options.fit.radius_mm)) is not None:
+        notice(line)
     if calibration is not None:
         calibration = calibration_for(tactile_map, calibration)
     files = {**(inputs or {}), **({"size_calibration": source} if source else {})}

@@ -370,3 +370,14 @@ def test_a_place_or_a_range_that_makes_no_sense_is_a_usage_error(
 ) -> None:
     done = run_here("estimate", "a.nc", *FAST, "--size-calibration", "none", *words, cwd=folder)
     assert (done.returncode, message in done.stderr) == (2, True), done.stderr
+
+
+def test_a_map_of_far_too_many_cells_is_told_before_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("estimate", "a.nc", *FAST, "--size-calibration", "size.json", "--json")
+    plain = run_here(*words, cwd=folder)
+    assert plain.stderr == ""
+    monkeypatch.setattr("tactile_bayes.mapping.fine_cells.MANY_CELLS", 500)
+    told = run_here(*words, cwd=folder)
+    assert told.stderr.startswith("a.nc: about ")
+    assert told.stderr.count("\n") == 1
+    assert (told.returncode, told.stdout) == (plain.returncode, plain.stdout)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths, principal_widths
@@ -9,7 +11,17 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.lump.cells import FitCells
 from tactile_bayes.records import dataclass
 
+BLOCK, LEAST_BLOCK = 64, 4
+"""Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""
+BLOCK_VALUES = 512 * 1024
+"""Cells times vectors in a block: beyond 8192 cells a block has fewer vectors, but `LEAST_BLOCK`."""
+
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+
+def block_size(cells: int) -> int:
+    """Parameter vectors to predict at a time for a window of so many cells."""
+    return min(BLOCK, max(LEAST_BLOCK, BLOCK_VALUES // max(cells, 1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +121,13 @@ class Bump:
 
     def predict(self, theta: FloatArray, cells: FitCells) -> FloatArray:
         """(m, k) map values of (m, p) parameter vectors: Eq 7 averaged over the cells."""
-        return self.level(theta)[:, None] + theta[:, 0, None] * self.unit_bump(theta, cells)
+        size = block_size(len(cells))
+        if len(theta) > size:
+            return np.concatenate([self.predict(theta[i : i + size], cells) for i in range(0, len(theta), size)])
+        values = self.unit_bump(theta, cells)
+        values *= theta[:, 0, None]
+        values += self.level(theta)[:, None]
+        return values
 
     def log_prior(self, theta: FloatArray, prior: BumpPrior) -> FloatArray:
         """(m,) log density of the priors; flat in the background; the centre's is the window's."""
@@ -130,22 +148,29 @@ def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: Float
 
     It is the same formula. Its exponential is a product and its fourth cumulant a sum of what rows and columns have.
     """
-    column, row = cells.column - cells.column.min(), cells.row - cells.row.min()
-    x, x_fourth = _profile(cells.x_mm, column, centre_mm=x_mm, sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
-    y, y_fourth = _profile(cells.y_mm, row, centre_mm=y_mm, sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
+    x_axis, y_axis, place = _lattice(cells)
+    x, x_fourth = _profile(x_axis, centre_mm=x_mm, sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
+    y, y_fourth = _profile(y_axis, centre_mm=y_mm, sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
     bump = (1.0 - y_fourth)[:, :, None] - x_fourth[:, None, :]
     bump *= x[:, None, :]
     bump *= y[:, :, None]
-    return np.asarray(bump.reshape(len(bump), -1).take(row * x.shape[1] + column, axis=1))
+    return np.asarray(bump.reshape(len(bump), -1).take(place, axis=1))
+
+
+@lru_cache(maxsize=2)
+def _lattice(cells: FitCells) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Places of the window's columns and rows, and where each cell lies in the grid of them; kept for the next call."""
+    column, row = cells.column - cells.column.min(), cells.row - cells.row.min()
+    x_axis, y_axis = np.zeros(int(column.max()) + 1), np.zeros(int(row.max()) + 1)
+    x_axis[column], y_axis[row] = cells.x_mm, cells.y_mm
+    return x_axis, y_axis, row * len(x_axis) + column
 
 
 def _profile(
-    place_mm: FloatArray, index: IntArray, *, centre_mm: FloatArray, sigma_mm: FloatArray, cell_mm: float
+    axis_mm: FloatArray, *, centre_mm: FloatArray, sigma_mm: FloatArray, cell_mm: float
 ) -> tuple[FloatArray, FloatArray]:
     """(m, n) Gaussians averaged over the cells of an axis to second order, and the share that the fourth takes off."""
-    axis = np.zeros(int(index.max()) + 1)
-    axis[index] = place_mm
     wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
-    square = (axis - centre_mm[:, None]) ** 2 / wide
+    square = (axis_mm - centre_mm[:, None]) ** 2 / wide
     gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
     return gaussian, cell_mm**4 / 2880.0 * (square * (square - 6.0) + 3.0) / wide**2

@@ -9,11 +9,9 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.cache import Solved
 from tactile_bayes.inference.least_squares import ModelFunction
+from tactile_bayes.posterior.lump.bump import block_size
 from tactile_bayes.posterior.white.residuals import ErrorModel
 from tactile_bayes.records import dataclass
-
-BLOCK = 64
-"""Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""
 
 LogPrior = Callable[[FloatArray], FloatArray]
 
@@ -58,13 +56,16 @@ class Target:
 
     def excess(self, theta: FloatArray) -> FloatArray:
         """(m,) rise of the weighted sum of squares above its minimum, divided by the inflation."""
-        sse = np.concatenate([self._sse(theta[i : i + BLOCK]) for i in range(0, len(theta), BLOCK)])
+        size = block_size(len(self.data))
+        sse = np.concatenate([self._sse(theta[i : i + size]) for i in range(0, len(theta), size)])
         rise = np.clip(sse - self.sse_min, 0.0, None) / self.errors.inflation
         return np.where(np.isfinite(rise), rise, np.inf)
 
     def _sse(self, theta: FloatArray) -> FloatArray:
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray((self.data - self.predict(theta)) ** 2 @ self.weight)
+            off = self.data - self.predict(theta)
+            off *= off
+            return np.asarray(off @ self.weight)
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """(m,) log density of (m, p) parameter vectors; -inf where the model overflows."""
