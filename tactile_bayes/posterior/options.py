@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tactile_bayes.errors import UsageError
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.presets import Background, Method, Noise, Rotation, SceneAsked
+from tactile_bayes.presets import METHODS, Background, Method, Noise, Rotation, SceneAsked
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.pooling import SizePriors
 
@@ -102,7 +102,9 @@ class EstimateOptions:
 
 
 def check_options(options: EstimateOptions) -> None:
-    """Refuse options that contradict each other."""
+    """Refuse options that contradict each other, or that do not exist."""
+    if options.method not in METHODS:
+        raise UsageError(f"method is {options.method!r}; give one of {', '.join(METHODS)}")
     if not options.fit.correlated:
         asked = {"scene": options.scene not in ("auto", "none"), "accuracy in mm": options.accuracy_mm is not None}
         asked |= {"checkpoint": options.store is not None}

@@ -201,7 +201,7 @@ def test_too_few_steps_are_not_convergence() -> None:
 
 
 def test_an_unknown_method_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown method"):
+    with pytest.raises(UsageError, match="method is 'guess'; give one of optimise, laplace"):
         run(method="guess")
 
 

@@ -31,7 +31,7 @@ def test_weighing_draws_anew_is_the_other_posterior() -> None:
     assert found.median["sigma_x_mm"] == pytest.approx((wider - middle) / narrow, abs=0.01)
     upper = (wider + 1.96 * wide - middle - 1.96 * narrow) / narrow
     assert found.ends["sigma_x_mm"] == pytest.approx(upper, abs=0.02)
-    assert "would move by +0." in sensitivity_line(found)
+    assert "would move the median of sigma_x by +0.16 SD" in sensitivity_line(found)
     # the negative control: a width that the data give alone does not move
     sharp = np.exp(np.log(5.0) + 0.01 * rng.standard_normal((1, 8000)))
     assert abs(prior_sensitivity(sharp, sharp, {"sigma_x_mm": sharp}, prior).median["sigma_x_mm"]) < 0.01
