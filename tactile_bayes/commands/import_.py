@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,7 +76,7 @@ def command(
 
 _HEADING = "Arrays of a scan in an .npz file, in mm, kPa and s, for n frames and m poses:"
 _ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines()])
-command.help = f"{command.help}\n\n{_ARRAYS}"
+command.help = f"{cleandoc(command.help or '')}\n\n{_ARRAYS}"
 
 
 def _kind_of(source: Path, output: Path) -> str:

@@ -1,25 +1,64 @@
-"""The arrays of a scan in an .npz file, in words: for the help of `import` and its errors."""
+"""The arrays of a scan in an .npz file, in words: for the help of `import`, its errors and docs/formats.md."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 Shape = tuple[str | int, ...]
-LAYOUT: Final[dict[str, tuple[Shape, str]]] = {
-    "counts": (("n", "rows", "columns"), "raw readings, 0 to 65535; rows across the head (x), columns along it (y)"),
-    "frame_time_s": (("n",), "time of each frame"),
-    "position_mm": (("m", 3), "tracker sensor in the tracker's base frame"),
-    "quaternion_wxyz": (("m", 4), "its rotation, scalar first, from the sensor to the base frame"),
-    "pose_time_s": (("m",), "time of each pose, on the frames' clock"),
-    "gain_kpa_per_count": (("rows", "columns"), "pressure in kPa = gain x counts + offset"),
-    "offset_kpa": (("rows", "columns"), "see gain_kpa_per_count"),
-    "pitch_mm": ((), "distance between neighbouring elements"),
-    "array_from_tracker": ((4, 4), "transform from the tracker sensor to the scan head, mm"),
-    "head_surface_mm": (("rows", "columns", 3), "element centres; origin at the apex of the face, z into the tissue"),
-    "landmarks_mm": ((2, 3), "sternal notch and xiphoid in the base frame"),
-    "saturation_count": ((), "readings at or above it carry no pressure; 4095 if left out"),
+
+
+class ArrayLayout(NamedTuple):
+    """One array of a scan in an .npz file.
+
+    Parameters
+    ----------
+    shape
+        Lengths of its axes; n frames, m poses. Letters are lengths that must agree between arrays.
+    meaning
+        What it holds.
+    kind
+        Numbers it may have: ``integer`` or ``real``.
+    unit
+        Of its numbers; ``1`` where they have none.
+    frame
+        Coordinate frame of places and directions, or the clock of times; empty where there is none.
+    """
+
+    shape: Shape
+    meaning: str
+    kind: str = "real"
+    unit: str = "1"
+    frame: str = ""
+
+
+LAYOUT: Final[dict[str, ArrayLayout]] = {
+    "counts": ArrayLayout(
+        ("n", "rows", "columns"), "raw readings, 0 to 65535; rows across the head (x), columns along it (y)", "integer"
+    ),
+    "frame_time_s": ArrayLayout(("n",), "time of each frame", unit="s", frame="the frames' clock"),
+    "position_mm": ArrayLayout(("m", 3), "tracker sensor in the tracker's base frame", unit="mm", frame="base"),
+    "quaternion_wxyz": ArrayLayout(
+        ("m", 4), "its rotation, scalar first, from the sensor to the base frame", frame="base from sensor"
+    ),
+    "pose_time_s": ArrayLayout(("m",), "time of each pose, on the frames' clock", unit="s", frame="the frames' clock"),
+    "gain_kpa_per_count": ArrayLayout(
+        ("rows", "columns"), "pressure in kPa = gain x counts + offset", unit="kPa/count"
+    ),
+    "offset_kpa": ArrayLayout(("rows", "columns"), "see gain_kpa_per_count", unit="kPa"),
+    "pitch_mm": ArrayLayout((), "distance between neighbouring elements", unit="mm"),
+    "array_from_tracker": ArrayLayout(
+        (4, 4), "transform from the tracker sensor to the scan head, mm", unit="mm", frame="scanhead from sensor"
+    ),
+    "head_surface_mm": ArrayLayout(
+        ("rows", "columns", 3),
+        "element centres; origin at the apex of the face, z into the tissue",
+        unit="mm",
+        frame="scanhead",
+    ),
+    "landmarks_mm": ArrayLayout((2, 3), "sternal notch and xiphoid in the base frame", unit="mm", frame="base"),
+    "saturation_count": ArrayLayout((), "readings at or above it carry no pressure; 4095 if left out"),
 }
-"""Shape and meaning of each array; n frames, m poses. Letters are lengths that must agree between arrays."""
+"""Each array by its name."""
 OPTIONAL: Final = ("landmarks_mm", "saturation_count")
 
 
@@ -31,4 +70,4 @@ def in_words(shape: Shape) -> str:
 def layout_lines() -> list[str]:
     """A line for each array."""
     left_out = dict.fromkeys(OPTIONAL, ", may be left out")
-    return [f"- {name} ({in_words(shape)}{left_out.get(name, '')}): {what}" for name, (shape, what) in LAYOUT.items()]
+    return [f"- {name} ({in_words(one.shape)}{left_out.get(name, '')}): {one.meaning}" for name, one in LAYOUT.items()]

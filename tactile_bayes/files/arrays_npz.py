@@ -31,7 +31,7 @@ def read_arrays(path: Path) -> Scan:
     """
     try:
         required = [name for name in LAYOUT if name not in OPTIONAL]
-        shapes = {name: in_words(shape) for name, (shape, _) in LAYOUT.items()}
+        shapes = {name: in_words(layout.shape) for name, layout in LAYOUT.items()}
         arrays = load_npz(path, required=required, optional=OPTIONAL, shapes=shapes)
         _check_shapes(arrays)
         _check_numbers(arrays)
@@ -44,7 +44,7 @@ def read_arrays(path: Path) -> Scan:
 def _check_shapes(arrays: Arrays) -> None:
     lengths: dict[str, tuple[int, str]] = {}  # letter -> length, and the array that set it
     for name, array in arrays.items():
-        want, _ = LAYOUT[name]
+        want = LAYOUT[name].shape
         fits = array.ndim == len(want)
         for letter, have in zip(want, array.shape, strict=False):
             length = letter if isinstance(letter, int) else lengths.setdefault(letter, (have, name))[0]

@@ -126,8 +126,8 @@ def test_a_grid_in_npz_becomes_a_map_where_the_output_says_so(run_cli: Run, tmp_
 
 def test_the_help_has_the_layout_that_the_reader_checks() -> None:
     said = command.help or ""
-    for name, (shape, _) in LAYOUT.items():
-        assert f"- {name} ({in_words(shape)}" in said
+    for name, layout in LAYOUT.items():
+        assert f"- {name} ({in_words(layout.shape)}" in said
     for line in ("- head_surface_mm (rows, columns, 3): ", "- pitch_mm (one number): ", "- frame_time_s (n): "):
         assert line in said
 
