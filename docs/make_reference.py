@@ -1,4 +1,4 @@
-"""Write docs/commands.md from the commands themselves: `python docs/make_reference.py`."""
+"""Write docs/commands.md and docs/columns-and-keys.md from the program: `python docs/make_reference.py`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from typing import Any
 import click
 
 ROOT = Path(__file__).resolve().parent.parent
-TARGET = ROOT / "docs" / "commands.md"
+COMMANDS_PAGE = ROOT / "docs" / "commands.md"
+SCHEMAS_PAGE = ROOT / "docs" / "columns-and-keys.md"
 PROGRAM = "tactile-bayes"
 
 HEAD = """\
 # Command reference
 
 Generated from the program by `python docs/make_reference.py`; a test holds the two together. What the exit codes
-mean is in [exit-codes.md](exit-codes.md), how to complete words in the shell in [completion.md](completion.md).
-Every command also takes `-h` or `--help`.
+mean is in [exit-codes.md](exit-codes.md), how to complete words in the shell in
+[complete with Tab](guides/complete-with-tab.md). Every command also takes `-h` or `--help`.
 """
 
 
@@ -82,15 +83,22 @@ def _default(facts: dict[str, Any]) -> str:
     return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
 
 
-def main() -> None:
-    """Write the page, or say with ``--check`` whether it is up to date."""
-    sys.path.insert(0, str(ROOT))
+def pages() -> dict[Path, str]:
+    """What each generated page has to hold."""
+    sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+    from make_schema_page import render_schemas
+
     from tactile_bayes.cli import cli
 
-    text = render(cli)
+    return {COMMANDS_PAGE: render(cli), SCHEMAS_PAGE: render_schemas()}
+
+
+def main() -> None:
+    """Write the pages, or say with ``--check`` whether they are up to date."""
     if "--check" in sys.argv[1:]:
-        sys.exit(0 if TARGET.is_file() and TARGET.read_text(encoding="utf-8") == text else 1)
-    TARGET.write_text(text, encoding="utf-8")
+        sys.exit(0 if all(path.is_file() and path.read_text("utf-8") == text for path, text in pages().items()) else 1)
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""The documents say what the program does: the reference is fresh, every example parses, marked ones run.
+"""The documents say what the program does: generated pages are fresh, every example parses, and pages run as printed.
 
-An example is a line beginning with ``$ `` in a fence whose first word is ``console``. With a second word ``run`` it is
-also run: all of a page's in order and in one folder. A line may end in ``# exits 3``; otherwise it must end well.
+`doc_pages` says what a page's blocks are, and which may be left out of a run.
 """
 
 from __future__ import annotations
@@ -9,21 +8,24 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
-from collections.abc import Iterator
-from dataclasses import dataclass
+import tomllib
 from pathlib import Path
 
 import click
+import h5py
 import pytest
+from doc_pages import PROGRAM, Command, Reader, blocks_of, commands_of, not_printed
 
 from tactile_bayes import errors
 from tactile_bayes.cli import COMMANDS, cli
+from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-PAGES = sorted([*DOCS.glob("*.md"), *ROOT.glob("README.md")])
+PAGES = sorted([*DOCS.glob("*.md"), *(DOCS / "guides").glob("*.md"), *ROOT.glob("README.md")])
 DECISIONS = sorted((DOCS / "decisions").glob("*.md"))
-PROGRAM = "tactile-bayes"
+RUN_ELSEWHERE = (DOCS / "guides" / "python.md",)
+"""tests/api/test_pages.py runs it, and looks at what it finds."""
 
 _spec = importlib.util.spec_from_file_location("make_reference", DOCS / "make_reference.py")
 assert _spec is not None
@@ -31,48 +33,8 @@ assert _spec.loader is not None
 make_reference = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(make_reference)
 
-
-@dataclass(frozen=True)
-class Example:
-    """One command line of a page."""
-
-    page: Path
-    line: int
-    words: tuple[str, ...]
-    runs: bool
-    exit_code: int
-
-    def __str__(self) -> str:
-        return f"{self.page.name}:{self.line}"
-
-
-def examples_of(page: Path) -> Iterator[Example]:
-    """The program's command lines on a page; continued lines are joined."""
-    fence, joined, start = "", "", 0
-    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
-        stripped = line.strip()
-        if stripped.startswith("```"):
-            fence = "" if fence else stripped[3:] or "text"
-        elif fence.split()[:1] == ["console"] and (joined or stripped.startswith("$ ")):
-            start = start if joined else number
-            joined += " " + stripped.removeprefix("$ ").removesuffix("\\")
-            if not stripped.endswith("\\"):
-                yield from example(page, start, joined.strip(), runs="run" in fence.split())
-                joined = ""
-
-
-def example(page: Path, line: int, text: str, *, runs: bool) -> Iterator[Example]:
-    exits = re.search(r"\s+# exits (\d+)$", text)
-    code = int(exits[1]) if exits else 0
-    words = shlex.split(text[: exits.start()] if exits else text, comments=True)
-    if words and words[0] == PROGRAM:
-        yield Example(page, line, tuple(words[1:]), runs, code)
-    elif runs:
-        raise AssertionError(f"{page.name}:{line}: only {PROGRAM} can be run here ({text})")
-
-
-EXAMPLES = [found for page in PAGES for found in examples_of(page)]
-RUN_PAGES = sorted({found.page for found in EXAMPLES if found.runs})
+EXAMPLES = [found for page in PAGES for found in commands_of(page)]
+RUN_PAGES = sorted({found.page for found in EXAMPLES if not found.mark} - set(RUN_ELSEWHERE))
 
 
 def check_words(words: tuple[str, ...]) -> None:
@@ -102,9 +64,9 @@ def all_commands() -> list[tuple[tuple[str, ...], click.Command]]:
     return list(make_reference.every_command(cli))
 
 
-def test_the_reference_is_fresh():
-    written = (DOCS / "commands.md").read_text(encoding="utf-8")
-    assert written == make_reference.render(cli), "run `make docs`"
+def test_the_generated_pages_are_fresh():
+    for path, text in make_reference.pages().items():
+        assert path.read_text(encoding="utf-8") == text, "run `make docs`"
 
 
 def test_every_command_is_documented_with_every_option():
@@ -128,8 +90,15 @@ def test_every_command_and_option_has_a_help():
 
 
 @pytest.mark.parametrize("found", EXAMPLES, ids=str)
-def test_an_example_parses(found):
-    check_words(found.words)
+def test_an_example_parses(found: Command):
+    words = found.words
+    if words[0] == "make":
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)
+        assert set(words[1:]) <= set(targets)
+    elif words[0] == PROGRAM:
+        check_words(words[1:])
+    else:
+        assert words[0] in ("pip", "echo", "mkdir") or PROGRAM in words, f"{found}: what is {found.text!r}?"
 
 
 def test_examples_in_the_help_parse():
@@ -147,24 +116,65 @@ def test_a_wrong_example_would_be_found(words):
         check_words(tuple(words.split()))
 
 
-def test_examples_are_found_with_their_marks(tmp_path):
+def test_blocks_are_read_with_their_marks_and_what_they_print(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
-        "```console run\n$ tactile-bayes map a.mcap \\\n    -o b.nc  # exits 3\nsome output\n```\n"
-        "```sh\n$ tactile-bayes no\n```\n```console\n$ cat b\n$ tactile-bayes show b.nc\n```\n"
+        "```console\n$ tactile-bayes map a.mcap \\\n    -o b.nc  # exits 3\nsome output\n```\n"
+        "```sh setup\nmake demo\n```\n```toml a.toml\nx = 1\n```\n"
+        "```console device\n$ cat b\n$ tactile-bayes show b.nc\n```\n```text\nno file\n```\n"
     )
-    found = list(examples_of(page))
-    assert [(one.line, one.words, one.runs, one.exit_code) for one in found] == [
-        (2, ("map", "a.mcap", "-o", "b.nc"), True, 3),
-        (11, ("show", "b.nc"), False, 0),
+    found = commands_of(page)
+    assert [(one.line, one.text, one.mark, one.exit_code, one.printed) for one in found] == [
+        (2, "tactile-bayes map a.mcap -o b.nc", "", 3, ("some output",)),
+        (7, "make demo", "setup", 0, ()),
+        (13, "cat b", "device", 0, ()),
+        (14, "tactile-bayes show b.nc", "device", 0, ()),
     ]
+    assert [(one.file_name, one.text) for one in blocks_of(page) if one.file_name] == [("a.toml", "x = 1\n")]
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("```console\n$ tactile-bayes show nothing.nc\n```\n", "page.md:2: ended with 3"),
+        ("```console\n$ tactile-bayes show f.toml  # exits 0\n```\n", "page.md:2: ended with"),
+        ("```console\n$ tactile-bayes --version\nversion 77\n```\n", "does not print 'version 77'"),
+        ("```console later\n$ tactile-bayes --version\n```\n", "later is none of"),
+        ("```python\nassert False, 'python runs'\n```\n", "python runs"),
+    ],
+)
+def test_a_page_that_does_not_run_is_found(text, fault, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(text)
+    with pytest.raises(AssertionError, match=fault):
+        Reader(tmp_path, tmp_path / "demos").follow(page)
+
+
+def test_printed_lines_are_looked_for_in_their_order():
+    printed = "first\nsecond  \nthird\n"
+    assert not_printed(("first", "...", "third"), printed) == ""
+    assert not_printed(("third", "first"), printed) == "first"
+
+
+@pytest.fixture(scope="session")
+def demos(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """Where the pages keep the demo's files; one folder for all processes of a test run."""
+    base = tmp_path_factory.getbasetemp()
+    return (base if worker_id == "master" else base.parent) / "demos"
 
 
 @pytest.mark.parametrize("page", RUN_PAGES, ids=lambda page: page.name)
-def test_the_marked_examples_of_a_page_run(page, run_cli, tmp_path):
-    for found in (one for one in EXAMPLES if one.page == page and one.runs):
-        ended = run_cli(*found.words, cwd=tmp_path)
-        assert ended.returncode == found.exit_code, f"{found}: {ended.stderr}"
+def test_a_page_runs_as_printed(page, tmp_path, demos):
+    Reader(tmp_path, demos).follow(page)
+
+
+def test_every_settings_block_is_a_file_that_a_command_reads():
+    """A block of TOML without a name would be tried by nobody."""
+    for page in PAGES:
+        for block in blocks_of(page):
+            if block.language == "toml":
+                assert block.file_name, f"{page.name}:{block.line}"
+                tomllib.loads(block.text)
 
 
 @pytest.mark.parametrize("page", [*PAGES, *DECISIONS], ids=lambda page: page.name)
@@ -172,6 +182,42 @@ def test_links_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if not re.match(r"[a-z]+:|#", link)]
     assert [link for link in links if not (page.parent / link.split("#")[0]).exists()] == []
+
+
+def table_under(heading: str, page: Path) -> list[list[str]]:
+    """The cells of the first table under a heading of a page, without its head."""
+    section = re.split(r"^#+ ", page.read_text(encoding="utf-8").split(f"## {heading}\n")[1], flags=re.MULTILINE)[0]
+    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in section.splitlines() if line[:1] == "|"]
+    return [[cell.strip(" |") for cell in row] for row in rows[2:]]
+
+
+def test_the_formats_page_has_the_arrays_of_a_scan():
+    rows = table_under("Scan arrays (`.npz`)", DOCS / "formats.md")
+    wanted = []
+    for name, one in LAYOUT.items():
+        optional = " (may be left out)" if name in OPTIONAL else ""
+        wanted.append([f"`{name}`{optional}", one.shape, one.kind, one.unit, one.frame, one.meaning])
+    assert rows == wanted
+
+
+@pytest.mark.parametrize(
+    ("heading", "file", "group"), [("Maps (`.nc`)", "map.nc", "/"), ("Posteriors (`.nc`)", "posterior.nc", "posterior")]
+)
+def test_the_formats_page_has_the_variables_of_a_netcdf_file(heading, file, group, demos, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"```console\n$ {PROGRAM} demo -o demo\n```\n")
+    Reader(tmp_path, demos).follow(page)
+    rows = table_under(heading, DOCS / "formats.md")
+    with h5py.File(tmp_path / "demo" / file) as whole:
+        held = {name: len(values.shape) for name, values in whole[group].items() if "NAME" not in values.attrs}
+        scales = {name for name, values in whole[group].items() if "NAME" in values.attrs}
+    if group == "/":  # the cells' centres were called x_mm and y_mm in the first maps
+        held = {name.removesuffix("_mm"): length for name, length in held.items()} | dict.fromkeys(
+            scales & {"x", "y"}, 1
+        )
+        assert {row[0].strip("`"): row[1].count(",") + 1 for row in rows} == held
+    else:
+        assert {name for row in rows for name in re.findall(r"`(\w+)`", row[0])} == set(held)
 
 
 def test_the_exit_codes_are_those_of_the_program():
@@ -196,7 +242,9 @@ def test_decision_records_are_numbered_once():
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_is_documented_and_prints_a_script(shell, run_cli):
-    assert f"_TACTILE_BAYES_COMPLETE={shell}_source {PROGRAM}" in (DOCS / "completion.md").read_text(encoding="utf-8")
+    assert f"_TACTILE_BAYES_COMPLETE={shell}_source {PROGRAM}" in (DOCS / "guides" / "complete-with-tab.md").read_text(
+        encoding="utf-8"
+    )
     printed = run_cli(env={"_TACTILE_BAYES_COMPLETE": f"{shell}_source"})
     assert printed.returncode == 0, printed.stderr
     assert f"_TACTILE_BAYES_COMPLETE={shell}_complete" in printed.stdout

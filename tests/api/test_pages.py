@@ -11,7 +11,7 @@ import pytest
 
 import tactile_bayes as tb
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides"
 
 
 def blocks_of_page() -> list[str]:

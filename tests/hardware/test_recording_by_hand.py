@@ -1,4 +1,4 @@
-"""docs/recording.md followed word by word, with a pause before space: the map is that of the scan."""
+"""docs/guides/record.md followed word by word, with a pause before space: the map is that of the scan."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.scan import Scan, TrackerPoses
 
-PAGE = Path(__file__).parents[2] / "docs" / "recording.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "record.md"
 DURATION_S = 3.0
 PAUSE_S = 1.5
 
@@ -41,9 +41,9 @@ def folder(tmp_path, scan) -> Path:
 
 
 def commands() -> list[list[str]]:
-    """The commands of the page's first two blocks: emulate, record, map."""
-    blocks = re.findall(r"```console\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-    lines = [line[2:] for block in blocks[:2] for line in block.splitlines() if line.startswith("$ ")]
+    """The commands of the blocks that are marked so: emulate, record, map."""
+    blocks = re.findall(r"```console by-hand\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    lines = [line[2:] for block in blocks for line in block.splitlines() if line.startswith("$ ")]
     return [shlex.split(line) for line in lines]
 
 

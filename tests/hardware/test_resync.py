@@ -1,7 +1,7 @@
 """One spoilt record in a stream: every record after the next one is read exactly, in every protocol.
 
 Where a record carries no checksum the spoilt one itself may pass for another pose, and it may take the beginning of the
-next one with it (docs/recording.md); nothing behind that is touched.
+next one with it (docs/trackers.md); nothing behind that is touched.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def test_every_single_byte_lost_and_every_single_bit_turned(name):
 
 
 def test_a_checksum_lets_no_spoilt_pose_through_and_its_absence_does():
-    """What flags and marks cannot show: a bit turned in a number. The control for what docs/recording.md says."""
+    """What flags and marks cannot show: a bit turned in a number. The control for what docs/trackers.md says."""
     passed = {}
     for name in NAMES:
         records, poses = stream_of(name, 2)
