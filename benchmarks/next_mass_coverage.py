@@ -61,8 +61,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.old_prior:
         model.log_prior = half_normal_log_prior
-    heads = "".join(f" {level:.0%} holds |" for level in LEVELS)
-    print(f"| design | true error % | median of medians % |{heads} error if found, 95 % holds |")
+    heads = "".join(f" {level:.0%} covers |" for level in LEVELS)
+    print(f"| design | true error % | median of medians % |{heads} error if found, 95 % covers |")
     print("|---|---|---|" + "---|" * (len(LEVELS) + 1))
     for name, design in DESIGNS.items():
         found = list(ranks(design, trials=options.trials, seed=options.seed))

@@ -19,7 +19,7 @@ HEAD = """\
 # Command reference
 
 Generated from the program by `python docs/make_reference.py`; a test holds the two together. What the exit codes
-mean is in [exit-codes.md](exit-codes.md), how to complete words in the shell in
+mean is in [exit codes](exit-codes.md), how to complete words in the shell in
 [complete with Tab](guides/complete-with-tab.md). Every command also takes `-h` or `--help`.
 """
 

@@ -1,4 +1,4 @@
-"""Write a page of the Python reference for each subpackage: its modules in order, from their docstrings.
+"""Write the pages of the Python reference, from docstrings: the public names, then each subpackage with its modules.
 
 The pages go to docs/generated, which git ignores, so that they follow the modules wherever these move.
 """
@@ -6,6 +6,7 @@ The pages go to docs/generated, which git ignores, so that they follow the modul
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 from pathlib import Path
 from types import ModuleType
@@ -37,7 +38,21 @@ def _pages() -> dict[str, str]:
     packages = {info.name: info.ispkg for info in pkgutil.iter_modules(tactile_bayes.__path__) if info.name in LIBRARY}
     beside = [f"tactile_bayes.{name}" for name in LIBRARY if not packages.get(name)]
     pages = {name: _package_page(name) for name in LIBRARY if packages.get(name)}
-    return pages | {"basics": _page("basics", "What every package uses.", beside)}
+    return pages | {"tb": _public_page(), "basics": _page("basics", "What every package uses.", beside)}
+
+
+def _public_page() -> str:
+    """What `import tactile_bayes as tb` offers: functions first, then what they return."""
+    found = {name: getattr(tactile_bayes, name) for name in tactile_bayes.__all__}
+    functions = [f".. autofunction:: tactile_bayes.{name}\n" for name, one in found.items() if inspect.isfunction(one)]
+    classes = [
+        f".. autoclass:: tactile_bayes.{name}\n   :members:\n" for name, one in found.items() if inspect.isclass(one)
+    ]
+    title = "import tactile_bayes as tb"
+    parts = [f"{title}\n{'=' * len(title)}\n", f"{_words(tactile_bayes)}\n"]
+    for heading, entries in (("Functions", functions), ("Results", classes)):
+        parts += [f"{heading}\n{'-' * len(heading)}\n", *entries]
+    return "\n".join(parts)
 
 
 def _package_page(name: str) -> str:
