@@ -16,9 +16,11 @@ import h5py
 import pytest
 from doc_pages import PROGRAM, Command, Reader, blocks_of, commands_of, not_printed
 
+import tactile_bayes as tb
 from tactile_bayes import errors
 from tactile_bayes.cli import COMMANDS, cli
 from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL
+from tactile_bayes.report.size_text import SOURCES
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -187,8 +189,8 @@ def test_links_lead_somewhere(page):
 def table_under(heading: str, page: Path) -> list[list[str]]:
     """The cells of the first table under a heading of a page, without its head."""
     section = re.split(r"^#+ ", page.read_text(encoding="utf-8").split(f"## {heading}\n")[1], flags=re.MULTILINE)[0]
-    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in section.splitlines() if line[:1] == "|"]
-    return [[cell.strip(" |") for cell in row] for row in rows[2:]]
+    rows = [line.strip().removeprefix("|").removesuffix("|") for line in section.splitlines() if line[:1] == "|"]
+    return [[cell.strip() for cell in row.split("|")] for row in rows[2:]]
 
 
 def test_the_formats_page_has_the_arrays_of_a_scan():
@@ -218,6 +220,17 @@ def test_the_formats_page_has_the_variables_of_a_netcdf_file(heading, file, grou
         assert {row[0].strip("`"): row[1].count(",") + 1 for row in rows} == held
     else:
         assert {name for row in rows for name in re.findall(r"`(\w+)`", row[0])} == set(held)
+
+
+def test_the_shares_of_variance_are_those_of_the_demo():
+    """docs/how-a-size-comes-about.md says what each share is, and how large it is for the demo's map."""
+    shares = tb.estimate(tb.demo_map()).answer.document["variance_share"]
+    said = {row[0]: row[2] for row in table_under("What makes an interval wide", DOCS / "how-a-size-comes-about.md")}
+    assert set(said) == set(SOURCES.values())
+    for source, name in SOURCES.items():
+        share = shares.get(source)
+        wanted = "" if share is None else f"{share:.0f} %" if share >= 0.5 else "below 0.5 %"
+        assert said[name] == wanted
 
 
 def test_the_exit_codes_are_those_of_the_program():
