@@ -19,7 +19,7 @@ from doc_pages import PROGRAM, Command, Reader, blocks_of, commands_of, not_prin
 import tactile_bayes as tb
 from tactile_bayes import errors
 from tactile_bayes.cli import COMMANDS, cli
-from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL
+from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL, in_words
 from tactile_bayes.report.size_text import SOURCES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -198,7 +198,7 @@ def test_the_formats_page_has_the_arrays_of_a_scan():
     wanted = []
     for name, one in LAYOUT.items():
         optional = " (may be left out)" if name in OPTIONAL else ""
-        wanted.append([f"`{name}`{optional}", one.shape, one.kind, one.unit, one.frame, one.meaning])
+        wanted.append([f"`{name}`{optional}", in_words(one.shape), one.kind, one.unit, one.frame, one.meaning])
     assert rows == wanted
 
 
