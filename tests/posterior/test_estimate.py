@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from posterior_maps import TRUTH, bump_map, correlated_field, grid_map
 
-from tactile_bayes.errors import BadDataError, NotConvergedError
+from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.bump import BumpPrior
