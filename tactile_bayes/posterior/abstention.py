@@ -32,6 +32,8 @@ Of 800 simulated exams 46 showed a lump wider than 8 mm, all of them enclosed so
 """
 LEAST_SEEN = 0.25
 """Share of a side's breadth that must be covered for the side to reach as far."""
+HOPELESS = 2.0
+"""Widths at the mode so many times beyond a limit decide without draws: chains for a stripe of readings took 30 s."""
 MOST_PRIOR_SHARE = 0.5
 """Above this ratio of the posterior's to the prior's SD of a log width the prior, not the map, gives the interval."""
 SIDES = {
@@ -205,14 +207,9 @@ def undetected(detection: Detection, least: float, *, where: str) -> Abstention:
 
 def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, prior: BumpPrior) -> Abstention | None:
     """What draws of the widths say against a size: too narrow for the cells, a ridge, or the prior's own width."""
-    x, y = float(np.median(sigma_x)), float(np.median(sigma_y))
-    wide, narrow = max(x, y), min(x, y)
-    if narrow < LEAST_WIDTH_IN_CELLS * cell_mm:
-        reason = f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved"
-        return Abstention("unresolved", reason, f"map again with --cell-mm {max(0.1, narrow / 0.75):.1g}")
-    if wide / narrow > MOST_AXIS_RATIO:
-        reason = f"a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
-        return Abstention("unresolved", reason, "feel whether it is a rib; name the lump's place with --centre-mm")
+    fault = _width_fault(float(np.median(sigma_x)), float(np.median(sigma_y)), cell_mm=cell_mm, margin=1.0)
+    if fault is not None:
+        return fault
     share = prior_share(sigma_x, sigma_y, prior)
     if share > MOST_PRIOR_SHARE:
         reason = (
@@ -220,6 +217,23 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
             f"(at most {MOST_PRIOR_SHARE:g})"
         )
         return Abstention("prior", reason, "scan again, more slowly or with more lines, and map all scans together")
+    return None
+
+
+def hopeless_shape(sigma_x_mm: float, sigma_y_mm: float, *, cell_mm: float) -> Abstention | None:
+    """What the widths at the mode say against a size, if they are so far beyond the limits that no draw is needed."""
+    return _width_fault(sigma_x_mm, sigma_y_mm, cell_mm=cell_mm, margin=HOPELESS)
+
+
+def _width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Abstention | None:
+    """Too narrow for the cells, or a ridge, by a factor of `margin` beyond the limit."""
+    wide, narrow = max(x, y), min(x, y)
+    if narrow * margin < LEAST_WIDTH_IN_CELLS * cell_mm:
+        reason = f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved"
+        return Abstention("unresolved", reason, f"map again with --cell-mm {max(0.1, narrow / 0.75):.1g}")
+    if wide / narrow > MOST_AXIS_RATIO * margin:
+        reason = f"a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
+        return Abstention("unresolved", reason, "feel whether it is a rib; name the lump's place with --centre-mm")
     return None
 
 

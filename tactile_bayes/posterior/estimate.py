@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import no_bump, searched, undetected
+from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
 from tactile_bayes.posterior.assessment import MapDraws
 from tactile_bayes.posterior.drawn import draw_sized
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
@@ -76,6 +76,10 @@ def estimate_map(
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)
+    bump = seen.bump()
+    hopeless = hopeless_shape(bump.sigma_x_mm, bump.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm)
+    if hopeless is not None:
+        return _none(hopeless, candidates, detection)
     try:
         found = draw_sized(tactile_map, seen, calibration, options, rng=rng, progress=progress)
     except NotConvergedError as error:

@@ -10,7 +10,9 @@ from posterior_maps import bump_map, bump_values, grid_map
 
 from tactile_bayes.abstention import CODES
 from tactile_bayes.errors import NotConvergedError, UsageError
+from tactile_bayes.posterior import estimate, search
 from tactile_bayes.posterior.abstention import extend_advice, fault_code, missing_strokes, shape_fault
+from tactile_bayes.posterior.assessment import ModalBump
 from tactile_bayes.posterior.correlated import draw as methods
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.bump import BumpPrior
@@ -152,3 +154,33 @@ def test_what_needs_a_field_is_refused_without(options: dict[str, object]) -> No
             options=EstimateOptions(fit=FitOptions(), **options),  # type: ignore[arg-type]
             rng=np.random.default_rng(1),
         )
+
+
+@pytest.mark.parametrize(
+    ("widths", "cell_mm", "drawn"), [((11.5, 0.6), 1.0, False), ((9.0, 2.0), 1.0, True), ((0.2, 0.2), 1.0, False)]
+)
+def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
+    monkeypatch: pytest.MonkeyPatch, widths: tuple[float, float], cell_mm: float, drawn: bool
+) -> None:
+    """A stripe of readings took 30 s of chains; a shape only just beyond a limit is still drawn, and judged by that."""
+    tactile_map = bump_map(noise=WHITE, cell_mm=cell_mm)
+    options = EstimateOptions(method="laplace", fit=FIELD)
+    candidates, seen = search.search(tactile_map, options)
+    assert seen is not None
+
+    class Odd:
+        fit, detection, fault, scene = seen.fit, seen.detection, "", seen.scene
+        drawings = 0
+
+        def bump(self) -> ModalBump:
+            return ModalBump(0.3, 0.0, 0.0, *widths)
+
+        def draw(self, *given: object, **named: object) -> object:
+            Odd.drawings += 1
+            return seen.draw(*given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(estimate, "search", lambda *_: (candidates, Odd()))
+    found = estimate.estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
+    assert (Odd.drawings > 0) == drawn
+    assert found.status == ("estimate" if drawn else "no_estimate")
+    assert drawn or found.code == "unresolved"
