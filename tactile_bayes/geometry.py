@@ -7,6 +7,7 @@ Frames: `base` (tracker, paper O), `scanhead` (paper S), `plane` (paper P), `pat
 from __future__ import annotations
 
 import math
+from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,7 +149,9 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
             way_out="scan with strokes side by side",
         )
     normal = axes[:, 0]
-    agreement = float(normal @ head_z) / max(math.sqrt(head_z @ head_z), 1e-300)
+    # Plain numbers where nothing but a decision hangs on them: a call of numpy costs more than three products.
+    facing, of = head_z.tolist(), math.hypot(*head_x.tolist())
+    agreement = sum(map(mul, normal.tolist(), facing)) / max(math.hypot(*facing), 1e-300)
     if abs(agreement) < 0.9:
         angle = np.degrees(np.arccos(abs(agreement)))
         raise BadDataError(
@@ -157,7 +160,7 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         )
     normal = normal if agreement > 0 else -normal
     x_axis = head_x - (head_x @ normal) * normal
-    length, of = math.sqrt(x_axis @ x_axis), math.sqrt(head_x @ head_x)
+    length = math.sqrt(x_axis @ x_axis)
     if not length > 0.1 * of:
         raise BadDataError(
             f"the head's x axis has no direction on the plane (length {length:.2g} of {of:.2g})",
@@ -165,9 +168,9 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         )
     x, n = (x_axis / length).tolist(), normal.tolist()
     y = [n[1] * x[2] - n[2] * x[1], n[2] * x[0] - n[0] * x[2], n[0] * x[1] - n[1] * x[0]]  # n cross x
-    rotation = np.array([x, y, n])
-    spread_mm = np.array([longest, middle, shortest])
-    return Plane(rigid(rotation, -rotation @ centroid_mm), shortest, spread_mm)
+    shift = (-np.array([x, y, n]) @ centroid_mm).tolist()
+    rows = [[*axis, along] for axis, along in zip((x, y, n), shift, strict=True)]
+    return Plane(np.array([*rows, [0.0, 0.0, 0.0, 1.0]]), shortest, np.array([longest, middle, shortest]))
 
 
 def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:

@@ -107,12 +107,14 @@ class CellSums:
             self._count_and_clip(steps)
         cells, weights, index = shape[0] * shape[1], steps.ravel(), flat.ravel()
         square = np.bincount(index, weights * weights, cells).astype(np.int64)
-        weights += 2.0**_PACK_BITS
-        packed = np.bincount(index, weights, cells).astype(np.int64)
-        count = (packed + (1 << (_PACK_BITS - 1))) >> _PACK_BITS
-        self.add_block(
-            first, count.reshape(shape), (packed - (count << _PACK_BITS)).reshape(shape), square.reshape(shape)
-        )
+        if len(index) < cells:  # few readings are quicker counted than cells taken apart
+            count, total = np.bincount(index, None, cells), np.bincount(index, weights, cells).astype(np.int64)
+        else:
+            weights += 2.0**_PACK_BITS
+            packed = np.bincount(index, weights, cells).astype(np.int64)
+            count = (packed + (1 << (_PACK_BITS - 1))) >> _PACK_BITS
+            total = packed - (count << _PACK_BITS)
+        self._add_inside(first, count.reshape(shape), total.reshape(shape), square.reshape(shape))
 
     def _count_and_clip(self, steps: FloatArray) -> None:
         lowest = float(steps.min())
@@ -125,10 +127,14 @@ class CellSums:
     def add_block(self, first: tuple[int, int], count: IntArray, total: IntArray, square: IntArray) -> None:
         """Add sums over a block of the lattice."""
         self.make_room(first, _shape(count))
+        self._add_inside(first, count, total, square)
+
+    def _add_inside(self, first: tuple[int, int], count: IntArray, total: IntArray, square: IntArray) -> None:
+        """The same for a block that has room."""
         window = self.window(first, _shape(count))
-        self.count[window] += count
-        self.total[window] += total
-        self.square[window] += square
+        for sums, block in ((self.count, count), (self.total, total), (self.square, square)):
+            part = sums[window]
+            part += block
 
     def merge(self, other: CellSums) -> None:
         """Add all of another's sums."""
@@ -142,7 +148,8 @@ class CellSums:
 
     def trimmed(self) -> CellSums:
         """A copy without the empty rows and columns around the data."""
-        rows, columns = np.flatnonzero(self.count.any(axis=1)), np.flatnonzero(self.count.any(axis=0))
+        held = self.count > 0
+        rows, columns = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
         if not len(rows):
             return CellSums(self.cell_mm, clipped=self.clipped, negative=self.negative)
         window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))

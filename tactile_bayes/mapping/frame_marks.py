@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from tactile_bayes.geometry import FloatArray
 
 NO_LIMIT = np.uint64(2**64 - 1)
+_ROUNDS = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
+_LAST_SHIFT = np.uint64(31)
 
 
 def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
@@ -31,9 +33,9 @@ def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
     The mixing function of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number generators).
     """
     mark = np.ascontiguousarray(level_kpa).view(np.uint64)
-    mark = (mark ^ (mark >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    mark = (mark ^ (mark >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return mark ^ (mark >> np.uint64(31))
+    for shift, factor in _ROUNDS:
+        mark = (mark ^ (mark >> shift)) * factor
+    return mark ^ (mark >> _LAST_SHIFT)
 
 
 def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:

@@ -120,7 +120,7 @@ def gate(
     """Which frames lie below the window, which above, and which are used; ends of the window included."""
     candidate = known & (valid_share >= VALID_SHARE)
     low, high = candidate & (level_kpa < pressure_window_kpa[0]), candidate & (level_kpa > pressure_window_kpa[1])
-    return low, high, candidate & ~low & ~high
+    return low, high, candidate ^ (low | high)
 
 
 def _levels(scan: Scan, good: BoolArray, engine: Engine) -> tuple[FloatArray, FloatArray]:

@@ -24,6 +24,8 @@ from tactile_bayes.scan import CountArray
 MOST_FRAMES = 2048
 # Chosen frames that wait to be read: many at once cost less each, and most are overtaken by others before.
 _MOST_WAITING = 4096
+# Frames that came a few at a time wait until there are so many before anybody looks at their marks.
+_FEW = 64
 _CHUNK = 128
 # The figures are means of whole multiples of this.
 _STEP = 2.0**-32
@@ -66,8 +68,8 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
     smooth = rows[rows[:, -1] <= SMOOTH_FACTOR * _tenth(rows[:, -1]), :-1]
     if len(smooth) < LEAST_FRAMES:
         return {}
-    # Sums of whole steps have no rounding, so the order of the frames leaves no trace.
-    mean = np.rint(smooth / _STEP).sum(axis=0) * (_STEP / len(smooth))
+    # Sums of whole steps have no rounding: neither the order of the frames nor a matrix product leaves a trace.
+    mean = np.ones(len(smooth)) @ np.rint(smooth / _STEP) * (_STEP / len(smooth))
     return {
         **{name: float(value) for name, value in zip(HEAD_PROFILE, mean, strict=True)},
         "head_profile_frames": float(len(smooth)),
@@ -77,7 +79,8 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
 def _tenth(values: FloatArray) -> float:
     """The quantile 0.1 of two values or more, between neighbours linear."""
     below, share = divmod(0.1 * (len(values) - 1), 1.0)
-    low, high = np.partition(values, (int(below), int(below) + 1))[int(below) : int(below) + 2]
+    parted = np.partition(values, int(below) + 1)
+    low, high = parted[: int(below) + 1].max(), parted[int(below) + 1]
     return float(low + share * (high - low))
 
 
@@ -114,6 +117,8 @@ class GrowingProfile:
         self._marks, self._rows = np.zeros(0, dtype=np.uint64), np.zeros((0, _COLUMNS))
         self._waiting: list[tuple[NDArray[np.uint64], CountArray, FloatArray]] = []
         self._number_waiting = 0
+        self._new: list[tuple[CountArray, FloatArray, FloatArray]] = []
+        self._number_new = 0
 
     def add(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
         """Add frames.
@@ -127,6 +132,23 @@ class GrowingProfile:
         """
         if not self._reader.solve.size:
             return
+        if len(counts) >= _FEW:
+            self._choose(counts, level_kpa, valid_share)
+            return
+        self._new.append((counts.copy(), level_kpa, valid_share))
+        self._number_new += len(counts)
+        if self._number_new >= _FEW:
+            self._choose_new()
+
+    def _choose_new(self) -> None:
+        """Look at the frames that came a few at a time."""
+        if self._new:
+            counts, level, share = (np.concatenate(part) for part in zip(*self._new, strict=True))
+            self._new, self._number_new = [], 0
+            self._choose(counts, level, share)
+
+    def _choose(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
+        """Let those frames wait that are among the chosen ones so far."""
         marks = frame_marks(level_kpa)
         if len(marks) >= MOST_FRAMES:  # so many that not all of them need be copied
             whole = marks[_whole(level_kpa, valid_share, self._good)]
@@ -160,6 +182,7 @@ class GrowingProfile:
 
     def _read_waiting(self) -> None:
         """Read the waiting frames that are still among the chosen ones."""
+        self._choose_new()
         if not self._waiting:
             return
         marks, counts, level = (np.concatenate(part) for part in zip(*self._waiting, strict=True))
@@ -171,8 +194,8 @@ class GrowingProfile:
     def _keep(self, marks: NDArray[np.uint64], rows: FloatArray) -> None:
         """Keep these rows, and those from before that are still under the limit."""
         kept = self._marks < self._limit
-        self._marks = np.concatenate([self._marks[kept], marks])
-        self._rows = np.concatenate([self._rows[kept], rows])
+        before = (self._marks, self._rows) if kept.all() else (self._marks[kept], self._rows[kept])
+        self._marks, self._rows = np.concatenate([before[0], marks]), np.concatenate([before[1], rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,7 +247,9 @@ class ProfileReader:
         fitted = np.matmul(self.gram, found[:, :, None])[:, :, 0]
         square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,fi->f", found, fitted)
         left = np.sqrt(np.maximum(square, 0.0) / self.solve.shape[1])
-        rows: FloatArray = np.column_stack([found[:, : len(HEAD_PROFILE)], left]) / level_kpa[:, None]
+        rows = np.empty((len(found), _COLUMNS))
+        rows[:, :-1], rows[:, -1] = found[:, : len(HEAD_PROFILE)], left
+        rows /= level_kpa[:, None]
         return rows
 
 

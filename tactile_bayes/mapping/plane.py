@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import add
+from functools import reduce
+from math import sqrt
+from operator import add, mul
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ _POSITION_STEP = 2.0**-16
 _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
 _STEPS = np.repeat([_POSITION_STEP, _SPREAD_STEP, _AXIS_STEP], [3, 9, 6])[:, None]
+_PER_STEP: tuple[float, ...] = tuple((1.0 / _STEPS)[:, 0].tolist())
 # Steps from one place up to 2^26 (1 m), and 2^10 frames: squares stay below 2^62. Beyond 2^52 steps floats have gaps.
 _FAR_STEPS = 2**26
 _FRAMES_AT_ONCE = 2**10
@@ -39,37 +42,25 @@ class HeadMoments:
 
     Parameters
     ----------
-    count
-        Frames.
-    position : 3 whole numbers
-        Sum over frames of the mean taxel centre in `base`.
-    product : 3 x 3 whole numbers, row by row
-        Sum of its outer products.
-    spread : 3 x 3 whole numbers, row by row
-        Sum of the covariance of the taxels about their mean.
-    axes : 2 x 3 whole numbers, row by row
-        Sums of the head's x axis and of its normal.
+    sums : 28 whole numbers
+        Frames (1), and sums over them: of the mean taxel centre in `base` (3), of its outer products (9, row by row),
+        of the covariance of the taxels about their mean (9), of the head's x axis and of its normal (6).
     """
 
-    count: int
-    position: Whole
-    product: Whole
-    spread: Whole
-    axes: Whole
+    sums: Whole
 
     def __add__(self, other: HeadMoments) -> HeadMoments:
-        return HeadMoments(
-            self.count + other.count,
-            _sum(self.position, other.position),
-            _sum(self.product, other.product),
-            _sum(self.spread, other.spread),
-            _sum(self.axes, other.axes),
-        )
+        return HeadMoments(_sum(self.sums, other.sums))
 
     @classmethod
     def none(cls) -> HeadMoments:
         """The moments of no frame."""
-        return cls(0, (0,) * 3, (0,) * 9, (0,) * 9, (0,) * 6)
+        return cls((0,) * 28)
+
+    @property
+    def count(self) -> int:
+        """Frames."""
+        return self.sums[0]
 
     def plane(self) -> Plane:
         """Best-fit plane of the taxel centres.
@@ -80,22 +71,26 @@ class HeadMoments:
             When the head was turned all round, so that its x axis has no mean direction; or see
             `tactile_bayes.geometry.fit_plane`.
         """
-        n, x = self.count, self.position
-        # In Python's integers up to the last division: positions far from the base lose nothing.
-        between = [(n * product - x[k // 3] * x[k % 3]) / (n * n) for k, product in enumerate(self.product)]
-        spread = np.array([value / n for value in self.spread])
-        head_x, head_z = np.array([value / n for value in self.axes]).reshape(2, 3) * _AXIS_STEP
-        resultant = float(np.sqrt(head_x @ head_x))
+        n, x = self.count, self.sums[1:4]
+        # In Python's integers up to the last division: positions far from the base lose nothing. Products are
+        # symmetric.
+        xx, xy, xz, _, yy, yz, _, _, zz = self.sums[4:13]
+        pairs = ((xx, 0, 0), (xy, 0, 1), (xz, 0, 2), (yy, 1, 1), (yz, 1, 2), (zz, 2, 2))
+        between = [(n * product - x[i] * x[j]) / (n * n) * _POSITION_STEP**2 for product, i, j in pairs]
+        spread = [value / n * _SPREAD_STEP for value in self.sums[13:22]]
+        covariance = [between[k] + value for k, value in zip((0, 1, 2, 1, 3, 4, 2, 4, 5), spread, strict=True)]
+        axes = [value / n * _AXIS_STEP for value in self.sums[22:]]
+        resultant = sqrt(sum(value * value for value in axes[:3]))
         if not resultant > _LEAST_RESULTANT:
             raise BadDataError(
                 f"the head was turned all round (resultant of its x axis {resultant:.2f} of 1)",
                 way_out="keep its direction while scanning; map parts with one direction apart",
             )
         return fit_plane(
-            np.array([value / n for value in x]) * _POSITION_STEP,
-            (np.array(between) * _POSITION_STEP**2 + spread * _SPREAD_STEP).reshape(3, 3),
-            head_x=head_x,
-            head_z=head_z,
+            np.array([value / n * _POSITION_STEP for value in x]),
+            np.array(covariance).reshape(3, 3),
+            head_x=np.array(axes[:3]),
+            head_z=np.array(axes[3:]),
         )
 
 
@@ -113,7 +108,7 @@ class MomentSums:
         taxels = apply(tracker_from_head, head.surface_mm.reshape(-1, 3))
         middle = taxels.mean(axis=0)
         covariance = (taxels - middle).T @ (taxels - middle) / len(taxels)
-        self._middle, self._covariance = middle.tolist(), covariance.tolist()
+        self._middle, self._across = middle.tolist(), covariance.T.tolist()
         self._axes = tracker_from_head[:3, [0, 2]].T.tolist()
         self._sums = HeadMoments.none()
 
@@ -128,6 +123,9 @@ class MomentSums:
         rotation, position = poses.rotation, poses.position_mm
         if not poses.known.all():
             rotation, position = rotation[poses.known], position[poses.known]
+        if len(rotation) == 1:
+            self._sums += self._one(rotation[0].tolist(), position[0].tolist())
+            return
         for start in range(0, len(rotation), _FRAMES_AT_ONCE):
             part = slice(start, start + _FRAMES_AT_ONCE)
             self._sums += self._of(rotation[part], position[part])
@@ -150,23 +148,22 @@ class MomentSums:
             return self._one_by_one(rotation, position)
         n, place, sums = len(rotation), reference[:, 0].tolist(), whole.sum(axis=1).tolist()
         first, product = sums[:3], (whole[:3] @ whole[:3].T).tolist()
-        outer = tuple(
+        outer = (
             product[i][j] + first[i] * place[j] + place[i] * first[j] + n * place[i] * place[j]
             for i in range(3)
             for j in range(3)
         )
-        return HeadMoments(n, _sum(first, [n * x for x in place]), outer, tuple(sums[3:12]), tuple(sums[12:]))
+        return HeadMoments((n, *_sum(first, [n * x for x in place]), *outer, *sums[3:]))
 
     def _one_by_one(self, rotation: FloatArray, position: FloatArray) -> HeadMoments:
-        total = HeadMoments.none()
-        for r, p in zip(rotation.tolist(), position.tolist(), strict=True):
-            values = self._values(r, p)
-            _refuse_far(max(abs(value) for value in values[:3]) / _POSITION_STEP)
-            place = tuple(round(value / _POSITION_STEP) for value in values[:3])
-            spread = tuple(round(value / _SPREAD_STEP) for value in values[3:12])
-            axes = tuple(round(value / _AXIS_STEP) for value in values[12:])
-            total += HeadMoments(1, place, tuple(x * y for x in place for y in place), spread, axes)
-        return total
+        return reduce(add, map(self._one, rotation.tolist(), position.tolist()))
+
+    def _one(self, r: list[list[float]], p: list[float]) -> HeadMoments:
+        values = self._values(r, p)
+        _refuse_far(max(map(abs, values[:3])) / _POSITION_STEP)
+        x, y, z, *others = map(round, map(mul, values, _PER_STEP))
+        xy, xz, yz = x * y, x * z, y * z
+        return HeadMoments((1, x, y, z, x * x, xy, xz, xy, y * y, yz, xz, yz, z * z, *others))
 
     def _values(self, r: Any, p: Any) -> list[Any]:
         """Mean taxel centre (3), covariance of the taxels (9) and axes (6) in `base`.
@@ -177,11 +174,11 @@ class MomentSums:
             3 x 3 rotation and 3 coordinates of one frame as numbers, or of many as arrays. Term by term and not by
             matrix products: the bits of a frame do not hang on how many others there are.
         """
-        (m0, m1, m2), (c0, c1, c2) = self._middle, self._covariance
-        centre = [x + (row[0] * m0 + row[1] * m1 + row[2] * m2) for x, row in zip(p, r, strict=True)]
-        turned = [[row[0] * c0[j] + row[1] * c1[j] + row[2] * c2[j] for j in range(3)] for row in r]
-        spread = [t[0] * row[0] + t[1] * row[1] + t[2] * row[2] for t in turned for row in r]
-        axes = [row[0] * x + row[1] * y + row[2] * z for x, y, z in self._axes for row in r]
+        m0, m1, m2 = self._middle
+        centre = [x + (a * m0 + b * m1 + c * m2) for x, (a, b, c) in zip(p, r, strict=True)]
+        turned = [[a * x + b * y + c * z for x, y, z in self._across] for a, b, c in r]
+        spread = [x * a + y * b + z * c for x, y, z in turned for a, b, c in r]
+        axes = [a * x + b * y + c * z for x, y, z in self._axes for a, b, c in r]
         return centre + spread + axes
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import floor
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,11 @@ _TURN_STEP = 2.0**-22
 _TAXEL_STEP_MM = 2.0**-15
 _SHIFT_STEP = 2.0**-30
 _MATRIX_STEPS = np.array([_TURN_STEP, _TURN_STEP, _TURN_STEP, _SHIFT_STEP])[:, None]
+# The same for a frame's eight numbers, with what is added to them.
+_NUMBERS = 2 * (3 * ((_TURN_STEP, 0.0),) + ((_SHIFT_STEP, 0.5),))
 _MOST_CELLS = 2**15
+# Floats from here on are whole numbers.
+_WHOLE = 2.0**52
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,17 +107,35 @@ class Projection:
         BadDataError
             When the block would be so wide that cells could not be told exactly.
         """
-        # Of two dimensions, for which numpy has a fast product.
-        reach = (np.abs(self.matrix).reshape(-1, 4) @ self.taxels.reach_mm).reshape(-1, 2)
-        left, top = np.floor((self.shift - reach).min(axis=0)).tolist()
-        right, bottom = np.floor((self.shift + reach).max(axis=0)).tolist()
+        left, top, right, bottom = self._ends_of_one() if len(self) == 1 else self._ends()
         columns, rows = right - left + 1, bottom - top + 1
         if max(abs(left), abs(top), columns, rows) > _MOST_CELLS:
             refuse_vast(int(rows + abs(top)), int(columns + abs(left)), self.cell_mm, most=_MOST_CELLS)
         return (int(top), int(left)), (int(rows), int(columns))
 
+    def _ends(self) -> list[float]:
+        """First column and row, and last column and row, that a reading can fall in."""
+        # Of two dimensions, for which numpy has a fast product.
+        reach = (np.abs(self.matrix).reshape(-1, 4) @ self.taxels.reach_mm).reshape(-1, 2)
+        first = np.floor((self.shift - reach).min(axis=0)).tolist()
+        return [*first, *np.floor((self.shift + reach).max(axis=0)).tolist()]
+
+    def _ends_of_one(self) -> list[float]:
+        """The same of one frame, as plain numbers: sums and products of whole steps are exact either way."""
+        x, y, z, _ = self.taxels.reach_mm.tolist()
+        shifts = [(abs(a) * x + abs(b) * y + abs(c) * z, shift) for a, b, c, shift in self.matrix[0].tolist()]
+        return [*(floor(shift - reach) for reach, shift in shifts), *(floor(shift + reach) for reach, shift in shifts)]
+
     def flat(self, first: tuple[int, int], shape: tuple[int, int]) -> IntArray:
         """(n, k) indices of the readings' cells in a block given by its first row and column and its shape."""
+        if len(self) == 1:
+            matrix = self.matrix[0].copy()
+            matrix[0, 3] -= first[1]
+            matrix[1, 3] -= first[0]
+            column, row = (matrix @ self.taxels.place_and_one).astype(np.int64)
+            row *= shape[1]
+            row += column
+            return np.asarray(row[None])
         # Not negative inside the block: cutting off is floor. Blocks have at most 2^30 cells, so 32 bits hold an index.
         row = self._coordinate(1, first[0]).astype(np.int32)
         row *= np.int32(shape[1])
@@ -140,6 +163,7 @@ class Projector:
     ) -> None:
         self._rows = plane_from_base[:2, :3].tolist()
         self._origin_mm = inverse(plane_from_base)[:3, 3]
+        self._origin = self._origin_mm.tolist()
         self._cell_mm = cell_mm
         tracker_from_head = inverse(head.scanhead_from_tracker)
         middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
@@ -150,23 +174,41 @@ class Projector:
 
     def at(self, poses: FramePoses) -> Projection:
         """Projection of the frames at `poses` onto the cells of the plane."""
+        if len(poses.position_mm) == 1:
+            return Projection(self._taxels, self._matrix_of_one(poses), self._cell_mm)
         offset = poses.position_mm - self._origin_mm  # first of all: bases may lie far away
-        # One frame as plain numbers, many as arrays, which each is the quicker for. Term by term and not by matrix
-        # products: the bits of a frame do not hang on how many others there are.
-        r: Any = poses.rotation[0].tolist() if len(offset) == 1 else poses.rotation.transpose(1, 2, 0).copy()
-        x, y, z = offset[0].tolist() if len(offset) == 1 else offset.T.copy()
-        m0, m1, m2 = self._middle
-        columns = []
-        for a, b, c in self._rows:
-            t0, t1, t2 = (a * r[0][j] + b * r[1][j] + c * r[2][j] for j in range(3))
-            columns += [t0, t1, t2, a * x + b * y + c * z + (t0 * m0 + t1 * m1 + t2 * m2)]
-        matrix = np.array(columns).reshape(2, 4, -1)
+        matrix = np.array(self._columns(poses.rotation.transpose(1, 2, 0).copy(), offset.T.copy())).reshape(2, 4, -1)
         matrix /= self._cell_mm
         matrix[:, 3] += 0.5
         matrix *= 1.0 / _MATRIX_STEPS
         np.rint(matrix, out=matrix)
         matrix *= _MATRIX_STEPS
         return Projection(self._taxels, np.ascontiguousarray(matrix.transpose(2, 0, 1)), self._cell_mm)
+
+    def _matrix_of_one(self, poses: FramePoses) -> FloatArray:
+        """(1, 2, 4) matrix of one frame, as plain numbers, which are the quicker for it; to the same bits."""
+        offset = [p - o for p, o in zip(poses.position_mm[0].tolist(), self._origin, strict=True)]
+        found, cell_mm = [], self._cell_mm
+        columns = self._columns(poses.rotation[0].tolist(), offset)
+        for value, (step, half) in zip(columns, _NUMBERS, strict=True):
+            steps = (value / cell_mm + half) / step
+            found.append((round(steps) if -_WHOLE < steps < _WHOLE else steps) * step)
+        return np.array(found).reshape(1, 2, 4)
+
+    def _columns(self, r: Any, offset: Any) -> list[Any]:
+        """The eight numbers of each frame's matrix, in mm.
+
+        Parameters
+        ----------
+        r, offset
+            3 x 3 rotation and 3 coordinates of one frame as numbers, or of many as arrays. Term by term and not by
+            matrix products: the bits of a frame do not hang on how many others there are.
+        """
+        (x, y, z), (m0, m1, m2), columns = offset, self._middle, []
+        for a, b, c in self._rows:
+            t0, t1, t2 = (a * r[0][j] + b * r[1][j] + c * r[2][j] for j in range(3))
+            columns += [t0, t1, t2, a * x + b * y + c * z + (t0 * m0 + t1 * m1 + t2 * m2)]
+        return columns
 
 
 def yaw_deg(head: HeadGeometry, rotation: FloatArray, *, plane_from_base: FloatArray) -> FloatArray:

@@ -128,8 +128,8 @@ class TactileMap:
             view = getattr(self, name).view()
             view.flags.writeable = False
             object.__setattr__(self, name, view)
-        covered = self.count > 0
-        if np.isinf(self.mean[covered]).any():
+        infinite = np.isinf(self.mean)
+        if infinite.any() and (infinite & (self.count > 0)).any():
             raise BadDataError("mean holds infinite values", way_out="mark cells without data by count 0")
 
     @property

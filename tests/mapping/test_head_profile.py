@@ -21,18 +21,29 @@ from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.frame_marks import NO_LIMIT, frame_marks, marks_limit
-from tactile_bayes.mapping.head_profile import LEAST_FRAMES, MOST_FRAMES, ProfileReader, profile_figures
+from tactile_bayes.mapping.head_profile import (
+    LEAST_FRAMES,
+    MOST_FRAMES,
+    GrowingProfile,
+    ProfileReader,
+    profile_figures,
+)
 from tactile_bayes.mapping.poses import poses_at
+from tactile_bayes.mapping.readout import Readout
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.scan import Scan
+from tactile_bayes.scan import ElementCalibration, Scan
 from tactile_bayes.size.fat_depth import head_profile
 from tactile_bayes.size.log_quadratic import LogQuadratic
 
 TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
 """By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""
+
+READOUT = Readout.of(
+    ElementCalibration(np.full((16, 26), 34 / 4095), np.zeros((16, 26))), np.ones((16, 26), dtype=bool)
+)
 
 
 def response(coefficients: np.ndarray, *, rows: int = 16, columns: int = 26) -> np.ndarray:
@@ -178,6 +189,20 @@ def test_a_live_map_has_the_profile_of_the_whole_scan(frames: int) -> None:
     for other in others:
         one_by_one.merge(other)
     assert profile_of(one_by_one.snapshot().quality) == expected
+
+
+def test_a_buffer_that_is_used_again_changes_no_frame_that_went_in() -> None:
+    """Frames one at a time wait for the next look at the profile, and their counts with them."""
+    counts = np.random.default_rng(4).integers(1000, 1300, (100, 16, 26)).astype(np.uint16)
+    kept, again = (GrowingProfile(np.ones((16, 26), dtype=bool), READOUT) for _ in range(2))
+    buffer = np.empty((1, 416), dtype=np.uint16)
+    for frame in counts.reshape(100, 1, 416):
+        level, share = READOUT.levels(*READOUT.pressure_kpa(frame))
+        kept.add(frame, level, share)
+        buffer[:] = frame
+        again.add(buffer, level, share)
+    assert kept.figures() == again.figures()
+    assert kept.figures()["head_profile_frames"] >= LEAST_FRAMES
 
 
 def test_the_marked_frames_are_a_random_choice() -> None:
