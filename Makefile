@@ -60,6 +60,10 @@ calibrations: $(VENV)/.installed
 		-o tactile_bayes/calibrations/solid.json --force
 	$(BIN)/tactile-bayes calibrate size build/population_mean.csv --form log-quadratic \
 		-o tactile_bayes/calibrations/solid_mean.json --force
+	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 700 --centred 400 --seed 7 --workers 2 \
+		--normalise gain -o build/population_eq6.csv --force
+	$(BIN)/tactile-bayes calibrate size build/population_eq6.csv --form eq6 \
+		-o tactile_bayes/calibrations/eq6.json --force
 	$(BIN)/tactile-bayes study -o build/paper_grid.csv --force
 	$(BIN)/tactile-bayes calibrate size build/paper_grid.csv --fit-radius-mm 48 --least-stiffness-ratio 8 \
 		-o tactile_bayes/calibrations/plane_strain.json --force

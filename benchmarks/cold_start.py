@@ -72,6 +72,9 @@ CASES: tuple[Case, ...] = (
 MEASURED_ELSEWHERE = {
     "study": "benchmarks.forward: minutes of work",
     "tables": "benchmarks.forward: minutes of work",
+    "head": "benchmarks.forward's model: `head design` is 2 s of work",
+    "compare-model": "it solves the scan's frames anew: seconds of work",
+    "diagnose": "it needs a posterior that `estimate` wrote; the chains are the cost",
     "tradeoff": "it measures itself: a minute of work",
     "population": "hours of work; see benchmarks.own_trial for a scan's",
     "sbc": "it measures itself: its report tells maps per second",

@@ -49,6 +49,7 @@ from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white.fit import default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
+from tactile_bayes.size.posterior import SizePosterior
 
 NOMINAL = 0.9
 AXIS = np.arange(-28.0, 28.5)
@@ -317,19 +318,24 @@ def sizes(run: Callable[..., Iterable[Row]], masses: int, bodies: str, output: P
 def report_sizes(rows: list[Row]) -> None:
     """Coverage and errors of single maps and of pooled masses."""
     single = [(row["d_mm"], one) for row in rows for one in row["single"] if one]
-    known = [(true, one["known"]) for true, one in single if "known" in one]
     pooled = [(row["d_mm"], row["pooled"]) for row in rows if row["pooled"]]
     maps = sum(len(row["single"]) for row in rows)
     print(f"{len(rows)} masses, {maps} maps; sized: {len(single)} maps, {len(pooled)} masses")
     for name, sized in (
-        ("single map", single),
-        ("single map, spread between simulated exams known", known),
+        ("one map", single),
+        ("one map, if exams differ by 15 %", [(true, one["another_exam"]) for true, one in single]),
         ("three maps pooled", pooled),
+        ("three maps pooled, if exams may differ more", [(true, one["another_exam"]) for true, one in pooled]),
     ):
         if not sized:
             continue
         error = np.array([one["median"] / true - 1 for true, one in sized])
-        print(f"{name}: MAE {100 * np.mean(np.abs(error)):.1f} %, bias {100 * np.mean(error):+.1f} %")
+        score = [(np.log(true) - one["log_mean"]) / one["log_sd"] for true, one in sized]
+        half = [(one["95"][1] - one["95"][0]) / 2 / one["median"] for _, one in sized]
+        print(
+            f"{name}: MAE {100 * np.mean(np.abs(error)):.1f} %, bias {100 * np.mean(error):+.1f} %, SD of standardised "
+            f"errors {np.std(score):.2f}, median half width of 95 % intervals {100 * np.median(half):.0f} %"
+        )
         for level in ("50", "90", "95"):
             inside = [one[level][0] <= true <= one[level][1] for true, one in sized]
             print(f"  nominal {level} %: {share(inside)}")
@@ -340,7 +346,7 @@ def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.size.fat_depth import head_profile
     from tactile_bayes.size.log_quadratic import LogQuadratic
-    from tactile_bayes.size.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
+    from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps
 
     path = size_calibration_path(DEFAULT)
     assert path is not None
@@ -356,17 +362,14 @@ def _size_mass(bodies: str, index: int) -> Row:
         one = found.map_posterior
         profile = head_profile(tactile_map.quality)
         shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad, profile=profile))
-        exam_sd = float(np.exp(calibration.at_fat([profile]).mean[-1]))
-        known = SizePriors(BetweenMaps(exam_sd, 0.0))
-        told = pooled_size([shapes[-1]], calibration=calibration, priors=known, rng=np.random.default_rng(index))
-        single.append(_intervals(found.size.max_size_mm) | {"known": _intervals(told.max_size_mm)})
+        single.append(_both(found.size))
     pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))
     return {
         "index": index,
         "bodies": bodies,
         "d_mm": max(lump.d_mm, lump.vertical_mm),
         "single": single,
-        "pooled": None if pooled.size is None else _intervals(pooled.size.max_size_mm),
+        "pooled": None if pooled.size is None else _both(pooled.size),
     }
 
 
@@ -383,9 +386,17 @@ def _estimates(scenes: Sequence[Scene], calibration: Any) -> Iterator[tuple[Tact
             yield None, None
 
 
+def _both(size: SizePosterior) -> dict[str, Any]:
+    """What both intervals of the largest size say."""
+    assert size.another_exam is not None
+    return _intervals(size.max_size_mm) | {"another_exam": _intervals(size.another_exam.max_size_mm)}
+
+
 def _intervals(draws: FloatArray) -> dict[str, Any]:
     ends = {f"{level}": list(np.nanquantile(draws, [0.5 - level / 200, 0.5 + level / 200])) for level in (50, 90, 95)}
-    return {"median": float(np.nanmedian(draws)), **ends}
+    log = np.log(draws)
+    moments = {"log_mean": float(np.nanmean(log)), "log_sd": float(np.nanstd(log))}
+    return {"median": float(np.nanmedian(draws)), **moments, **ends}
 
 
 if __name__ == "__main__":

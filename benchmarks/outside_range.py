@@ -275,7 +275,7 @@ def without_depth(row: Row) -> Row:
     names = ("amplitude", "sigma_x_mm", "sigma_y_mm")
     draws = (float(row[name]) * np.exp(0.02 * rng.standard_normal(DRAWS)) for name in names)
     maps = [ShapeDraws.of(*draws, np.zeros(DRAWS))]
-    size = pooled_size(maps, calibration=replace(shipped(), fat_cubic=None), priors=SizePriors(), rng=rng)
+    size = pooled_size(maps, calibration=replace(shipped(), with_fat=None), priors=SizePriors(), rng=rng)
     low, median, high = np.nanquantile(size.max_size_mm, [0.025, 0.5, 0.975])
     return {"median": median, "low": low, "high": high}
 

@@ -13,6 +13,7 @@ SECTIONS = {
     "Excision (CSV)": "excision.table.json",
     "Size table (CSV)": "size_table.table.json",
     "Study grid (CSV)": "study_grid.table.json",
+    "Measured frames (CSV)": "measured_frames.table.json",
     "Population (CSV)": "population.table.json",
     "Scene (TOML)": "scene.schema.json",
     "Settings of estimate (TOML)": "settings.schema.json",

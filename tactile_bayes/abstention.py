@@ -9,7 +9,7 @@ CODES = ("empty", "undetected", "unresolved", "window", "prior", "extrapolated",
 
 @dataclass(frozen=True, slots=True)
 class Abstention:
-    """No number.
+    """The reason for giving no number.
 
     Parameters
     ----------

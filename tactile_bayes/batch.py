@@ -41,7 +41,7 @@ CLUSTER_LOST = "the dask scheduler was lost before an answer came; start it agai
 
 @dataclass(frozen=True, slots=True)
 class Outcome(Generic[Result]):
-    """What became of one item.
+    """The outcome of one item: its result, or its error.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Outcome(Generic[Result]):
 
 
 class BatchInterrupted(KeyboardInterrupt):
-    """Ctrl-C, with what was finished.
+    """Ctrl-C during a batch, with the outcomes that were finished.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class BatchInterrupted(KeyboardInterrupt):
 
 
 def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:
-    """A line for each fault, with the names of the items that have it; many items are counted, not listed."""
+    """One line per distinct error, with the names of its items; many items are counted instead."""
     names: dict[str, list[str]] = {}
     for one in outcomes:
         if not one.ok:
@@ -164,7 +164,7 @@ def _named(items: Iterable[Item], key: Callable[[Item], str]) -> Iterator[tuple[
 
 
 def _stored(outcome: Outcome[Result], store: BatchStore) -> Outcome[Result]:
-    """The outcome as a resumed batch will read it, so that fresh and resumed results are equal."""
+    """Convert an outcome to what a resumed batch will read, so that fresh and resumed results are equal."""
     if not outcome.ok:
         return outcome
     try:
@@ -174,7 +174,7 @@ def _stored(outcome: Outcome[Result], store: BatchStore) -> Outcome[Result]:
 
 
 class _Run(Generic[Item, Result]):
-    """Hands items out, few ahead of their results, and keeps each outcome as it arrives.
+    """A running batch: submits a few items ahead of their results, and stores each outcome as it arrives.
 
     When worker processes are lost they are replaced. Whatever was handed out then is run again, one item at a time, so
     that an item that ends its process again is known to be at fault.
@@ -207,7 +207,7 @@ class _Run(Generic[Item, Result]):
             raise
 
     def _hand_out(self) -> None:
-        """Submit what may run now: a suspect alone, or else the next few items."""
+        """Submit what may run now: an item suspected of killing its worker alone, otherwise the next few."""
         if not self._waiting and self._broken and self._workers is not None:
             self._workers.renew()
             self._broken = False
@@ -244,7 +244,7 @@ class _Run(Generic[Item, Result]):
             self._suspects.append(work)
 
     def _abandon(self) -> None:
-        """Cancel what has not begun, keep what is finished, and do not wait for what is under way."""
+        """Cancel pending items, keep finished ones, and do not wait for running ones."""
         for future in list(self._waiting):
             future.cancel()
         for future in [one for one in self._waiting if one.done() and not one.cancelled()]:
@@ -256,7 +256,7 @@ class _Run(Generic[Item, Result]):
 
 
 def _attempt(function: Callable[[Item], Result], item: Item) -> tuple[Result | None, str]:
-    """Run one item where it is; its fault comes back as text, which every executor can carry."""
+    """Run one item; return its error as text, which every executor can send back."""
     try:
         return function(item), ""
     except Exception as error:
@@ -264,7 +264,7 @@ def _attempt(function: Callable[[Item], Result], item: Item) -> tuple[Result | N
 
 
 def _settle(name: str, future: Future[tuple[Result | None, str]]) -> Outcome[Result]:
-    """The outcome of a finished future; a lost worker or a result that cannot travel is a fault of its item."""
+    """Read the outcome of a finished future; a lost worker or a result that cannot be sent is the item's error."""
     try:
         value, error = future.result()
     except CancelledError:
@@ -313,7 +313,7 @@ class BatchStore:
         return self.values[name]
 
     def load(self, header: Mapping[str, Any]) -> None:
-        """Read what an earlier run left, or write the header of a new store; see `open_store` for the errors."""
+        """Read the results of an earlier run, or write the header of a new store; for the errors see `open_store`."""
         text = _read_all(self._descriptor)
         whole = text[: text.rfind(b"\n") + 1]
         first = _sealed(json.dumps(header, sort_keys=True, ensure_ascii=False))
@@ -396,12 +396,12 @@ def _read_all(descriptor: int) -> bytes:
 
 
 def _sealed(text: str) -> str:
-    """A line of a store: the text and its checksum."""
+    """Format a line of a store: the text and its checksum."""
     return f"{text} {zlib.crc32(text.encode()):08x}"
 
 
 def _unsealed(line: str) -> Any:
-    """What a line holds; `ValueError` where it is damaged."""
+    """Read the text of a store's line; `ValueError` where it is damaged."""
     text = line.rpartition(" ")[0]
     if _sealed(text) != line:
         raise ValueError("its checksum does not match")

@@ -21,11 +21,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "map": ("map", "Build a tactile map from one or more scans (paper steps i-iii)."),
     "calibrate": ("calibrate", "Learn a calibration: `calibrate size`, `calibrate array`."),
     "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
+    "diagnose": ("diagnose", "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures."),
     "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
     "plan": ("plan", "Plan a trial: power and the worth of more maps, by simulation."),
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
-    "tradeoff": ("tradeoff", "Measure what more accuracy costs, here and now: `tradeoff forward`."),
+    "head": ("head", "How evenly a scan head presses, and the head that does best."),
+    "compare-model": ("compare_model", "Compare a scan's frames and map with a forward model of a scene."),
+    "tradeoff": ("tradeoff", "Measure what more accuracy costs, here and now: `tradeoff estimate`, `map`, `forward`."),
     "population": ("population", "Simulate and fit exams of varied bodies: what a calibration is learned from."),
     "sbc": ("sbc", "Check the posterior of a map against itself: ranks and coverage on simulated maps."),
     "simulate": ("simulate", "Make a scan with known truth from a scene."),
@@ -122,7 +125,7 @@ def _run() -> int:
 
 
 def _system_fault(error: OSError | MemoryError) -> str:
-    """The one line for what the system refused and no command foresaw."""
+    """Describe an error of the operating system that no command handled, in one line."""
     if isinstance(error, MemoryError):
         return "the memory did not suffice; give a smaller file, or a machine with more"
     where = f"{error.filename}: " if error.filename else ""

@@ -6,6 +6,8 @@ reader of the output has gone.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 EXIT_DONE = 0
 EXIT_FAULT = 1
 EXIT_USAGE = 2
@@ -29,6 +31,12 @@ class UsageError(TactileBayesError):
     exit_code = EXIT_USAGE
 
 
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Refuse a value that is none of the choices, with a `UsageError` that lists them."""
+    if value not in choices:
+        raise UsageError(f"{name} is {value!r}; give one of {', '.join(choices)}")
+
+
 _MOST_SHOWN = 1000  # characters of what a file holds that an error repeats
 
 
@@ -39,7 +47,7 @@ def _shortened(text: str) -> str:
 
 
 class BadDataError(TactileBayesError, ValueError):
-    """A file, array or table does not hold what it must.
+    """A file, array or table has invalid content.
 
     Parameters
     ----------

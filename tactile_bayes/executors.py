@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class LocalWorkers(Executor):
-    """Processes that are spawned, not forked: libraries with threads of their own do not survive a fork.
+    """Local worker processes, spawned and not forked: libraries with threads do not survive a fork.
 
     A worker leaves Ctrl-C to its parent and ends when the parent does, even if that was killed. When one is killed,
     all items that were handed out come back with `BrokenExecutor`; then `renew` and hand them out again.
@@ -34,7 +34,7 @@ class LocalWorkers(Executor):
 
     @property
     def ahead(self) -> int:
-        """Items to hand out at a time: few, because all of them are run again when a worker is lost."""
+        """Number of items to submit ahead; small, because all of them run again when a worker is lost."""
         return 2 * self._workers
 
     def _start(self) -> None:
@@ -53,25 +53,25 @@ class LocalWorkers(Executor):
         return self._pool.submit(fn, *args, **kwargs)
 
     def stop(self) -> None:
-        """End all processes now; what they were doing is lost."""
+        """Kill all processes now; their running items are lost."""
         self._leash.close()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def renew(self) -> None:
-        """New processes in place of those that are lost."""
+        """Start new processes in place of lost ones."""
         self.stop()
         self._theirs.close()
         self._start()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the processes end when their work is done."""
+        """Let the processes end when their items are done."""
         self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
         self._leash.close()
         self._theirs.close()
 
 
 def prepare_worker(leash: Connection | None = None) -> None:
-    """In a worker: leave Ctrl-C to the parent, and end when the parent does, even if that was killed.
+    """Set up a worker process: ignore Ctrl-C, and end when the parent process does, even if that was killed.
 
     With a `leash`, the reading end of a pipe, the worker ends when the parent closes the other end, by its death too.
     """
@@ -108,7 +108,7 @@ class InlineExecutor(Executor):
 
 @contextlib.contextmanager
 def open_executor(*, workers: int = 1, cluster: str | None = None) -> Iterator[Executor]:
-    """What ``--workers`` and ``--cluster`` mean: a cluster when an address is given, else local processes."""
+    """Open the executor that ``--workers`` and ``--cluster`` ask for: a cluster if an address is given, else local."""
     chosen = local_executor(workers) if cluster is None else cluster_executor(cluster)
     with chosen as executor:
         yield executor
@@ -155,7 +155,7 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
 
 
 def _silence(library: str) -> None:
-    """No log of a library on stderr: what matters of it is told in the outcomes, in one line."""
+    """Stop a library's log on stderr; the outcomes repeat what matters of it in one line."""
     import logging
 
     for name in list(logging.root.manager.loggerDict):

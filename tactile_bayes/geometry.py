@@ -68,7 +68,7 @@ def unroll_quaternion_signs(quaternion_wxyz: FloatArray) -> FloatArray:
 
 
 def rigid(rotation: FloatArray, translation_mm: FloatArray) -> FloatArray:
-    """(4, 4) transform of a (3, 3) rotation and a (3,) translation in mm."""
+    """(4, 4) transform from a (3, 3) rotation and a (3,) translation in mm."""
     transform = np.eye(4)
     transform[:3, :3] = rotation
     transform[:3, 3] = translation_mm
@@ -163,7 +163,7 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
     length = math.sqrt(x_axis @ x_axis)
     if not length > 0.1 * of:
         raise BadDataError(
-            f"the head's x axis has no direction on the plane (length {length:.2g} of {of:.2g})",
+            f"the head's x axis is perpendicular to the plane of motion (projected length {length:.2g} of {of:.2g})",
             way_out="check scanhead_from_tracker, and keep the head's direction while scanning",
         )
     x, n = (x_axis / length).tolist(), normal.tolist()
@@ -174,7 +174,7 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
 
 
 def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:
-    """Patient frame from two landmarks and the direction into the body.
+    """Transform to the patient frame, from two landmarks and the direction into the body.
 
     Origin at the xiphoid, y towards the sternal notch, z the part of `normal` (into the body) at right angles to y,
     x = y cross z. The two landmarks of the paper fix only y; z is this program's choice of the third direction.
@@ -203,7 +203,7 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
 
 
 def patient_from_plane(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, plane_from_base: FloatArray) -> FloatArray:
-    """Patient frame, as `patient_from_base`, from two landmarks in `base` and a plane whose z points into the body.
+    """As `patient_from_base`, from two landmarks in `base` and a plane whose z points into the body.
 
     Returns
     -------

@@ -22,6 +22,9 @@ SHOULDERS_INSIDE: Final = "shoulders-inside"
 SHOULDERS_OUTSIDE: Final = "shoulders-outside"
 HEADS: Final = (SHOULDERS_INSIDE, SHOULDERS_OUTSIDE)
 
+# E2/E1 from which the paper takes a lump for hard: widths change by less than 5 % from there on (section 2.4).
+LEAST_HARD_RATIO: Final = 8.0
+
 CELL_MM: Final = 1.0
 # A cell wider than this share of the narrower sigma is called coarse in the report.
 CELL_PER_SIGMA: Final = 0.75

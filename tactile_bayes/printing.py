@@ -17,7 +17,7 @@ _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u2
 
 
 class ReaderGoneError(Exception):
-    """Whoever read the standard output stopped: ``tactile-bayes show scan.mcap | head -1``."""
+    """The reader of the standard output stopped: ``tactile-bayes show scan.mcap | head -1``."""
 
 
 def printable(text: str) -> str:
@@ -30,7 +30,7 @@ def printable(text: str) -> str:
 
 
 class PrintableStream:
-    """A text stream that shows control characters; everything else is the stream underneath.
+    """A text stream that escapes control characters; all else goes to the stream underneath.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class PrintableStream:
         return len(text)
 
     def flush(self) -> None:
-        """Hand over what was written.
+        """Flush the stream underneath.
 
         Raises
         ------
@@ -82,7 +82,7 @@ def _failure(error: OSError) -> Exception:
 
 
 def _abandon(stream: TextIO) -> None:
-    """Let what is still buffered go nowhere, or Python would try again at its end and print a traceback."""
+    """Discard buffered output; otherwise Python would try again at exit and print a traceback."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)
@@ -99,11 +99,11 @@ def protect_streams() -> None:
 
 
 def release_streams() -> None:
-    """Put the streams back as they were, for Python's own end."""
+    """Restore the original streams."""
     sys.stdout, sys.stderr = raw_stream(sys.stdout), raw_stream(sys.stderr)
 
 
 def raw_stream(stream: Any) -> TextIO:
-    """The stream underneath, for what draws with control characters itself."""
+    """The stream underneath, for code that draws with control characters."""
     found: TextIO = stream._stream if isinstance(stream, PrintableStream) else stream
     return found

@@ -30,7 +30,7 @@ else:
 
 
 def _set_once(self: object, name: str, value: object) -> None:
-    """What ``__init__`` sets nothing else does."""
+    """Let only ``__init__`` set a field."""
     if hasattr(self, name):
         raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
     object.__setattr__(self, name, value)

@@ -19,7 +19,7 @@ CountArray = NDArray[np.uint16]
 
 
 def _check_finite(array: FloatArray, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
-    """The array as float64, after its shape (None is any length) and finiteness were checked."""
+    """Return the array as float64 after checking shape (None is any length) and finiteness."""
     values = np.asarray(array, dtype=np.float64)
     fits = values.ndim == len(shape) and all(
         want in (None, have) for want, have in zip(shape, values.shape, strict=True)
@@ -140,7 +140,7 @@ class PressureFrames:
         if self.counts.dtype != np.uint16 or self.counts.ndim != 3 or len(self.counts) != len(self.time_s):
             raise BadDataError(
                 f"counts is {self.counts.dtype} of shape {self.counts.shape} for {len(self.time_s)} frame times",
-                way_out="it must be uint16 (n, rows, columns), one frame a time",
+                way_out="it must be uint16 (n, rows, columns), one frame per time",
             )
         view = self.counts.view()
         view.flags.writeable = False
@@ -210,7 +210,7 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """All of one scan, ready to be mapped.
+    """All data of one scan.
 
     Parameters
     ----------

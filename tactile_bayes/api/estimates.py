@@ -19,6 +19,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.posterior import SIZES
 
 if TYPE_CHECKING:
     import pandas
@@ -27,12 +28,11 @@ if TYPE_CHECKING:
     from tactile_bayes.pipeline.pooled import PooledOutcome
     from tactile_bayes.size.posterior import SizePosterior
 
-_SIZES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 
 
 class _Sized:
-    """What the estimates of one map and of several share."""
+    """Base of the estimates from one map and from several."""
 
     name: str
     probability: float
@@ -62,8 +62,19 @@ class _Sized:
         """Smallest diameter; None without a size."""
         return self._of_size("min_size_mm")
 
+    @property
+    def max_size_another_exam_mm(self) -> Draws | None:
+        """Largest diameter if another exam of the mass may come out as far apart as the paper's maps.
+
+        None without a size, or where the spread between exams was stated: `max_size_mm` has it then.
+        """
+        size = None if self._size is None else self._size.another_exam
+        if size is None:
+            return None
+        return Draws(np.atleast_2d(size.max_size_mm), "mm", self.probability, size.replicates)
+
     def _columns(self) -> dict[str, Draws]:
-        found = {name: self._of_size(name) for name in _SIZES}
+        found = {name: self._of_size(name) for name in SIZES}
         return {name: draws for name, draws in found.items() if draws is not None}
 
     def to_dataframe(self) -> pandas.DataFrame:
@@ -121,7 +132,7 @@ class SizeEstimate(_Sized):
 
     @property
     def probability(self) -> float:  # type: ignore[override]
-        """Of the intervals that are shown where none is asked for."""
+        """Probability of the intervals shown by default."""
         return self.outcome.settings.interval
 
     @property
@@ -220,11 +231,9 @@ class SizeEstimate(_Sized):
         UsageError
             Without an estimate, or when the file exists and `force` is false.
         """
-        from tactile_bayes.files.posterior_nc import write_posterior
-
         if self.status != "estimate":
             raise UsageError(f"there are no draws to write: {self.why}")
-        write_posterior(path_of(path), self.outcome.estimate, provenance=self.outcome.provenance, force=force)
+        self.outcome.write(path_of(path), force=force)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -278,7 +287,7 @@ class PooledSize(_Sized):
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
-    """Settings from keywords; what is not given is as on the command line.
+    """Make settings from keywords; the defaults are the command line's.
 
     Raises
     ------
@@ -301,7 +310,7 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
 
 
 def _keywords() -> dict[str, str]:
-    """Keywords of `estimate`, and the settings that they are."""
+    """Translate keywords of `estimate` into settings."""
     renamed = {"calibration": "size_calibration"}
     names = [one.name for one in fields(Settings) if one.name != "settings_file"]
     return {renamed.get(name, name): name for name in names}

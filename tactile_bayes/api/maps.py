@@ -47,7 +47,7 @@ class Map:
 
     @property
     def mean(self) -> FloatArray:
-        """(ny, nx) mean normalised pressure; NaN where no frame has been."""
+        """(ny, nx) mean normalised pressure; NaN in cells without readings."""
         return np.where(self.tactile_map.covered, self.tactile_map.mean, np.nan)
 
     @property
@@ -190,17 +190,17 @@ def simulate(
 
 
 def demo_scan() -> Scan:
-    """The scan that comes with the program: a simulated lump of 15 mm."""
+    """Return the scan that comes with the program: a simulated lump of 15 mm."""
     return read_scan(_DEMO)
 
 
 def demo_map() -> Map:
-    """The map of `demo_scan`."""
+    """Return the map of `demo_scan`."""
     return build_map(_DEMO)
 
 
 def map_of(given: Any) -> Map:
-    """A map, whatever of it was given: a map, a path, or a `TactileMap`.
+    """Return the map given as a `Map`, a path or a `TactileMap`.
 
     Raises
     ------

@@ -18,5 +18,5 @@ def path_of(given: None) -> None: ...
 
 
 def path_of(given: PathLike | None) -> Path | None:
-    """A path, with ``~`` as the home folder; None stays None."""
+    """Convert to a path, with ``~`` as the home folder; None stays None."""
     return None if given is None else Path(given).expanduser()

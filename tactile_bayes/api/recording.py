@@ -15,7 +15,7 @@ _RENAMED = {"head": "head_url", "tracker": "tracker_url", "session": "session_fi
 
 
 def record(output: PathLike, *, head: str, duration_s: float, **options: Any) -> Report:
-    """Record a scan head and a tracker into a scan file, from now on for some seconds.
+    """Record a scan head and a tracker into a scan file for some seconds, starting now.
 
     Call it from the main thread: Ctrl-C ends the recording in order.
 

@@ -1,11 +1,11 @@
-"""Tables in, results out: a size calibration from lumps of known size, a trial's report from readings and excision."""
+"""Size calibrations from lumps of known size, and reports of trials, from tables or DataFrames."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.presets import RESEARCH_USE
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import pandas
 
     from tactile_bayes.files.tables import Sheet
+    from tactile_bayes.pipeline.size_calibration import EqSixFit
     from tactile_bayes.pipeline.trial import TrialOutcome
     from tactile_bayes.size.calibration import Calibration
 
@@ -102,6 +103,7 @@ def calibrate_size(
     table: PathLike | pandas.DataFrame,
     *,
     form: str = "eq6",
+    fit: str = "joint",
     least_stiffness_ratio: float = 0.0,
     seed: int = 1,
     path: PathLike | None = None,
@@ -113,9 +115,11 @@ def calibrate_size(
     Parameters
     ----------
     table
-        A row for each lump: d_mm, amplitude, sigma_x_mm...; a table of `population` for ``form="log-quadratic"``.
+        A row for each lump: d_mm, amplitude, sigma_x_mm...; or a table of `population`, a row for each exam.
     form
-        ``"eq6"`` as printed, or ``"log-quadratic"``.
+        ``"eq6"`` as printed, or ``"log-quadratic"`` for a table of `population`.
+    fit
+        Eq 6 of lumps: ``"joint"``, the posterior from all rows, or ``"two-stage"``, the paper's.
     least_stiffness_ratio
         Eq 6: softer lumps take no part.
     seed
@@ -138,10 +142,9 @@ def calibrate_size(
         When a keyword is none of these.
     """
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_json import write_size_calibration
-    from tactile_bayes.files.size_quadratic_json import write_log_quadratic
+    from tactile_bayes.files.size_json import write_body_calibration, write_size_calibration
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.pipeline.size_calibration import learn_eq6, learn_quadratic
+    from tactile_bayes.pipeline.size_calibration import is_population, learn_eq6, learn_population
 
     names = ("normalise", "background", "fit_radius_mm", "noise")
     for name in declared:
@@ -149,17 +152,21 @@ def calibrate_size(
             raise TypeError(f"calibrate_size has no setting {name!r} for form {form!r}; Eq 6 has {', '.join(names)}")
     if form not in ("eq6", "log-quadratic"):
         raise TypeError(f"form is {form!r}; it is 'eq6' or 'log-quadratic'")
+    if fit not in ("joint", "two-stage"):
+        raise TypeError(f"fit is {fit!r}; it is 'joint' or 'two-stage'")
     source = _table(table, "table")
     inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
-    if form == "log-quadratic":
-        quadratic, settings = learn_quadratic(read_table(source, "population.table.json"))
+    if form == "log-quadratic" or is_population(source):
+        if fit != "joint":
+            raise TypeError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
+        over_bodies, settings = learn_population(read_table(source, "population.table.json"), form)
         if path is not None:
             provenance = Provenance("calibrate size", settings, inputs)
-            write_log_quadratic(path_of(path), quadratic, provenance=provenance, force=force)
-        return quadratic
+            write_body_calibration(path_of(path), over_bodies, provenance=provenance, force=force)
+        return over_bodies
     rows = read_table(source, "size_table.table.json")
     given = {name: declared.get(name) for name in names}
-    learned = learn_eq6(rows, given, least_stiffness_ratio=least_stiffness_ratio, seed=seed)
+    learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)
     if path is not None:
         provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)
         write_size_calibration(path_of(path), learned.calibration, provenance=provenance, force=force)
@@ -167,7 +174,7 @@ def calibrate_size(
 
 
 def _table(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
-    """A path, or a DataFrame as the CSV text that its file would hold."""
+    """Return a path as it is, and a DataFrame as CSV text."""
     from tactile_bayes.files.tables import Sheet
 
     if hasattr(given, "to_csv"):

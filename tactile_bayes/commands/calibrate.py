@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
@@ -14,6 +15,7 @@ from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 if TYPE_CHECKING:
     from datetime import datetime
 
+    from tactile_bayes.pipeline.size_calibration import EqSixFit
 
 _FILE = FilePath()
 
@@ -31,7 +33,14 @@ def command() -> None:
     type=click.Choice(["eq6", "log-quadratic"]),
     default="eq6",
     show_default=True,
-    help="eq6: as printed, one row per lump; log-quadratic: from a table of `population`, one row per exam.",
+    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; log-quadratic: of bodies only.",
+)
+@click.option(
+    "--fit",
+    type=click.Choice(["joint", "two-stage"]),
+    default="joint",
+    show_default=True,
+    help="eq6: joint posterior of m, b, e, f from all rows, or the paper's two stages (needs depth_ratio).",
 )
 @click.option(
     "--normalise",
@@ -62,6 +71,12 @@ def command() -> None:
     show_default=True,
     help="Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.",
 )
+@click.option(
+    "--figure",
+    metavar=METAVAR,
+    type=FigurePath(),
+    help="Draw Fig 8 of the paper from the table's lumps (eq6 only).",
+)
 @seed_option(1)
 @FORCE
 @click.pass_context
@@ -71,11 +86,13 @@ def size(
     table: Path,
     output: Path,
     form: str,
+    fit: EqSixFit,
     normalise: str | None,
     background: str | None,
     fit_radius_mm: float | None,
     noise: str | None,
     least_stiffness_ratio: float,
+    figure: Path | None,
     seed: int,
     force: bool,
 ) -> None:
@@ -85,15 +102,22 @@ def size(
     stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. How the
     table's maps were made and fitted stands in its columns normalise, background, fit_radius_mm, noise and flat_field,
     as in a table of `study`, or is declared by the options; an option that contradicts the table is refused, and
-    `estimate` refuses a map made otherwise. With depth_ratio and stiffness_ratio the table is a study: each geometry
+    `estimate` refuses a map made otherwise.
+
+    --fit joint takes m, b, e and f from all rows at once, on the scale of ln d. --fit two-stage is the paper's: d on
+    sigma in the rows at depth_ratio 1, then ln Delta sigma on ln a; its spread is a bootstrap over diameters. The
+    report tells how far the other fit lies.
+
+    With depth_ratio and stiffness_ratio the table is a study: each geometry
     (seat, d_mm, depth_ratio) is also left out of the learning in turn, and the report tells how far Eq 6 and a
     quadratic in logarithms then miss the hard lumps' sizes. Where seat, stiffness below 8, thickness_mm or
     head_radius_mm vary in it, the report tells what each does to the size that Eq 6 gives, and how much of its scatter
     would go if it were known; `estimate` does not use that.
 
-    The log-quadratic form, ln d as a quadratic in ln a and ln sigma, tells apart what differs between bodies and
-    between exams of one body. Its table comes from `population`, which made the maps: nothing is declared. From the
-    pressure over the head where it felt no lump it also learns how deep the fat is, and sizes that go with it.
+    From a table of `population`, which has a row for each exam of a body, either form tells apart what differs between
+    bodies and between exams of one body. `population` made the maps: nothing is declared. From the pressure over the
+    head where it felt no lump it also learns how deep the fat is, and sizes that go with it. The log-quadratic form is
+    ln d as a quadratic in ln a and ln sigma, or a cubic with the depth of fat.
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
@@ -102,45 +126,57 @@ def size(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.pipeline.size_calibration import learn_eq6
+    from tactile_bayes.pipeline.size_calibration import is_population, learn_eq6
     from tactile_bayes.report.calibration_text import calibration_text
     from tactile_bayes.size.learn.body_effects import size_terms
 
-    refuse_existing(output, force=force)
-    if form == "log-quadratic":
+    for path in filter(None, (output, figure)):
+        refuse_existing(path, force=force)
+    if form == "log-quadratic" or is_population(table):
         _refuse_declared(ctx)
-        click.echo(_log_quadratic(table, output, force=force), nl=False)
+        click.echo(_over_bodies(table, output, form, force=force), nl=False)
         return
     declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     rows = read_table(table, "size_table.table.json")
     with progress_bar("effective draws") as progress:
-        learned = learn_eq6(rows, declared, least_stiffness_ratio=least_stiffness_ratio, seed=seed, progress=progress)
+        learned = learn_eq6(
+            rows, declared, fit=fit, least_stiffness_ratio=least_stiffness_ratio, seed=seed, progress=progress
+        )
     provenance = Provenance("calibrate size", learned.settings, hash_inputs(table=table), seed=seed)
     write_size_calibration(output, learned.calibration, provenance=provenance, force=force)
-    words = calibration_text(learned.calibration, terms=size_terms(learned.lumps), not_left_out=learned.not_left_out)
+    if figure is not None:
+        from tactile_bayes.report.eq6_figure import eq6_figure
+
+        eq6_figure(learned.calibration, learned.lumps, figure, title=table.name, force=force)
+    words = calibration_text(
+        learned.calibration,
+        terms=size_terms(learned.lumps),
+        not_left_out=learned.not_left_out,
+        other_fit=learned.other_fit,
+    )
     click.echo(words, nl=False)
 
 
 def _refuse_declared(ctx: click.Context) -> None:
     from tactile_bayes.errors import UsageError
 
-    for name in ("normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "seed"):
+    for name in ("fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed"):
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
-            raise UsageError(f"--{option} is for --form eq6: a table of `population` fixes how its maps were made")
+            raise UsageError(f"--{option} is for tables of lumps: a table of `population` fixes how its maps were made")
 
 
-def _log_quadratic(table: Path, output: Path, *, force: bool) -> str:
+def _over_bodies(table: Path, output: Path, form: str, *, force: bool) -> str:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_quadratic_json import write_log_quadratic
+    from tactile_bayes.files.size_json import write_body_calibration
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.pipeline.size_calibration import learn_quadratic
-    from tactile_bayes.report.quadratic_text import log_quadratic_text
+    from tactile_bayes.pipeline.size_calibration import learn_population
+    from tactile_bayes.report.population_text import body_calibration_text
 
-    calibration, settings = learn_quadratic(read_table(table, "population.table.json"))
+    calibration, settings = learn_population(read_table(table, "population.table.json"), form)
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table))
-    write_log_quadratic(output, calibration, provenance=provenance, force=force)
-    return log_quadratic_text(calibration)
+    write_body_calibration(output, calibration, provenance=provenance, force=force)
+    return body_calibration_text(calibration)
 
 
 @command.command("array")

@@ -1,4 +1,4 @@
-"""`calibrate array`: from recorded bladder steps to a file that `record` attaches."""
+"""`calibrate array`: learn an array's calibration from recorded bladder steps, for `record` to attach."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def calibrate_array(
     steps: tuple[tuple[float, Path], ...], output: Path, *, head_id: str | None, day: date, force: bool
 ) -> str:
-    """Fit, write, and say what was found."""
+    """Fit the calibration, write it, and print the result."""
     from tactile_bayes.files.instrument_json import ArrayCalibrationFile, write_array_calibration
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan

@@ -1,4 +1,4 @@
-"""`emulate`: a scan served as the bytes of a device."""
+"""`emulate`: serve a scan as a device would send it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.commands.options import SPEED
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import BadDataError, UsageError
 
@@ -37,13 +38,7 @@ _SHARE = click.FloatRange(0.0, 1.0)
 @click.option(
     "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
 )
-@click.option(
-    "--speed",
-    type=click.FloatRange(0.01, 100.0),
-    default=1.0,
-    show_default=True,
-    help="Playback speed; 1 is real time.",
-)
+@SPEED
 @click.option("--drop", type=_SHARE, default=0.0, help="Share of the records that are not sent.")
 @click.option("--corrupt", type=_SHARE, default=0.0, help="Share of the records with one bit changed.")
 @click.option(
@@ -118,7 +113,7 @@ def _emulator(device: Device, link: Link, faults: Faults, stage: Stage, *, leads
 
 
 def _serve(emulators: list[Emulator], *, once: bool) -> None:
-    """Run the first here and the others in threads, until all have ended or a signal comes."""
+    """Run the first emulator here and the others in threads, until all have ended or a signal comes."""
     from threading import Thread
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -138,7 +133,7 @@ def _account(role: str, served: Served) -> str:
 
 
 class _LeaveError(Exception):
-    """Somebody asked this program to end."""
+    """A signal asked this program to end."""
 
 
 def _leave(number: int, frame: object) -> None:
@@ -147,7 +142,7 @@ def _leave(number: int, frame: object) -> None:
 
 
 def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, held: Stage | None) -> Device:
-    """The device; an NDI tracker, which answers and streams nothing, looks at the stage itself where it is shared."""
+    """Make the emulated device; an NDI tracker, which only answers, follows a shared stage itself."""
     from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
 
     if kind == "head" and len(scan.frames):
@@ -172,7 +167,7 @@ def _refuse_for_ndi(faults: Faults, *, once: bool) -> None:
 
 
 def _link(tcp: str | None, *, after: int) -> Link:
-    """A link of its own; the one `after` another listens on a port as far after."""
+    """Make a device's link; the one `after` others listens on a port that many numbers higher."""
     from tactile_bayes.hardware.emulator import PtyLink, TcpLink
 
     if tcp is None:

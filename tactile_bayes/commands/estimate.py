@@ -1,4 +1,4 @@
-"""`estimate`: from tactile maps to sizes."""
+"""`estimate`: estimate sizes from tactile maps."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--size-calibration",
-    metavar="solid|solid-mean|plane-strain|none|SIZE.json",
+    metavar="solid|eq6|solid-mean|plane-strain|none|SIZE.json",
     help="Calibration from widths to sizes: a shipped one, your own file, or none (widths only). Default: "
-    "solid, or solid-mean for maps of frames divided by their means.",
+    "solid, or solid-mean for maps of frames divided by their means; eq6 is the paper's Eq 6 over such bodies.",
 )
 @click.option(
     "--method",
@@ -189,7 +189,7 @@ def _named(calibration: str | None) -> Path | None:
 
 
 def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, force: bool) -> None:
-    """Stop before any work is done if an output cannot be written."""
+    """Raise an error, before any work is done, if an output cannot be written."""
     from tactile_bayes.files.atomic import refuse_existing
 
     twice = [path for index, path in enumerate(maps) if path in maps[:index]]
@@ -218,9 +218,7 @@ def _one_map(
         )
     tactile_map, estimate = outcome.tactile_map, outcome.estimate
     if output and estimate.status == "estimate":
-        from tactile_bayes.files.posterior_nc import write_posterior
-
-        write_posterior(output, estimate, provenance=outcome.provenance, force=force)
+        outcome.write(output, force=force)
     if figure or map_figure:
         from tactile_bayes.report.estimate_figures import draw_figures
 
@@ -246,7 +244,7 @@ def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, sche
 
 
 def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
-    """The maps' answers; maps that have one fault of the batch are named together, in the first one's answer."""
+    """Answers for all maps; maps with the same error of the batch are named together in the first's answer."""
     from tactile_bayes.batch import fault_lines
 
     found = list(outcomes)
@@ -260,7 +258,7 @@ def _answers(outcomes: Iterable[Outcome[Answer]]) -> list[Answer]:
 
 @contextmanager
 def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: bool) -> Iterator[None]:
-    """On Ctrl-C print the answers of the maps that are done, and go on up."""
+    """On Ctrl-C print the finished answers, and pass the interruption on."""
     from tactile_bayes.batch import BatchInterrupted
 
     try:
@@ -273,7 +271,7 @@ def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: b
 
 
 def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbose: bool, listed: bool) -> None:
-    """Errors on stderr, answers on stdout: whole with `verbose`; `listed` where several maps were given."""
+    """Print errors on stderr and answers on stdout: in full with `verbose`, `listed` for several maps."""
     from tactile_bayes.files.schema import check_document, dump_json
 
     for answer in answers:

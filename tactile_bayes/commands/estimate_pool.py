@@ -26,7 +26,7 @@ def estimate_pool(
     verbose: bool,
     force: bool,
 ) -> int:
-    """Print, and write where asked, the size of the mass; return the exit code.
+    """Pool the maps, print and write the result; return the exit code.
 
     A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
     """

@@ -12,10 +12,10 @@ METAVAR: Final = "FIG.png|.pdf|.svg"
 
 
 class FigurePath(FilePath):
-    """A path whose suffix says how the figure is written; another suffix is refused before any work."""
+    """Path of a figure; an unknown suffix is refused before any work."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path, with a suffix that is known."""
+        """Check the suffix and return the path."""
         from tactile_bayes.report.figure_file import check_suffix
 
         path = super().convert(value, param, ctx)

@@ -11,7 +11,7 @@ from tactile_bayes.presets import HEADS
 
 
 def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The option, with a sentence about what is taken without it."""
+    """Make the option; its help ends with a sentence about the default."""
     return click.option(
         "--head",
         type=click.Choice(HEADS),

@@ -1,4 +1,4 @@
-"""`import`: other people's arrays as a scan, grids and images as a map."""
+"""`import`: import scans, grids and images from other programs."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ command.help = f"{cleandoc(command.help or '')}\n\n{_ARRAYS}"
 
 
 def _kind_of(source: Path, output: Path) -> str:
-    """What comes out, where nothing is said: a map where the output is .nc or the source can only be a grid."""
+    """Default kind of output: a map where the output is .nc or the source can only be a grid."""
     as_map = output.suffix.lower() == ".nc" and source.suffix.lower() != ".mcap"
     return "scan" if source.suffix.lower() in (".npz", ".mcap") and not as_map else "map"
 
@@ -143,13 +143,13 @@ def _describe_map(tactile_map: TactileMap) -> list[str]:
 
 
 def _unit(tactile_map: TactileMap) -> str:
-    """Of the values, after them; nothing where they were divided."""
+    """Unit of the values, to follow them; empty where they were divided by a level."""
     unit = tactile_map.recipe.value_unit
     return "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
 
 
 def describe_scan(scan: Scan) -> list[str]:
-    """A few lines on what a scan holds, for people."""
+    """Summary of a scan in a few lines."""
     times, poses = scan.frames.time_s, scan.poses
     span = float(times[-1] - times[0]) if len(times) else 0.0
     calibration = scan.element_calibration
@@ -173,7 +173,7 @@ def _rate(times: FloatArray) -> str:
 
 
 def _dropped(times: FloatArray) -> int:
-    """Periods that passed without a record, by the median period."""
+    """Number of records missing, by the median period."""
     import numpy as np
 
     steps = np.diff(times)

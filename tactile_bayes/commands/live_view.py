@@ -1,4 +1,4 @@
-"""The live view's process: follows a recording, keeps a map, draws it and has it estimated in another process.
+"""Process of the live view: follows a recording, keeps and draws a map, with estimates from another process.
 
 It is started by `record` and never makes it wait; if it dies, the recording goes on.
 """
@@ -43,13 +43,13 @@ def live_view(
     serve: str | None,
     size_calibration: str,
 ) -> Iterator[Any]:
-    """Start the view's process; what comes out is an observer for the recorder."""
+    """Start the view's process; returns an observer for the recorder."""
     from tactile_bayes.files.scan_parts import calibration_document, head_document
     from tactile_bayes.hardware.feed import Feed
     from tactile_bayes.hardware.serve import address_of
 
     if serve:
-        address_of(serve)  # tell a mistake before anything is recorded
+        address_of(serve)  # report a mistake before anything is recorded
     setup = {
         "head": head_document(head),
         "calibration": calibration_document(calibration),
@@ -78,7 +78,7 @@ def live_view(
 
 
 class LiveAnswer(NamedTuple):
-    """What one look at the map came to; nothing where the answer before stands.
+    """Result of one live estimate; empty where the previous one stays.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class LiveAnswer(NamedTuple):
 
 
 class Estimator:
-    """Estimates the size of the newest map in a process of its own, again and again."""
+    """Estimates the newest map's size repeatedly in a process of its own."""
 
     def __init__(self, calibration: str | None) -> None:
         self._calibration = calibration
@@ -105,14 +105,14 @@ class Estimator:
         self.seconds = 0.0
 
     def warm_up(self) -> None:
-        """Start the process and let it import what it needs, before there is a map."""
+        """Start the process and its imports before there is a map."""
         import multiprocessing
 
         self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
         self._running, self._begun = self._pool.submit(LiveAnswer), time.monotonic()
 
     def look(self, tactile_map: TactileMap | None) -> None:
-        """Take the answer that has come, and ask anew."""
+        """Take the answer if it has come, and start the next estimate."""
         if self._running is not None and self._running.done():
             with contextlib.suppress(Exception):  # the estimate's process died: the view goes on without
                 answer = self._running.result()
@@ -128,7 +128,7 @@ class Estimator:
                 self._running = self._pool.submit(live_estimate, tactile_map, self._calibration)
 
     def close(self) -> None:
-        """End its process, in the middle of an estimate too."""
+        """End the process, also during an estimate."""
         if self._pool is not None:
             import multiprocessing
 
@@ -146,7 +146,7 @@ def _prepare() -> None:
 
 
 class Turn:
-    """Which of the map's rises is looked at next: one a time, because most of them are no lump and cost as much.
+    """Choice of the next rise to estimate, one at a time: most are no lump and each costs as much as a lump.
 
     The one that was a lump last time, or else the next lower one; now and then the highest, which may be new. How wide
     the lump was is where the next fit of it begins.
@@ -159,7 +159,7 @@ class Turn:
         self._width_mm: float | None = None
 
     def of(self, number: int) -> int:
-        """Which of `number`, 0 being the highest."""
+        """Index of the next of `number` rises; 0 is the highest."""
         self._asked += 1
         self._home %= number
         self._now = 0 if self._asked % self.AGAIN == 0 else self._home
@@ -167,11 +167,11 @@ class Turn:
 
     @property
     def width_mm(self) -> float | None:
-        """Of the lump, where this turn is at it again."""
+        """Width of the lump, when its turn has come again."""
         return self._width_mm if self._now == self._home else None
 
     def tell(self, *, lump: bool, width_mm: float | None = None) -> bool:
-        """What came of it; whether that is worth showing: not that the highest is still none."""
+        """Record an estimate's result; return whether to show it: not when a rise glanced at is no lump."""
         glance = self._now != self._home
         if lump:
             self._home, self._width_mm = self._now, width_mm
@@ -199,7 +199,7 @@ def _calibration_of(path: str) -> Calibration:
 
 
 def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: Turn = _TURN) -> LiveAnswer:
-    """The size by the quick method and where the lump is; the reason when there is none."""
+    """Size by the fast method with the lump's place, or the reason why there is none."""
     import numpy as np
 
     from tactile_bayes.errors import TactileBayesError
@@ -214,7 +214,7 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
             return LiveAnswer("no estimate: nothing rises above the background")
         centre = centres[turn.of(len(centres))]
         calibration = _calibration_of(calibration_path) if calibration_path else None
-        # whether an ellipse is turned is a question for afterwards, and takes a third of the time
+        # no test for rotation: it takes a third of the time and can be made afterwards
         fit = FitOptions("fixed", FIT_RADIUS_MM, "off", centre, "independent", turn.width_mm, FIELD_COSINES)
         if calibration is not None:
             recipe = calibration.recipe
@@ -239,7 +239,7 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
 
 
 def _in_base(tactile_map: TactileMap, posterior: MapPosterior) -> FloatArray | None:
-    """The lump's centre in `base`, where it stays when the plane of the map changes."""
+    """Centre of the lump in `base`, which stays valid when the map's plane changes."""
     import numpy as np
 
     from tactile_bayes.geometry import apply, inverse
@@ -259,7 +259,7 @@ def _interval(name: str, draws: FloatArray, probability: float) -> str:
 
 
 def run(pipe: int, setup: dict[str, Any]) -> None:
-    """Look on until the recording ends."""
+    """Follow a recording until it ends."""
     from tactile_bayes.files.scan_parts import calibration_from_document, head_from_document
     from tactile_bayes.hardware.feed import FeedReader
     from tactile_bayes.hardware.live import LiveMap
@@ -288,7 +288,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
 
 
 def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callable[[LiveState], None]]) -> int:
-    """Draw until the recording ends; how often that was."""
+    """Draw until the recording ends; returns the number of drawings."""
     drawn, drawings, newest = 0.0, 0, None
     while not reader.ended:
         live.take(reader.read(TAKEN_EVERY_S))
@@ -306,7 +306,7 @@ def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callab
 
 @contextlib.contextmanager
 def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]]:
-    """Draws on a terminal; a line a second where it cannot be drawn on.
+    """Draw on a terminal; one line per second where it cannot be redrawn.
 
     `keys` says whether the recording's keys can be pressed there.
     """

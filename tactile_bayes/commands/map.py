@@ -5,18 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, NumberOr
+from tactile_bayes.commands.options import FORCE, PRESSURE_WINDOW, NumberOr
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
-
-if TYPE_CHECKING:
-    pass
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE
 
 _FILE = FilePath()
 
@@ -25,14 +21,7 @@ _FILE = FilePath()
 @click.argument("scans", metavar="SCAN.mcap...", nargs=-1, required=True, type=_FILE)
 @click.option("-o", "--output", required=True, metavar="MAP.nc", type=_FILE, help="Where to write the map.")
 @click.option("--cell-mm", type=float, default=CELL_MM, show_default=True, help="Side of the square cells, mm.")
-@click.option(
-    "--pressure-window-kpa",
-    type=(float, float),
-    metavar="LOW HIGH",
-    default=PRESSURE_WINDOW_KPA,
-    show_default=True,
-    help="Leave out frames whose mean pressure lies outside.",
-)
+@PRESSURE_WINDOW
 @click.option(
     "--normalise",
     type=click.Choice(NORMALISE),
@@ -60,6 +49,14 @@ _FILE = FilePath()
 @click.option(
     "--register-strokes", is_flag=True, help="Align the strokes with each other, for a lump that moves with the head."
 )
+@click.option(
+    "--every",
+    type=click.IntRange(min=1),
+    metavar="N",
+    default=1,
+    show_default=True,
+    help="Use one frame of every N: quicker, and noisier; `tradeoff map` measures both.",
+)
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the map and its coverage.")
 @FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print the time of each step on stderr.")
@@ -73,6 +70,7 @@ def command(
     plane_radius_mm: float | str,
     flat_field: bool,
     register_strokes: bool,
+    every: int,
     figure: Path | None,
     force: bool,
     verbose: bool,
@@ -101,6 +99,7 @@ def command(
         "plane_radius_mm": plane_radius_mm,
         "flat_field": flat_field,
         "register_strokes": register_strokes,
+        "every": every,
     }
     clock = _Clock(verbose)
     loaded, lost = load_scans(scans)
@@ -115,6 +114,7 @@ def command(
             plane_radius_mm=None if plane_radius_mm == "all" else plane_radius_mm,
             flat_field=flat_field,
             register_strokes=register_strokes,
+            every=every,
             progress=progress,
         )
     clock.tell("map")
@@ -129,7 +129,7 @@ def command(
 
 
 def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:
-    """Stop before any work is done if an output cannot be written or a scan is given twice."""
+    """Raise an error, before any work, for an output that cannot be written or a scan given twice."""
     from tactile_bayes.files.atomic import refuse_existing
 
     if len({path.absolute() for path in scans}) < len(scans):
@@ -139,7 +139,7 @@ def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, 
 
 
 class _Clock:
-    """Says how long each step took, if asked to."""
+    """Prints the time of each step, if requested."""
 
     def __init__(self, verbose: bool) -> None:
         self._verbose = verbose

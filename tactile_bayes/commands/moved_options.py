@@ -1,4 +1,4 @@
-"""Options that have moved: using one prints where it is now."""
+"""Options that have moved to a settings file: using one prints where it is now."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tactile_bayes.errors import UsageError
 
 
 class MovedOptions(click.Command):
-    """A command some of whose options have moved.
+    """A command with options that have moved.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Options that several commands have, and types of values: a finite number, or a number or one of a few words."""
+"""Options shared by several commands, and value types: finite numbers, numbers or words."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 
 if TYPE_CHECKING:
     _ParamType = click.ParamType[Any]
@@ -21,15 +23,15 @@ class WholeOrAuto(click.IntRange):
     """A whole number, or None for "auto"."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number, or None."""
+        """Convert to the number, or to None."""
         return None if value == "auto" else super().convert(value, param, ctx)
 
 
 class FiniteRange(click.FloatRange):
-    """A number in a range; nan and infinity, which pass comparisons or stand at their ends, are refused."""
+    """A finite number in a range; nan and infinity are refused."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number."""
+        """Convert to the number."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number", param, ctx)
@@ -51,7 +53,7 @@ class NumberOr(_ParamType):
         self.words = words
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
-        """The number, or the word."""
+        """Convert to the number, or return the word."""
         if isinstance(value, int | float):
             return float(value)
         if value in self.words:
@@ -64,9 +66,40 @@ class NumberOr(_ParamType):
 
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+PRESSURE_WINDOW = click.option(
+    "--pressure-window-kpa",
+    type=(float, float),
+    metavar="LOW HIGH",
+    default=PRESSURE_WINDOW_KPA,
+    show_default=True,
+    help="Leave out frames whose mean pressure lies outside.",
+)
+SPEED = click.option(
+    "--speed",
+    type=click.FloatRange(0.01, 100.0),
+    default=1.0,
+    show_default=True,
+    help="Playback speed; 1 is real time.",
+)
 WORKERS = click.option(
     "--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Number of worker processes."
 )
+
+
+def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """``--live``, ``--serve`` and ``--size-calibration``: the live view of a recording."""
+    live = click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
+    serve = click.option(
+        "--serve", metavar="HOST:PORT", help="Show the map in a browser on this computer, with a tone for the pressure."
+    )
+    size_calibration = click.option(
+        "--size-calibration",
+        default="solid-mean",
+        show_default=True,
+        metavar="solid-mean|plane-strain|none|SIZE.json",
+        help="Size calibration of the live view, whose frames are divided by their means.",
+    )
+    return live(serve(size_calibration(command)))
 
 
 def seed_option(default: int) -> Decorator:
@@ -75,5 +108,5 @@ def seed_option(default: int) -> Decorator:
 
 
 def scheduler_option(what: str) -> Decorator:
-    """``--scheduler``; `what` is sent to it, in words."""
+    """``--scheduler``; `what` names the work that is sent to it."""
     return click.option("--scheduler", metavar="ADDRESS", help=f"Send {what} to a dask scheduler (extra [cluster]).")

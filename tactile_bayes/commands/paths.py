@@ -1,4 +1,4 @@
-"""Paths on the command line: no output may be an input of the same command, or another output of it."""
+"""Paths on the command line: an output may be neither an input nor another output of the same command."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import click
 
 from tactile_bayes.errors import UsageError
 
-WRITTEN: Final = frozenset({"output", "figure", "map_figure", "figures", "html"})
+WRITTEN: Final = frozenset({"output", "figure", "map_figure", "figures", "html", "trace", "rank", "corner"})
 """The options that name what a command writes; every other path is read."""
 _SEEN: Final = "tactile_bayes.paths"
 
 
 class FilePath(click.Path):
-    """A path that is compared with the other paths of the same call before the command runs.
+    """Path that is checked against the other paths of the call before the command runs.
 
     Symbolic and hard links to one file are that file.
     """
@@ -26,7 +26,7 @@ class FilePath(click.Path):
         super().__init__(path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path.
+        """Record and return the path.
 
         Raises
         ------
@@ -47,7 +47,7 @@ class FilePath(click.Path):
 
 
 def also_read(*paths: Path | None) -> None:
-    """Refuse the call if it writes one of the files that it reads besides those on its command line.
+    """Refuse the call if it would overwrite one of these further inputs.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def also_read(*paths: Path | None) -> None:
 def refuse_same(
     outputs: Iterable[Path | None], inputs: Iterable[Path], *, what: str = "an input of this command"
 ) -> None:
-    """Refuse an output that is one of the inputs, by whatever name.
+    """Refuse an output that is the same file as an input, under any name.
 
     Parameters
     ----------

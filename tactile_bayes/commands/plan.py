@@ -123,12 +123,12 @@ def command(
 
 
 def _sources(typed: set[str], *, pilot: bool) -> dict[str, str]:
-    """Where each assumed error comes from: an option, the pilot or the default."""
+    """Source of each assumed error: an option, the pilot or the default."""
     return {name: "option" if name in typed else "pilot" if pilot else "default" for name in _ERRORS}
 
 
 def _typed() -> set[str]:
-    """The options that were given on the command line."""
+    """Options given on the command line."""
     context = click.get_current_context()
     return {
         name for name in context.params if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
@@ -136,7 +136,7 @@ def _typed() -> set[str]:
 
 
 def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, float]) -> dict[str, float]:
-    """The pilot's errors, but for those that options give."""
+    """Errors from the pilot, where no option gives them."""
     import numpy as np
 
     from tactile_bayes.commands.paths import also_read

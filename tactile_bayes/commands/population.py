@@ -1,4 +1,4 @@
-"""`population`: simulated exams of varied bodies, mapped and fitted: the table for a size calibration."""
+"""`population`: simulate, map and fit exams of varied bodies: the table for a size calibration."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def command(
     Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
     pressure, strokes, head yaw, tilt, noise, tracker errors and latency. The solid model makes the scans; maps are
     built and fitted as `map` and `estimate` do it. A mass takes about ten seconds. An interrupted run goes on where it
-    stopped. `calibrate size --form log-quadratic` learns from the table.
+    stopped. `calibrate size` learns Eq 6 from the table, or with
+    --form log-quadratic a calibration of the default's kind.
 
     Example: tactile-bayes population --masses 100 --workers 4 -o population.csv
     """
@@ -114,7 +115,7 @@ def command(
 def rows_of_mass(
     index: int, *, scans: int, seed: int, first_centred: int, normalise: str = DEFAULT_NORMALISE
 ) -> list[MassRow]:
-    """The rows of one mass, in whichever process."""
+    """Rows of one mass, in any process."""
     import numpy as np
 
     from tactile_bayes.forward.population import BodyPrior, draw_mass
@@ -145,7 +146,7 @@ def _decode(rows: list[dict[str, Any]]) -> list[MassRow]:
 
 
 def table_text(rows: list[MassRow]) -> str:
-    """The rows under the header that `data_schema/population.table.json` describes."""
+    """CSV of the rows, with the header of `data_schema/population.table.json`."""
     from dataclasses import astuple, fields
 
     from tactile_bayes.studies.population import MassRow

@@ -1,4 +1,4 @@
-"""A progress bar on stderr, drawn only on a terminal and only for work that takes a while."""
+"""Progress bar on stderr, drawn only on a terminal and only for work that takes a while."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile_bayes.printing import raw_stream
 
 # Work that ends sooner draws nothing.
 QUIET_S = 2.0
-# Between two drawings; a bar is for eyes.
+# Seconds between two drawings.
 REDRAW_S = 0.1
 _WIDTH = 30
 
@@ -23,7 +23,7 @@ Progress = Callable[[int, int], None]
 def progress_bar(
     label: str, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Progress]:
-    """A ``progress(done, total)`` callback for `batch.run_batch` and the samplers; the line goes when the block ends.
+    """Give a ``progress(done, total)`` callback; the bar is erased when the block ends.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def progress_bar(
 
 
 class _Bar:
-    """One line that is drawn over itself."""
+    """A line that is redrawn."""
 
     def __init__(self, label: str, out: TextIO, clock: Callable[[], float]) -> None:
         self._label = label
@@ -58,7 +58,7 @@ class _Bar:
         self._first: int | None = None  # what a resumed run had before it began
 
     def update(self, done: int, total: int) -> None:
-        """Draw the bar at `done` of `total`, if it is time."""
+        """Redraw the bar at `done` of `total`, at most every so often."""
         now = self._clock()
         self._first = done if self._first is None else self._first
         if now < self._next or total <= 0:
@@ -78,7 +78,7 @@ class _Bar:
         return f" {seconds // 60}:{seconds % 60:02d} left"
 
     def erase(self) -> None:
-        """Leave the line empty for what comes next."""
+        """Erase the line."""
         if self._drawn:
             self._out.write("\r" + " " * self._drawn + "\r")
             self._out.flush()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
-from tactile_bayes.commands.options import FORCE
+from tactile_bayes.commands.options import FORCE, live_options
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.commands.record_request import Request
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
@@ -100,17 +100,7 @@ _CODE = "A code, not a name."
     metavar="SESSION.toml",
     help="Read these five, and other facts in plain text, from a file; an option overrides it.",
 )
-@click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
-@click.option(
-    "--serve", metavar="HOST:PORT", help="Show the map in a browser on this computer, with a tone for the pressure."
-)
-@click.option(
-    "--size-calibration",
-    default="solid-mean",
-    show_default=True,
-    metavar="solid-mean|plane-strain|none|SIZE.json",
-    help="Size calibration of the live view, whose frames are divided by their means.",
-)
+@live_options
 @FORCE
 @click.pass_context
 def command(ctx: click.Context, /, output: Path, **options: Any) -> None:
@@ -144,7 +134,7 @@ def _check_rom(request: Request) -> None:
 
 
 def make_recording(request: Request) -> tuple[Report, bool]:
-    """Check everything, record, close the file; the account, and whether somebody interrupted.
+    """Check the devices, record and close the file; returns the account, and whether it was interrupted.
 
     Raises
     ------
@@ -209,7 +199,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
 def _look_on(
     request: Request, head: HeadGeometry, calibration: ElementCalibration, stack: ExitStack
 ) -> Observer | None:
-    """Start the live view, if one was asked for."""
+    """Start the live view, if requested."""
     if not (request.live or request.serve):
         return None
     from tactile_bayes.commands.live_view import live_view
@@ -222,7 +212,7 @@ def _look_on(
 
 
 def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None]]:
-    """Open the ports, check who is there, start the reading processes."""
+    """Open the ports, identify the devices and start the reading processes."""
     from tactile_bayes.hardware import head
     from tactile_bayes.hardware.drivers import TRACKERS, check_head, open_tracker
     from tactile_bayes.hardware.head import HeadParser
@@ -260,7 +250,9 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
 
 def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> None:
     if not hello.rows * hello.columns:
-        raise DeviceError(f"head {request.head_url}: {hello.device_id!r} is there, without taxels; give a head's port")
+        raise DeviceError(
+            f"head {request.head_url}: {hello.device_id!r} is a device without taxels; give a head's port"
+        )
     if (hello.rows, hello.columns) != head.shape:
         raise UsageError(
             f"head {request.head_url} has {hello.rows} x {hello.columns} taxels, the geometry given is for "
@@ -271,7 +263,7 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
 
 
 def _place(landmarks: Landmarks | None, writer: Any, observer: Observer | None) -> None:
-    """Write the landmarks that a file gave, and show them to the live view."""
+    """Write the landmarks given in a file, and show them in the live view."""
     if landmarks is None:
         return
     for name in ("sternal_notch", "xiphoid"):

@@ -1,4 +1,4 @@
-"""External control of a recording: signals and terminal keys."""
+"""Control of a recording by signals and terminal keys."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Stopper:
-    """Turns Ctrl-C, SIGTERM and SIGHUP into an orderly end."""
+    """Ends a recording in order on Ctrl-C, SIGTERM or SIGHUP."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
@@ -27,11 +27,11 @@ class Stopper:
 
     @property
     def interrupted(self) -> bool:
-        """Whether a signal came."""
+        """Whether a signal has come."""
         return bool(self._why)
 
     def look(self) -> None:
-        """Stop the recorder if a signal came."""
+        """Stop the recorder if a signal has come."""
         if self._why:
             self._recorder.stop(self._why)
 
@@ -50,7 +50,7 @@ class Stopper:
 
 
 class Keys:
-    """The keys of a terminal: landmarks, start, stop. Without a terminal there are none, and nothing waits."""
+    """Keys of a terminal for landmarks, start and stop; without a terminal there are none."""
 
     def __init__(self, recorder: Recorder, scanhead_from_tracker: FloatArray, *, wait: bool) -> None:
         self._recorder = recorder
@@ -80,7 +80,7 @@ class Keys:
                 termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
 
     def look(self) -> None:
-        """Do what the keys say that were pressed since, and tell of landmarks."""
+        """Act on the keys pressed since the last call, and report landmarks."""
         for text in self._recorder.report.landmarks[self._told :]:
             click.echo(text, err=True)
             self._told += 1

@@ -1,4 +1,4 @@
-"""What `record` knows of the instrument before it starts: geometry, calibration, landmarks, provenance."""
+"""Instrument and provenance of a recording, checked before it starts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NOMINAL_FULL_SCALE = 4095
 
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:
-    """Geometry, calibration and landmarks from the files that were given.
+    """Read geometry, calibration and landmarks from the files given.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def _calibration(request: Request, head: HeadGeometry, like: Any) -> ElementCali
 
 
 def refuse_calibration(request: Request, *, head_id: str, today: date) -> None:
-    """Raise `UsageError` when the array's calibration is stale or another head's, unless it was accepted."""
+    """Raise `UsageError` for a calibration that is stale or of another head, unless accepted."""
     from tactile_bayes.files.instrument_json import read_array_calibration
 
     if not request.array_calibration or request.uncalibrated or request.accept_calibration:
@@ -88,7 +88,7 @@ def _landmarks(request: Request) -> Landmarks | None:
 
 
 def provenance_of(request: Request, settings: dict[str, Any]) -> Provenance:
-    """What made the file; ports are not in it."""
+    """Provenance of the recording, without its ports."""
     from tactile_bayes.files.provenance import Provenance, hash_inputs
 
     names = ("like", "head_geometry", "array_calibration", "landmarks")

@@ -1,4 +1,4 @@
-"""The options of one recording, and what a file records of them."""
+"""Options of one recording, and the part of them that the file stores."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Request:
-    """The options of one recording, as they were given."""
+    """Options of one recording, as given."""
 
     output: Path
     head_url: str
@@ -45,7 +45,7 @@ class Request:
     force: bool
 
     def facts(self) -> dict[str, str]:
-        """Plain text facts of the session: the file's, and the options' where both name one.
+        """Session facts as text: from the file, overridden by options.
 
         Raises
         ------
@@ -62,13 +62,13 @@ class Request:
         return facts
 
     def session(self, hello: HelloReading, facts: dict[str, str]) -> dict[str, str]:
-        """What the file records of the session: the devices, the clock, and the facts."""
+        """Session as the file stores it: devices, clock and facts."""
         tracker = self.tracker_protocol if self.tracker_url else "none"
         devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker, "clock": self.clock}
         return devices | ({"rotation": "inverted"} if self.invert_rotation else {}) | facts
 
     def settings(self, hello: HelloReading) -> dict[str, Any]:
-        """For the provenance."""
+        """Settings for the provenance."""
         return {
             "tracker_protocol": self.tracker_protocol if self.tracker_url else None,
             "rate_hz": hello.rate_hz / self.every,

@@ -1,4 +1,4 @@
-"""`replay`: a scan through the same path as a recording."""
+"""`replay`: play a scan through emulated devices and the recorder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from tactile_bayes.commands.options import FORCE
+from tactile_bayes.commands.options import FORCE, SPEED, live_options
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import DeviceError
 
@@ -21,24 +21,8 @@ _FILE = FilePath()
 @click.command("replay")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
 @click.option("-o", "--output", metavar="OUT.mcap", type=_FILE, help="Save what is recorded.")
-@click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
-@click.option(
-    "--serve", metavar="HOST:PORT", help="Show the map in a browser on this computer, with a tone for the pressure."
-)
-@click.option(
-    "--size-calibration",
-    default="solid-mean",
-    show_default=True,
-    metavar="solid-mean|plane-strain|none|SIZE.json",
-    help="Size calibration of the live view, whose frames are divided by their means.",
-)
-@click.option(
-    "--speed",
-    type=click.FloatRange(0.01, 100.0),
-    default=1.0,
-    show_default=True,
-    help="Playback speed; 1 is real time.",
-)
+@live_options
+@SPEED
 @FORCE
 @click.pass_context
 def command(
@@ -73,7 +57,7 @@ def command(
 
 @contextmanager
 def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, str]]:
-    """Emulated devices that play one scan together, in a process of their own; their URLs by role."""
+    """Start emulated devices that play one scan together, in one process; gives their URLs by role."""
     words = ["emulate", "both" if poses else "head", str(scan), "--speed", str(speed)]
     process = subprocess.Popen(
         [sys.executable, "-m", "tactile_bayes", *words],

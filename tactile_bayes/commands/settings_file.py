@@ -1,4 +1,4 @@
-"""The settings of a call: its options and, where one is given, a settings file."""
+"""Settings of a call from its options and its settings file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tactile_bayes.pipeline.settings import Settings
 
 
 def settings_of(path: Path | None, **options: Any) -> Settings:
-    """Settings from options and a file.
+    """Make settings from options and a settings file.
 
     Raises
     ------

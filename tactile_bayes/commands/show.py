@@ -35,12 +35,12 @@ def command(file: Path, as_json: bool) -> None:
 
 
 def shown(found: dict[str, Any]) -> str:
-    """What a file is, one fact a line."""
+    """Description of a file, one fact per line."""
     return "\n".join(_lines(found))
 
 
 def _lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
-    """Nested facts, one a line."""
+    """Nested facts as lines."""
     width = max((len(name) for name in found), default=0)
     for name, value in found.items():
         if isinstance(value, dict) and value:

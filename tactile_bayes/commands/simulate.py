@@ -1,4 +1,4 @@
-"""`simulate`: a scan with known truth from a scene."""
+"""`simulate`: make a scan with known truth from a scene."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ def command(
     Lumps given as bumps (amplitude, sigma) take the empirical-gaussian model; lumps of tissue (d_mm, depth_ratio,
     stiffness_ratio, seat) and ribs in a [body] take the solid one: every frame is a contact problem in three
     dimensions. Cheaper for one lump: plane-strain solves the contact in two dimensions, empirical takes Eqs 1 to 4 of
-    the paper. To both a lump is a cylinder along y, and a frame's profile across the head is repeated along it.
+    the paper, which hold for lumps of 10 mm and more down to h/d 1 (deeper, a warning: the map loses the lump). To
+    both a lump is a cylinder along y, and a frame's profile across the head is repeated along it.
 
     The truth goes into the scan file beside the data; no other command reads it. On one machine and its libraries
     the same scene and seed give the same bytes.
@@ -65,9 +66,13 @@ def _run(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import write_scan
     from tactile_bayes.files.scene_toml import read_scene
+    from tactile_bayes.forward.plane.empirical import outside_range
     from tactile_bayes.forward.simulate import simulate
 
     scene = read_scene(scene_path)
+    for lump in scene.solid_lumps if fidelity == "empirical" else ():
+        if warning := outside_range(lump.d_mm, lump.depth_ratio):
+            click.echo(warning, err=True)
     used = scene.seed if seed is None else seed
     with progress_bar("frames") as progress:
         simulated = simulate(scene, rng=np.random.default_rng(used), fidelity=fidelity, head=head, progress=progress)

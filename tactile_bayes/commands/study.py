@@ -1,4 +1,4 @@
-"""`study`: amplitude and width of each lump's map, from the forward models."""
+"""`study`: amplitude and width of the maps of simulated lumps."""
 
 from __future__ import annotations
 
@@ -54,7 +54,25 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
     help="How far the lump stands out of the gland, if the grid does not state it.",
 )
 @click.option("-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write the table. Default: print it.")
-@click.option("--figures", metavar="DIR", type=_FILE, help="Draw figures 5 to 8 of the paper into this directory.")
+@click.option(
+    "--figures",
+    metavar="DIR",
+    type=_FILE,
+    help="Draw figures 5 to 8 of the paper into this directory, and in two dimensions the frames of four lumps. "
+    "The empirical model in them holds for lumps of 10 mm and more down to h/d 1.",
+)
+@click.option(
+    "--measured-frames",
+    metavar="FRAMES.csv",
+    type=_FILE,
+    help="Your own frames, drawn into figure 6 beside both models: columns s_mm, pressure_kpa and optionally x_c_mm.",
+)
+@click.option(
+    "--phantom",
+    type=(_ABOVE_0, _ABOVE_0),
+    metavar="D H/D",
+    help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
+)
 @click.option("--head-radius-mm", type=_ABOVE_0, default=35.0, show_default=True, help="Radius of the head's arc.")
 @click.option(
     "--shoulder-mm",
@@ -98,6 +116,8 @@ def command(
     seat: str,
     output: Path | None,
     figures: Path | None,
+    measured_frames: Path | None,
+    phantom: tuple[float, float] | None,
     workers: int,
     scheduler: str | None,
     force: bool,
@@ -118,19 +138,26 @@ def command(
 
     Example: tactile-bayes study --model solid --seat resting -o study.csv
     """
+    from tactile_bayes.commands.study_figures import draw_figures, prepare_figures, read_frames
+    from tactile_bayes.errors import UsageError
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.forward.body import parse_seat
     from tactile_bayes.forward.plane.study import paper_grid
     from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.report.study_text import study_text
 
     chosen = parse_seat(seat)
     settings = study_settings(model=model, **options)
+    if (measured_frames or phantom) and (figures is None or model != "plane-strain"):
+        named = "--measured-frames" if measured_frames else "--phantom"
+        raise UsageError(f"{named} is for --figures of the plane-strain model; give --figures DIR")
+    frames = [] if measured_frames is None else read_frames(measured_frames)
     geometries = paper_grid(chosen) if grid == "paper" else read_grid(Path(grid), seat=chosen)
     if output is not None:
         refuse_existing(output, force=force)
     if figures is not None:
-        prepare_figures(figures, force=force)
+        prepare_figures(figures, model=model, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
         rows = run_study(geometries, settings=settings, executor=executor, output=output)
     if output is None:
@@ -138,10 +165,13 @@ def command(
     else:
         write_text(output, table_text(rows), force=force)
         store_path(output).unlink(missing_ok=True)
-    click.echo(summary(rows), err=output is None)
+    click.echo(study_text(rows), err=output is None)
     if figures is not None:
-        draw_figures(rows, settings, figures, seat=chosen, force=force)
-        click.echo(f"figures 5 to 8 are in {figures}", err=output is None)
+        drawn = draw_figures(
+            rows, settings, figures, seat=chosen, fit=fit_line, phantom=phantom, frames=frames, force=force
+        )
+        for line in drawn:
+            click.echo(line, err=output is None)
     click.echo(RESEARCH_USE, err=output is None)
 
 
@@ -160,7 +190,7 @@ def study_settings(
     flat_field: bool | None = None,
     head: str | None = None,
 ) -> StudySettings | SolidSettings:
-    """The study's settings from the options of the command line.
+    """Make the study's settings from the command line's options.
 
     Raises
     ------
@@ -197,7 +227,7 @@ def study_settings(
 
 
 def read_grid(path: Path, *, seat: float) -> list[Geometry]:
-    """The cases of a table; `seat` where it does not say."""
+    """Read the cases of a table; `seat` is the default of rows without one."""
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.forward.body import parse_seat
@@ -219,7 +249,7 @@ def run_study(
     executor: Executor,
     output: Path | None = None,
 ) -> list[StudyRow]:
-    """All rows, in the order of the geometries; kept beside `output` as they come.
+    """Compute all rows, in order of the geometries; finished ones are stored beside `output`.
 
     Raises
     ------
@@ -242,7 +272,7 @@ def run_study(
 
 
 def _rows_of(settings: StudySettings | SolidSettings) -> Callable[[Geometry], list[StudyRow]]:
-    """What makes the rows of a geometry, importable by name in another process."""
+    """Function that computes a geometry's rows, importable by name in another process."""
     from functools import partial
 
     from tactile_bayes.forward.plane.study import StudySettings, run_geometry
@@ -291,12 +321,12 @@ def _run_all(
 
 
 def _rows(outcomes: Iterable[Outcome[list[StudyRow]]]) -> list[StudyRow]:
-    """Of the geometries that are done; without an output file they are printed also when others are missing."""
+    """Rows of the finished geometries; without an output file they are printed even if others failed."""
     return [row for outcome in outcomes for row in outcome.value or []]
 
 
 def store_path(output: Path) -> Path:
-    """Where an unfinished study keeps what it has."""
+    """Path of an unfinished study's results."""
     return output.with_name(f"{output.name}.unfinished")
 
 
@@ -313,7 +343,7 @@ def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:
 
 
 def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
-    """Eq 5 with a background of 1 and the bump on the lump's axis, averaged over the cells as for a patient's map.
+    """Fit Eq 5 with background 1 and the bump on the lump's axis, averaged over cells as for a patient's map.
 
     Notes
     -----
@@ -341,7 +371,7 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
 
 
 def table_text(rows: list[StudyRow]) -> str:
-    """The study as a size table that `calibrate size` reads; columns of the solid model only where a row has them."""
+    """CSV of the study for `calibrate size`; columns of the solid model only where a row has them."""
     names = ["seat", "d_mm", "depth_ratio", "stiffness_ratio", "amplitude", "sigma_x_mm"]
     if any(row.sigma_y_mm is not None for row in rows):
         names.append("sigma_y_mm")
@@ -358,62 +388,3 @@ def _cell(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return value if isinstance(value, str) else f"{value:.6g}"
-
-
-def summary(rows: list[StudyRow]) -> str:
-    """How many cases show, and Eq 6 in two stages for each seat and each axis of the head."""
-    from tactile_bayes.forward.plane.study import DETECTABLE, learn_as_printed
-
-    shown = sum(row.detectable for row in rows)
-    lines = [f"{len(rows)} cases, {len(rows) - shown} not detectable (amplitude below {DETECTABLE:g}, or not resolved)"]
-    heads = dict.fromkeys(row.head for row in rows if row.head is not None)
-    if heads:
-        lines.append(f"head: {', '.join(heads)}")
-    axes = (
-        {"x": ", across the head", "y": ", along it"} if any(row.sigma_y_mm is not None for row in rows) else {"x": ""}
-    )
-    for seat in dict.fromkeys(row.seat for row in rows):
-        for axis, words in axes.items():
-            learned = learn_as_printed([row for row in rows if row.seat == seat], axis=axis)
-            if learned is not None:
-                lines.append(
-                    f"{seat}, E2/E1 = 100{words}: d = {learned.m:.2f} (sigma / delta) {learned.b_mm:+.2f} mm, "
-                    f"delta = {learned.e:.3f} a^{learned.f:.3f} from {learned.cases} cases "
-                    "(Eq 6 in two stages, as printed)"
-                )
-    return "\n".join(lines)
-
-
-def figure_paths(folder: Path) -> list[Path]:
-    """Where figures 5 to 8 go."""
-    return [folder / f"figure_{number}.png" for number in (5, 6, 7, 8)]
-
-
-def prepare_figures(folder: Path, *, force: bool) -> None:
-    """Make the directory, and stop before any work where a figure is in the way."""
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{folder} cannot be made a directory ({error.strerror}); choose another name") from None
-    for path in figure_paths(folder):
-        refuse_existing(path, force=force)
-
-
-def draw_figures(
-    rows: list[StudyRow], settings: StudySettings | SolidSettings, folder: Path, *, seat: float, force: bool
-) -> None:
-    """Figures 5 to 8 of the paper."""
-    from tactile_bayes.forward.plane.study import StudySettings
-
-    if isinstance(settings, StudySettings):
-        from tactile_bayes.report.study_figures import study_figures
-
-        study_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_line, force=force)
-        return
-    from tactile_bayes.report.solid_figures import solid_figures
-    from tactile_bayes.studies.raster import fit_raster, raster_map
-
-    solid_figures(rows, settings, figure_paths(folder), seat=seat, fit=fit_raster, build=raster_map, force=force)

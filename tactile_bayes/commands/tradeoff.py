@@ -1,4 +1,4 @@
-"""`tradeoff`: what more accuracy costs, measured on this machine."""
+"""`tradeoff`: measure the cost of accuracy on this machine."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Final
 import click
 
 # name -> module under tactile_bayes.commands, imported when its command runs
-_SUBCOMMANDS: Final = {"forward": "tradeoff_forward", "estimate": "tradeoff_estimate"}
+_SUBCOMMANDS: Final = {"forward": "tradeoff_forward", "estimate": "tradeoff_estimate", "map": "tradeoff_map"}
 
 
 class _Lazy(click.Group):
-    """A group that imports a subcommand when it is asked for."""
+    """A group that imports a subcommand on first use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         del ctx

@@ -1,120 +1,103 @@
-"""`tradeoff estimate`: every method of `estimate` on the user's own map, against a long reference."""
+"""`tradeoff estimate`: every setting of `estimate` on the user's own map, against a long reference."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.options import FORCE, JSON, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath
-from tactile_bayes.presets import FIT_RADIUS_MM
-
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.commands.tradeoff_options import CALIBRATION, RUNS, TOLERANCE
 
 _FILE = FilePath()
 
 
 @click.command("estimate")
-@click.argument("map_file", metavar="MAP.nc", type=_FILE)
+@click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
+@CALIBRATION
+@click.option(
+    "--centre-mm",
+    type=(FiniteRange(), FiniteRange()),
+    metavar="X Y",
+    help="Place on the map to measure. Default: the highest bump that can be a lump.",
+)
+@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Settings, as in `estimate`.")
+@TOLERANCE
+@RUNS
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw error against time.")
-@click.option(
-    "--fit-radius-mm",
-    type=FiniteRange(min=0.0, min_open=True),
-    default=FIT_RADIUS_MM,
-    show_default=True,
-    help="Radius of the fit window, mm, as in `estimate`.",
-)
-@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Priors, as in `estimate`.")
-@click.option(
-    "--tolerance-sd",
-    type=FiniteRange(min=0.0, min_open=True),
-    default=0.05,
-    show_default=True,
-    help="Error of an interval end below which more accuracy is not worth its cost.",
-)
-@click.option("--runs", type=click.IntRange(min=1), default=4, show_default=True, help="Number of runs to average.")
 @seed_option(1)
 @JSON
 @FORCE
+@click.pass_context
 def command(
-    *,
-    map_file: Path,
-    figure: Path | None,
-    fit_radius_mm: float,
+    ctx: click.Context,
+    /,
+    maps: tuple[Path, ...],
+    size_calibration: str | None,
+    centre_mm: tuple[float, float] | None,
     settings_file: Path | None,
-    tolerance_sd: float,
+    tolerance_mm: float,
     runs: int,
+    figure: Path | None,
     seed: int,
     as_json: bool,
     force: bool,
 ) -> None:
-    """Measure what each method of `estimate` costs on a map, and how far its interval ends are off.
+    """Measure what each setting of `estimate` costs on a map, and how far its size interval is off.
 
-    Least squares, the Gaussians about the mode, importance sampling at four accuracies and MCMC of three lengths are
-    run on the map under correlated errors, and compared with a reference of 65,536 weighted points. Times are CPU
-    seconds of this machine. Where the map shows no bump there is nothing to compare: exit code 6.
+    Whole estimates, from the map to the size, by every method, at several accuracies, noise fields and fit windows, are
+    compared with a long run of the default's posterior, by importance sampling or, where that cannot be trusted, MCMC.
+    With several maps, all of one mass, the settings are tried on the first, and the sizes by one map, two and so on are
+    shown. Times are CPU seconds of this machine; about how long it takes is printed on stderr.
+
+    Where the map has no size by default there is no reference: what each setting says is printed, exit code 6.
 
     Example: tactile-bayes tradeoff estimate map.nc --figure methods.png
     """
     import time
+    from dataclasses import replace
 
+    from tactile_bayes.commands.fresh_process import fresh_cpu_s
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.errors import EXIT_NO_ESTIMATE
+    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.commands.tradeoff_options import forecast, show
+    from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.map_nc import read_map
-    from tactile_bayes.files.schema import dump_json
-    from tactile_bayes.report.tradeoff_estimate import draw_tradeoff, tradeoff_document, tradeoff_text
-    from tactile_bayes.studies.estimate_tradeoff import measure
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.pipeline.tradeoff import Work, pooled_rows, tradeoff_of_map
 
+    if size_calibration is not None:
+        also_read(size_calibration_path(size_calibration))
     if figure is not None:
         refuse_existing(figure, force=force)
-    tactile_map, priors = read_map(map_file), _priors(settings_file)
+    if len(set(maps)) < len(maps):
+        raise UsageError("a map is given twice; give each map once")
+    settings = settings_of(settings_file, calibration=size_calibration, centre_mm=centre_mm, seed=seed)
+    if len(maps) > 1 and centre_mm is not None:
+        raise UsageError("--centre-mm is a place on one map; give one map")
     with progress_bar("settings") as progress:
-        found = measure(
-            tactile_map,
-            radius_mm=fit_radius_mm,
-            prior=priors,
-            clock=time.process_time,
-            seed=seed,
-            runs=runs,
-            progress=progress,
-        )
-    if isinstance(found, str):
-        if figure is not None and tactile_map.covered.any():
-            from tactile_bayes.report.map_figure import map_figure
-
-            map_figure(
-                tactile_map,
-                figure,
-                title=f"Tactile map: {map_file.stem}",
-                note=f"Nothing to compare: {found}.",
-                force=force,
-            )
-        click.echo(f"Nothing to compare: {found}.")
-        raise click.exceptions.Exit(EXIT_NO_ESTIMATE)
-    if figure is not None:
-        draw_tradeoff(found, figure, tolerance_sd=tolerance_sd, force=force)
-    if as_json:
-        click.echo(dump_json(tradeoff_document(found, tolerance_sd=tolerance_sd)), nl=False)
-    else:
-        click.echo(tradeoff_text(found, tolerance_sd=tolerance_sd))
+        work = Work(time.process_time, tolerance_mm, runs, forecast, progress)
+        _, ladder = tradeoff_of_map(maps[0], settings, work)
+        if len(maps) > 1:
+            ladder = replace(ladder, pooled=pooled_rows(maps, settings, clock=time.process_time))
+    cold = fresh_cpu_s(["estimate", str(maps[0]), *_said(size_calibration, centre_mm, settings_file)])
+    if cold is not None:
+        shared = {"start of the program and reading the map": max(cold - ladder.default.seconds, 0.0)}
+        ladder = replace(ladder, shared_cpu_s=shared)
+    inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
+    kept = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
+    provenance = Provenance("tradeoff estimate", kept, inputs, seed=seed).as_dict()
+    title = f"{maps[0].stem}: what more time for `estimate` buys"
+    ctx.exit(
+        show(ladder, what="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
+    )
 
 
-def _priors(path: Path | None) -> BumpPrior:
-    """The priors of a settings file; what this command varies itself is refused."""
-    from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.settings_toml import read_settings
-    from tactile_bayes.posterior.lump.bump import BumpPrior
-
-    if path is None:
-        return BumpPrior()
-    found = read_settings(path)
-    prior = found.pop("prior")
-    del found["settings_file"]
-    for key in found:
-        raise UsageError(f"{path}: {key} is not for `tradeoff estimate`, which takes the priors only; leave {key} out")
-    return BumpPrior(**(prior or {}))
+def _said(calibration: str | None, centre_mm: tuple[float, float] | None, settings_file: Path | None) -> list[str]:
+    """The options of an `estimate` that does the same as the default row."""
+    words = [] if calibration is None else ["--size-calibration", calibration]
+    words += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
+    return words + ([] if settings_file is None else ["--settings", str(settings_file)])

@@ -59,7 +59,8 @@ def command(
 ) -> None:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene.
 
-    The empirical model, plane strain at several cells and the solid model at several meshes, ranks and rims compute the
+    The empirical model (which holds for lumps of 10 mm and more down to h/d 1, and warns outside), plane strain at
+    several cells and the solid model at several meshes, ranks and rims compute the
     map of one lump, here and now; each model's finest setting is the reference of its others. Without SCENE.toml: a
     hard ball of 15 mm at h/d 1, its centre on the gland.
 
@@ -112,7 +113,7 @@ def _case(path: Path | None, head: str | None) -> LumpCase:
 
 
 def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
-    """Learn Eq 6 or read the calibrations, then measure every setting."""
+    """Learn Eq 6 or read the calibrations, then measure all settings."""
     import time
 
     from tactile_bayes.commands.progress import progress_bar
@@ -137,7 +138,7 @@ def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, r
 
 
 def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
-    """How the widths of a model's maps become sizes: by a calibration's name or path, or learned."""
+    """Rule from a model's widths to sizes: a calibration by name or path, or one learned here."""
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.study import fit_line
     from tactile_bayes.errors import UsageError

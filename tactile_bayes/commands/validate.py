@@ -1,4 +1,4 @@
-"""`validate`: accuracy of each modality against excision."""
+"""`validate`: compare each modality with excision."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def command(
 
 
 def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, TrialSettings]:
-    """Title and settings of the protocol, where there is one; an option that contradicts it is refused."""
+    """Title and settings of the protocol, if there is one; refuses options that contradict it."""
     from tactile_bayes.files.protocol import read_protocol
 
     if protocol is None:

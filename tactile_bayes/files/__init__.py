@@ -1,1 +1,1 @@
-"""Every read and write of a file, one format a module."""
+"""Reading and writing of files, one format per module."""

@@ -1,4 +1,4 @@
-"""The arrays of a scan in an .npz file, in words: for the help of `import`, its errors and docs/formats.md."""
+"""Layout of a scan's arrays in an .npz file, for the help of `import`, its errors and docs/formats.md."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ OPTIONAL: Final = ("landmarks_mm", "saturation_count")
 
 
 def in_words(shape: Shape) -> str:
-    """A shape as the help and the errors name it: ``"m, 3"``, ``"one number"``."""
+    """Format a shape for the help and the errors: ``"m, 3"``, ``"one number"``."""
     return ", ".join(map(str, shape)) or "one number"
 
 

@@ -86,7 +86,7 @@ def _check_numbers(arrays: Arrays) -> None:
 
 
 def _check_units(arrays: Arrays) -> None:
-    """Refuse what is surely in other units: numbers off by 25 or 1000 go through every later check unseen."""
+    """Raise an error for numbers in other units: a factor of 25 or 1000 would pass every later check."""
     surface, position = arrays["head_surface_mm"], arrays["position_mm"]
     metres = "looks like metres or inches, give mm"
     extent = float(np.ptp(surface.reshape(-1, 3), axis=0).max())

@@ -25,7 +25,7 @@ _WAYS_OUT = {
 
 
 def refuse_existing(path: Path, *, force: bool) -> None:
-    """Stop before any work is done when `path` cannot become an output.
+    """Raise an error, before any work is done, when `path` cannot become an output.
 
     Raises
     ------
@@ -52,13 +52,13 @@ def refuse_existing(path: Path, *, force: bool) -> None:
 
 
 def _target(path: Path) -> Path:
-    """What is written: of a symbolic link, what it points to."""
+    """Path to be written; for a symbolic link, the file that it points to."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 @contextlib.contextmanager
 def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
-    """A temporary path beside `path` that becomes `path` when the block ends well.
+    """Give a temporary path beside `path`, which becomes `path` when the block ends without an error.
 
     The file is created with mode 0600, flushed to disk and renamed over the target, so that a kill at any
     moment leaves the old file or none. If the block raises, the temporary file goes; what a killed process of this
@@ -96,21 +96,21 @@ def _temporary(target: Path) -> Iterator[Path]:
 
 
 def _stem(target: Path) -> str:
-    """What the temporary files of a target on this computer begin with; short, however long the target's name is."""
+    """Beginning of a target's temporary names on this computer; short, however long the target's name is."""
     name = os.fsencode(target.name)
     short = target.name if len(name) <= _LONGEST_STEM else f"{zlib.crc32(name):08x}"
     return f".{short}.{_host()}"
 
 
 def _host() -> str:
-    """This computer, in eight letters: directories may be shared with others."""
+    """Eight letters that stand for this computer, because directories may be shared with others."""
     import socket
 
     return f"{zlib.crc32(socket.gethostname().encode()):08x}"
 
 
 def _sweep(target: Path) -> None:
-    """Remove what processes that are no more left of an earlier write of `target`."""
+    """Remove temporary files of `target` that ended processes left behind."""
     pattern = re.compile(rf"{re.escape(_stem(target))}-(\d+)-[^.]*{re.escape(_PART)}")
     for name in os.listdir(target.parent):  # noqa: PTH208 (names only: the directory may be large)
         found = pattern.fullmatch(name)
@@ -152,7 +152,7 @@ def write_bytes(path: Path, data: bytes, *, force: bool = False) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> UsageError:
-    """The one line for an output that the system does not take."""
+    """Error for an output that the system refuses to write."""
     shown = str(path) if len(str(path)) <= 120 else f"{str(path)[:117]}..."
     way_out = _WAYS_OUT.get(error.errno or 0, "choose another place")
     return UsageError(f"{shown} cannot be written ({error.strerror or error}); {way_out}")

@@ -20,7 +20,7 @@ SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2
 
 
 class CheckpointFile:
-    """One file, written anew after each block of steps.
+    """A checkpoint file, rewritten after each block of steps.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class CheckpointFile:
         self.path, self.context = path, context
 
     def load(self, key: str) -> ChainState | None:
-        """The state in the file; None when there is no file.
+        """Read the state; None when there is no file.
 
         Raises
         ------
@@ -63,7 +63,7 @@ class CheckpointFile:
         return ChainState(**{name: found[name] for name in SHAPES})
 
     def save(self, key: str, state: ChainState) -> None:
-        """Write the state, whole or not at all."""
+        """Write the state atomically."""
         arrays = {"schema": np.array(SCHEMA), "key": np.array(self._bound(key)), **state.as_arrays()}
         buffer = io.BytesIO()
         np.savez(buffer, sha256=np.array(_digest(arrays)), **arrays)
@@ -74,7 +74,7 @@ class CheckpointFile:
 
 
 def _digest(arrays: Mapping[str, np.ndarray[Any, Any]]) -> str:
-    """Checksum of the state and of what it is bound to: a changed number must not come back as another."""
+    """Checksum of the state and of what it belongs to, so that no changed number is read as valid."""
     digest = hashlib.sha256()
     for name in ("key", *SHAPES):
         array = np.ascontiguousarray(arrays[name])

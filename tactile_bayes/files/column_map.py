@@ -19,7 +19,7 @@ _FACTOR = {"mm": 1.0, "cm": 10.0, "in": 25.4}
 
 
 def read_wide(path: Path, mapping_path: Path) -> Table:
-    """A wide table as a tidy one, with the columns of ``trial.table.json``; each reading keeps its line.
+    """Convert a wide table to a tidy one with the columns of ``trial.table.json``; readings keep their line numbers.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def read_wide(path: Path, mapping_path: Path) -> Table:
 
 
 def read_wide_excision(path: Path, mapping_path: Path) -> Table:
-    """The ex-vivo sizes of a wide table, with the columns of ``excision.table.json``; rows without a size are left out.
+    """Read ex-vivo sizes from a wide table into columns of ``excision.table.json``; rows without a size are left out.
 
     Raises
     ------
@@ -72,12 +72,12 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
 
 
 def excision_columns(excision: Mapping[str, Any]) -> list[str]:
-    """The wide table's columns that the mapping's ``[excision]`` names."""
+    """Columns of the wide table that the mapping's ``[excision]`` names."""
     return [excision[key] for key in ("size", "second", "sd") if key in excision]
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The mapping, checked against ``column_map.schema.json``."""
+    """Read the mapping and check it against ``column_map.schema.json``."""
     document = load_toml(path, way_out="see the column mapping in the tutorial")
     check_document(document, "column_map.schema.json", path=path)
     return document

@@ -23,7 +23,7 @@ _LONG_KEY: Final = re.compile(
 
 
 def load_json(path: Path, *, way_out: str = "give a file this program wrote") -> object:
-    """Read a JSON file, whatever it holds.
+    """Read a JSON file of any content.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def load_json(path: Path, *, way_out: str = "give a file this program wrote") ->
 
 
 def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again") -> object:
-    """The document of a JSON text; see `load_json` for the errors.
+    """Parse a JSON text; for the errors see `load_json`.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
 
 
 def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
-    """The document of a TOML text; see `load_toml` for the errors."""
+    """Parse a TOML text; for the errors see `load_toml`."""
     import tomllib
 
     long = _LONG_KEY.search(text)
@@ -82,7 +82,7 @@ def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
 
 
 def check_plain(document: object, *, way_out: str, name: str = "") -> None:
-    """Refuse what cannot go on into a report: depth, infinities, NaN, numbers beyond 1.8e308, half characters, NUL.
+    """Refuse data that no report can hold: too deep, infinities, NaN, numbers beyond 1.8e308, surrogates, NUL.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def check_plain(document: object, *, way_out: str, name: str = "") -> None:
 
 
 def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, object]]:
-    """The parts of a container, each with its place; a single value is checked."""
+    """Members of a container with their places in it; a single value is checked."""
     if isinstance(item, dict):
         for key, value in item.items():
             yield "", key
@@ -116,6 +116,6 @@ def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, obj
 
 def _check_text(where: str, text: str, *, way_out: str) -> None:
     if not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text):
-        raise BadDataError(f"{where or 'a key'} holds half a character: {text[:40]!a}", way_out=way_out)
+        raise BadDataError(f"{where or 'a key'} holds a broken character: {text[:40]!a}", way_out=way_out)
     if "\0" in text:  # the system takes no file name with one
         raise BadDataError(f"{where or 'a key'} holds the character U+0000: {text[:40]!a}", way_out=way_out)

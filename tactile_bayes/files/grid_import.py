@@ -138,7 +138,7 @@ def _numbers(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
 
 
 def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Readings a cell: 1 where there is a value, unless the file says."""
+    """Readings per cell: 1 where there is a value, unless the file has counts."""
     if held is None:
         count = np.isfinite(mean).astype(np.int64)
     else:
@@ -159,7 +159,7 @@ def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tu
 
 
 def _variance(held: np.ndarray[Any, Any] | None, count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> FloatArray:
-    """Variance within a cell: 0 in a grid that has none, NaN where there is no data.
+    """Variance within a cell: 0 in a grid without variances, NaN where there is no data.
 
     It may also be NaN where a cell has a single reading: a sample variance, numpy's with ddof=1, does not exist there.
     """
@@ -183,7 +183,7 @@ def _check_same_shape(array: FloatArray, mean: np.ndarray[Any, Any], *, name: st
 
 
 def _check_level(values: FloatArray, *, normalise: str) -> None:
-    """Refuse values that cannot have been divided by their level, when the caller says they were."""
+    """Refuse values that cannot have been divided by their level although the caller declares it."""
     median = float(np.median(values))
     low, high = _NORMALISED_MEDIAN
     if normalise != "none" and not low <= median <= high:

@@ -1,4 +1,4 @@
-"""Check of an HDF5 file's text heaps before the library opens it: one kind of damage makes it loop forever."""
+"""Check of an HDF5 file's text heaps before the library opens it: a damaged size makes the library loop forever."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ALIGNMENT: Final = 8
 
 
 def check_heaps(data: bytes, *, way_out: str) -> None:
-    """Refuse a file with a global heap whose free space has the size 0.
+    """Refuse a file whose global heap has free space of size 0.
 
     The HDF5 library (seen with 2.0) walks from object to object by their sizes and would stay at that one.
 

@@ -20,7 +20,7 @@ _TABLES = ("trial.table.json", "excision.table.json", "size_table.table.json")
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What a file is: schema, shape, units, quality and provenance.
+    """Describe a file: schema, shape, units, quality and provenance.
 
     Returns
     -------
@@ -119,10 +119,10 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.body_calibration import BodyCalibration
 
     calibration = read_size_calibration(path)
-    if isinstance(calibration, LogQuadratic):
+    if isinstance(calibration, BodyCalibration):
         kept = ("form", "source", "recipe", "parameters", "centre", "mean", "domain", "fit", "provenance")
         return {
             "schema": document["schema"],
@@ -130,7 +130,7 @@ def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
             "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
             **{name: document[name] for name in kept},
             "variance_taken_away_by_knowing": calibration.unknowns,
-            **({} if calibration.fat_cubic is None else {"with_depth_of_fat": dict(calibration.fat_cubic.fit)}),
+            **({} if calibration.with_fat is None else {"with_depth_of_fat": dict(calibration.with_fat.fit)}),
         }
     return {
         "schema": document["schema"],
@@ -150,7 +150,7 @@ def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _table(path: Path, head: bytes) -> dict[str, Any]:
-    """A CSV table whose header fits one of the schemas."""
+    """Describe a CSV table whose header fits one of the schemas."""
     from tactile_bayes.files.schema import load_schema
     from tactile_bayes.files.tables import read_table
 

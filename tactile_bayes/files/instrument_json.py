@@ -1,4 +1,4 @@
-"""What `record` must know of an instrument: the head's geometry, the array's calibration, landmarks; JSON each."""
+"""Instrument files of `record`, as JSON: head geometry, array calibration, landmarks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LANDMARKS_SCHEMA: Final = "tactile-bayes/landmarks/1"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayCalibrationFile:
-    """An array's calibration with where it came from.
+    """An array's calibration and its origin.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def read_array_calibration(path: Path) -> ArrayCalibrationFile:
 
 
 def read_head_geometry(path: Path) -> HeadGeometry:
-    """Read where the taxels sit and how the tracker is mounted."""
+    """Read the places of the taxels and the mounting of the tracker."""
     document = _read(path, HEAD_SCHEMA, way_out="give surface_mm, pitch_mm and scanhead_from_tracker")
     try:
         return head_from_document(document)
@@ -97,7 +97,7 @@ def read_head_geometry(path: Path) -> HeadGeometry:
 
 
 def read_landmarks(path: Path) -> Landmarks:
-    """Read two points in `base`."""
+    """Read both landmarks in `base`."""
     document = _read(path, LANDMARKS_SCHEMA, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
     try:
         return Landmarks(*(np.array(document[name], dtype=np.float64) for name in ("sternal_notch_mm", "xiphoid_mm")))

@@ -1,4 +1,4 @@
-"""Kind of a file from its first bytes, so that a reader given the wrong one names the command to run."""
+"""Kind of a file by its first bytes; a reader given another kind names the command to run instead."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _LOOKED_AT = 4096
 
 
 def kind_of(path: Path) -> str:
-    """What a file holds, in words, or an empty string when its first bytes do not tell."""
+    """Kind of a file in words; empty when its first bytes do not show it."""
     try:
         with open_input(path) as file:
             start = file.read(_LOOKED_AT)
@@ -58,7 +58,7 @@ def kind_of(path: Path) -> str:
 
 
 def schema_kind(schema: object) -> str:
-    """What a document of this schema is called, or an empty string when the schema is not one of this program's.
+    """Kind of a document by its schema, in words; empty for a schema that is not this program's.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def schema_kind(schema: object) -> str:
 
 
 def not_a(path: Path, wanted: str, *, what: str, way_out: str) -> BadDataError:
-    """The error for a file that a reader cannot read: named by its kind where that is known.
+    """Error for a file of another kind than the reader's; names the kind where it is known.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Tactile maps as netCDF by the CF conventions: everything a map is; equal maps give equal bytes.
+"""Tactile maps as netCDF by the CF conventions; equal maps give equal bytes.
 
 Files of the schema map/2 hold the cells' centres as the coordinate variables ``x`` and ``y``. Those of map/1, which are
 read too, hold them as ``x_mm`` and ``y_mm`` on dimensions ``x`` and ``y`` that have no coordinates (record 0089).
@@ -60,7 +60,7 @@ _TRANSFORMS = {
 
 
 def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, force: bool = False) -> None:
-    """Write a map atomically, for its owner's eyes only.
+    """Write a map atomically, readable by its owner only.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def read_map(path: Path) -> TactileMap:
 
 
 def read_map_header(path: Path) -> dict[str, Any]:
-    """What a map file says about itself: schema, recipe, quality, provenance... without the arrays.
+    """Read a map's schema, recipe, quality and provenance without its arrays.
 
     Returns
     -------
@@ -140,18 +140,18 @@ def read_map_header(path: Path) -> dict[str, Any]:
 
 
 def _variable_of(field: str, schema: str) -> str:
-    """What a field of the map is called in files of a schema."""
+    """Name of a map's field in files of a schema."""
     return _AXES[schema].get(field, field)
 
 
 def _units(tactile_map: TactileMap) -> dict[str, str]:
-    """Units of the fields whose unit hangs on the recipe; empty where it is unknown."""
+    """Units of the fields whose unit depends on the recipe; empty where unknown."""
     unit = tactile_map.recipe.value_unit
     return {"mean": unit, "variance": unit if unit in ("", "1") else f"{unit}2" if unit.isalpha() else f"({unit})2"}
 
 
 def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, str]:
-    """Global attributes; whatever has structure is JSON with keys in a fixed order.
+    """Global attributes; structured values are JSON with keys in a fixed order.
 
     CF wants a unit that UDUNITS reads for every quantity that has one: a map without such a unit does not claim CF.
     """
@@ -172,7 +172,7 @@ def _json(value: object) -> str:
 
 
 def _finite(value: float) -> float | None:
-    """A figure for JSON, which has no NaN: an unknown one is null."""
+    """A figure for JSON: null where it is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -222,7 +222,7 @@ def _quality(values: dict[str, Any]) -> dict[str, float]:
 
 
 def _recipe(fields: dict[str, Any]) -> MapRecipe:
-    """The recipe from its JSON, each field checked."""
+    """Read the recipe from its JSON, checking each field."""
     window = fields.get("pressure_window_kpa")
     checks = {
         "source": isinstance(fields.get("source"), str),

@@ -11,7 +11,7 @@ _MOST_WINDOW: Final = 2**27
 
 
 class Unpacker:
-    """Unpacks chunk after chunk and counts what comes out.
+    """Unpacks chunks and counts the bytes that come out.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class Unpacker:
         self._unpacked = 0
 
     def count(self, number: int) -> None:
-        """Add to what was unpacked.
+        """Add to the number of unpacked bytes.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class Unpacker:
 
 
 def damage(error: Exception) -> str:
-    """What is wrong with a chunk or a record, in a few words."""
+    """Describe what is wrong with a chunk or a record, in a few words."""
     if type(error) is ValueError:
         return str(error)
     if type(error).__module__.startswith(("zstandard", "zstd", "lz4")):

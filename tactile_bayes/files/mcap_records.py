@@ -38,7 +38,7 @@ _KINDS: Final = {
 
 
 class Messages:
-    """Times and bodies of messages in file order, without an object for each.
+    """Times and bodies of messages in file order, without a Python object per message.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ class Messages:
         return len(self._times)
 
     def add(self, time_ns: int, body: memoryview) -> None:
-        """One more message."""
+        """Add one message."""
         self._times.append(time_ns)
         if self.keep:
             self._data += body
             self._ends.append(len(self._data))
 
     def extend(self, other: Messages) -> None:
-        """All messages of another channel."""
+        """Add all messages of another channel."""
         start = len(self._data)
         self._times += other._times
         self._data += other._data
@@ -85,7 +85,7 @@ class Messages:
 
 @dataclass(slots=True)
 class McapRecords:
-    """What a file held, as far as it could be read.
+    """Content of a file, as far as it could be read.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class McapRecords:
     lost: list[str] = field(default_factory=list)
 
     def messages(self, topic: str, *, schema: str, name: str | None = None) -> Messages:
-        """Messages of a topic (and of the channels with that `name` in their metadata).
+        """Messages of a topic (and of channels with that `name` in their metadata).
 
         Raises
         ------
@@ -141,14 +141,14 @@ class McapRecords:
         return found
 
     def topic_counts(self) -> dict[str, int]:
-        """Messages by topic."""
+        """Number of messages per topic."""
         counts: Counter[str] = Counter()
         for number, channel in self.channels.items():
             counts[channel.topic] += len(self.by_channel.get(number, ()))
         return dict(sorted(counts.items()))
 
     def channel_messages(self, number: int) -> Messages:
-        """Where the messages of a channel go; bodies of unknown channels are kept until it is known what they are."""
+        """Messages of a channel; bodies of unknown channels are kept until the channel is defined."""
         found = self.by_channel.get(number)
         if found is None:
             channel = self.channels.get(number)
@@ -196,7 +196,7 @@ def _check_magic(stream: IO[bytes], path: Path) -> None:
 
 
 def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
-    """Fill `records` up to the end of the file or the first record that cannot be read."""
+    """Fill `records` up to the end of the file or the first unreadable record."""
     unpacker = Unpacker(size)
     checksum = zlib.crc32(MCAP_MAGIC)
     while True:
@@ -224,7 +224,7 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
 
 
 def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
-    """Compare the checksum over everything, where there is one."""
+    """Compare the checksum over the whole data section, where there is one."""
     declared = _CHECKSUM.unpack_from(body)[0] if len(body) >= _CHECKSUM.size else 0
     if declared not in (0, checksum):
         if not records.damaged:  # a damaged chunk was told already; otherwise it is a description
@@ -249,7 +249,7 @@ def _tell_damage(records: McapRecords, position: int, *, size: int) -> None:
 
 
 def _take(records: McapRecords, opcode: int, body: bytes, *, start: int, unpacker: Unpacker) -> None:
-    """Keep one record from outside the chunks, or say that it makes no sense."""
+    """Keep one record from outside the chunks, or note that it is invalid."""
     try:
         record = _KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(body)))
     except Exception as error:  # struct.error, EndOfFile, UnicodeDecodeError...
@@ -276,7 +276,7 @@ def _describe(records: McapRecords, record: Any) -> None:
 
 
 def _take_chunk(records: McapRecords, chunk: Any, unpacker: Unpacker) -> None:
-    """Keep a chunk's messages, or none of them when it is damaged."""
+    """Keep all messages of a chunk; none when it is damaged."""
     try:
         data = unpacker.unpack(chunk)
         descriptions, spans = _split(data, unpacker)
@@ -296,7 +296,7 @@ def _take_chunk(records: McapRecords, chunk: Any, unpacker: Unpacker) -> None:
 
 
 def _split(data: bytes, unpacker: Unpacker) -> tuple[list[Any], list[tuple[int, int, int, int]]]:
-    """The schemas and channels of a chunk, and where its messages are: channel, publish time, start, end."""
+    """Schemas and channels of a chunk, and the places of its messages: channel, publish time, start, end."""
     descriptions, spans = [], []
     offset = 0
     while offset < len(data):

@@ -1,4 +1,4 @@
-"""Files of netCDF-4 by h5py alone: written in memory and published whole, read with every declared size checked first.
+"""Files of netCDF-4 by h5py alone: written in memory and stored atomically, read with every size checked first.
 
 A netCDF-4 file is an HDF5 file whose dimensions are dimension scales. A dimension without a variable of its name is an
 empty scale, which netCDF hides. Record 0080 says why neither netCDF4 nor h5netcdf is used here.
@@ -62,28 +62,44 @@ def netcdf_bytes(variables: Mapping[str, Variable], *, attributes: Mapping[str, 
     group
         Where everything goes, for example ``posterior``.
     """
+    return grouped_netcdf_bytes({group: Contents(variables, attributes)})
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What one group of a netCDF file holds: variables and attributes, as in `netcdf_bytes`."""
+
+    variables: Mapping[str, Variable]
+    attributes: Mapping[str, str]
+
+
+def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
+    """A netCDF-4 file of several groups by name, each with its own dimensions; ``/`` is the root."""
     import h5py
 
     with h5py.File("memory", "w", driver="core", backing_store=False, track_order=True) as file:
-        place = file if group == "/" else file.create_group(group, track_order=True)
-        for name, value in attributes.items():
-            place.attrs[name] = value
-        scales = _write_dimensions(place, variables)
-        for name, variable in variables.items():
-            if name not in scales:
-                _write_variable(place, name, variable, scales)
+        written = 0
+        for group, contents in groups.items():
+            place = file if group == "/" else file.create_group(group, track_order=True)
+            for name, value in contents.attributes.items():
+                place.attrs[name] = value
+            scales = _write_dimensions(place, contents.variables, first=written)
+            written += len(scales)
+            for name, variable in contents.variables.items():
+                if name not in scales:
+                    _write_variable(place, name, variable, scales)
         file.flush()
         image: bytes = file.id.get_file_image()
     return image
 
 
-def _write_dimensions(place: Any, variables: Mapping[str, Variable]) -> dict[str, Any]:
-    """A scale for each dimension, with the values of its coordinate where there is one."""
+def _write_dimensions(place: Any, variables: Mapping[str, Variable], *, first: int) -> dict[str, Any]:
+    """Write a scale for each dimension, with its coordinate values where it has some, numbered from `first`."""
     lengths: dict[str, int] = {}
     for variable in variables.values():
         lengths |= dict(zip(variable.dimensions, np.shape(variable.values), strict=True))
     scales = {}
-    for number, (name, length) in enumerate(lengths.items()):
+    for number, (name, length) in enumerate(lengths.items(), start=first):
         if name in variables:
             scale = _write_values(place, name, variables[name])
             scale.make_scale(name)
@@ -111,7 +127,7 @@ def _write_values(place: Any, name: str, variable: Variable) -> Any:
 
 
 class Group:
-    """One group of an open netCDF file; whatever is read is checked first.
+    """One group of an open netCDF file; all that is read is checked first.
 
     Parameters
     ----------
@@ -129,7 +145,7 @@ class Group:
         self._way_out = way_out
 
     def group(self, name: str) -> Group | None:
-        """A group inside; None where there is none."""
+        """Subgroup by name; None where there is none."""
         import h5py
 
         found = self._own(name)
@@ -138,7 +154,7 @@ class Group:
         )
 
     def attributes(self) -> dict[str, str]:
-        """The attributes that are text, by name."""
+        """Text attributes by name."""
         held = {str(name): _text(self._place.attrs[name]) for name in self._place.attrs}
         return {name: text for name, text in held.items() if text is not None}
 
@@ -148,12 +164,12 @@ class Group:
         return None if found is None or len(found.shape) != 1 else int(found.shape[0])
 
     def holds(self, name: str) -> bool:
-        """Whether there is an array of this name; a dimension without values is none."""
+        """Whether an array of this name exists; a dimension without values is not one."""
         found = self._dataset(name)
         return found is not None and not _is_bare(found)
 
     def variables(self) -> list[str]:
-        """The names of the arrays, in alphabetical order; dimensions without values are not among them."""
+        """Names of the arrays in alphabetical order, without dimensions that have no values."""
         return sorted(name for name in map(str, self._place) if self.holds(name))
 
     def array(self, name: str, *, kind: str, dimensions: tuple[str, ...]) -> Any:
@@ -184,7 +200,7 @@ class Group:
         return np.asarray(found[...], dtype=np.dtype(kind))
 
     def _own(self, name: str) -> Any:
-        """A member of this file; links to other places and files are not followed."""
+        """Member of this file by name; links to other places and files are not followed."""
         import h5py
 
         if not isinstance(self._place.get(name, getlink=True), h5py.HardLink):
@@ -192,18 +208,18 @@ class Group:
         return self._place[name]
 
     def _dataset(self, name: str) -> Any:
-        """A dataset whose values are in this file; None where there is none."""
+        """Dataset whose values are in this file; None where there is none."""
         import h5py
 
         found = self._own(name)
         if not isinstance(found, h5py.Dataset):
             return None
         if found.shape is None or found.external or found.is_virtual:
-            raise BadDataError(f"variable {name} keeps its values elsewhere", way_out=self._way_out)
+            raise BadDataError(f"variable {name} has its values in another file", way_out=self._way_out)
         return found
 
     def _check_chunks(self, name: str, found: Any) -> None:
-        """Refuse a chunk that does not unpack to what it declares.
+        """Refuse a chunk that does not unpack to its declared size.
 
         HDF5 unpacks more for as long as there is memory, takes what is missing from whatever lies in memory, and ends
         the process where a checksum has less than its four bytes.
@@ -226,7 +242,7 @@ class Group:
 
 
 def _unpacked_bytes(found: Any, stored: Any, filters: list[int], *, most: int) -> int:
-    """How many bytes a chunk's values take, up to `most`; less than none where a checksum has no room."""
+    """Bytes that a chunk unpacks to, up to `most`; negative where the checksum is cut off."""
     applied = [one for number, one in enumerate(filters) if not stored.filter_mask >> number & 1]
     if _DEFLATE not in applied:
         return int(stored.size) - _CHECKSUM_BYTES * (_CHECKSUM in applied)
@@ -239,7 +255,7 @@ def _unpacked_bytes(found: Any, stored: Any, filters: list[int], *, most: int) -
 
 
 def _text(value: Any) -> str | None:
-    """An attribute's text, of fixed or variable length, alone or as the one string of a list; else None."""
+    """Text of an attribute of fixed or variable length, single or in a list of one; else None."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
     if isinstance(value, bytes):
@@ -248,14 +264,14 @@ def _text(value: Any) -> str | None:
 
 
 def _is_bare(dataset: Any) -> bool:
-    """Whether a dataset only stands for a dimension."""
+    """Whether a dataset only represents a dimension without values."""
     name = dataset.attrs.get("NAME", b"")
     text = name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name)
     return text.startswith(_NO_VARIABLE.partition("{")[0])
 
 
 def _dimensions(dataset: Any) -> tuple[str, ...]:
-    """The name of each axis, by the scale that is attached to it; a coordinate is its own."""
+    """Name of each axis from the attached scale; a coordinate variable names its own."""
     if dataset.is_scale:
         return (PurePosixPath(dataset.name).name,)
     return tuple(PurePosixPath(axis[0].name).name if len(axis) else "" for axis in dataset.dims)

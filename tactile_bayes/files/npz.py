@@ -1,4 +1,4 @@
-"""Arrays out of an .npz file, never unpickled; what each declares is checked before memory is taken for it."""
+"""Arrays from an .npz file, without pickle; declared sizes are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HEADERS: Final = {
 def load_npz(
     path: Path, *, required: Sequence[str], optional: Sequence[str], shapes: Mapping[str, str] | None = None
 ) -> Arrays:
-    """The named arrays of an .npz file.
+    """Read the named arrays of an .npz file.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Posteriors as netCDF that arviz opens: every draw of the map's parameters and of the sizes."""
+"""Posteriors as netCDF that arviz opens: every draw of a map's parameters and of the sizes, and what goes with them."""
 
 from __future__ import annotations
 
@@ -10,18 +10,35 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
-from tactile_bayes.files.netcdf import Variable, netcdf_bytes
+from tactile_bayes.files.documents import parse_json
+from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.inference_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.records import dataclass
 from tactile_bayes.size.posterior import SizePosterior
 
 SCHEMA = "tactile-bayes/posterior/1"
 
 
-def write_posterior(path: Path, estimate: Estimate, *, provenance: Provenance, force: bool = False) -> None:
+def write_posterior(
+    path: Path,
+    estimate: Estimate,
+    *,
+    provenance: Provenance,
+    groups: Mapping[str, DrawGroup] | None = None,
+    force: bool = False,
+) -> None:
     """Write the draws of an estimate atomically; equal draws give equal bytes, see `netcdf_bytes`.
+
+    Parameters
+    ----------
+    groups
+        What goes beside the draws, see `inference_groups`.
 
     Raises
     ------
@@ -56,11 +73,11 @@ def write_posterior(path: Path, estimate: Estimate, *, provenance: Provenance, f
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in figures.items() if _plain(v)}),
     }
-    write_bytes(path, _posterior_bytes(variables, attributes), force=force)
+    write_bytes(path, _posterior_bytes(variables, attributes, groups or {}), force=force)
 
 
 def write_pooled(path: Path, size: SizePosterior, *, provenance: Provenance, force: bool = False) -> None:
-    """Write the draws of a mass's size, pooled over its maps, atomically."""
+    """Write the draws of a mass's size from several maps atomically."""
     names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
     variables = {name: np.atleast_2d(getattr(size, name)) for name in names}
     attributes = {
@@ -70,17 +87,68 @@ def write_pooled(path: Path, size: SizePosterior, *, provenance: Provenance, for
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in size.figures.items() if _plain(v)}),
     }
-    write_bytes(path, _posterior_bytes(variables, attributes), force=force)
+    write_bytes(path, _posterior_bytes(variables, attributes, {}), force=force)
 
 
-def _posterior_bytes(variables: Mapping[str, Any], attributes: Mapping[str, str]) -> bytes:
-    """A file with one group of (chain, draw) variables, as InferenceData has it."""
-    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in variables.items()}
+def _posterior_bytes(
+    variables: Mapping[str, Any], attributes: Mapping[str, str], groups: Mapping[str, DrawGroup]
+) -> bytes:
+    """A file with groups as InferenceData has them: the (chain, draw) variables of the posterior, then the others."""
     axes = ("chain", "draw")
-    lengths = next(iter(arrays.values())).shape
-    held = {name: Variable(np.arange(n), (name,), {}) for name, n in zip(axes, lengths, strict=True)}
-    held |= {name: Variable(values, axes, {}) for name, values in arrays.items()}
-    return netcdf_bytes(held, attributes=attributes, group="posterior")
+    draws = {name: (axes, np.asarray(values, dtype=np.float64)) for name, values in variables.items()}
+    held = {"posterior": Contents(_with_coordinates(draws), attributes)}
+    held |= {name: Contents(_with_coordinates(group.arrays), group.notes) for name, group in groups.items()}
+    return grouped_netcdf_bytes(held)
+
+
+def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) -> dict[str, Variable]:
+    """The variables after a coordinate of whole numbers for each of their axes."""
+    lengths: dict[str, int] = {}
+    for axes, values in arrays.values():
+        lengths |= dict(zip(axes, np.shape(values), strict=True))
+    held = {name: Variable(np.arange(length), (name,), {}) for name, length in lengths.items()}
+    return held | {name: Variable(values, axes, {}) for name, (axes, values) in arrays.items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosteriorDraws:
+    """What a posterior file says.
+
+    Parameters
+    ----------
+    method
+        That gave the draws.
+    draws
+        (chain, draw) arrays by name.
+    diagnostics
+        As the estimate's JSON has them.
+    """
+
+    method: str
+    draws: dict[str, FloatArray]
+    diagnostics: dict[str, Any]
+
+
+def read_posterior(path: Path) -> PosteriorDraws:
+    """Read what `write_posterior` or `write_pooled` wrote, of this version or an earlier one.
+
+    Raises
+    ------
+    BadDataError
+        When the file is no posterior, holds no draws, or is damaged.
+    """
+    way_out = "give what `estimate` wrote with -o"
+    with open_netcdf(path, way_out=way_out) as file:
+        group = file.group("posterior")
+        attributes = {} if group is None else group.attributes()
+        if group is None or not attributes.get("schema", "").startswith("tactile-bayes/posterior/"):
+            raise BadDataError("holds no posterior of this program", way_out=way_out)
+        names = [name for name in group.variables() if name not in ("chain", "draw")]
+        draws = {name: group.array(name, kind="f8", dimensions=("chain", "draw")) for name in names}
+    if not draws or not all(values.size > 1 for values in draws.values()):
+        raise BadDataError("holds no draws", way_out=way_out, path=str(path))
+    diagnostics = parse_json(attributes.get("diagnostics", "{}"))
+    return PosteriorDraws(attributes.get("method", ""), draws, diagnostics if isinstance(diagnostics, dict) else {})
 
 
 def _plain(value: object) -> bool:

@@ -1,4 +1,4 @@
-"""A pre-specified analysis in TOML: the settings fixed before the data were seen, and whatever else was promised."""
+"""A pre-specified analysis in TOML: settings fixed before the data were seen, and other text."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Protocol:
 
 
 def read_protocol(path: Path) -> Protocol:
-    """The title and the settings under ``[analysis]``; the rest is for people and counts only through the file's hash.
+    """Read the title and the settings under ``[analysis]``; the rest counts only through the file's hash.
 
     Raises
     ------

@@ -38,5 +38,5 @@ class Provenance:
 
 
 def hash_inputs(**paths: Path) -> dict[str, str]:
-    """Digest of each input by its role, for `Provenance.inputs`."""
+    """Digests of the inputs by role, for `Provenance.inputs`."""
     return {role: sha256(path) for role, path in paths.items()}

@@ -1,4 +1,4 @@
-"""Opening files that others wrote: regular files only, up to a stated size, and one line for whatever a decoder raises.
+"""Safe reading of files: regular files only, up to a size limit; a decoder's errors become one line.
 
 Limits are judged before memory is taken. Each is multiplied by the environment variable ``TACTILE_BAYES_LIMITS`` (a
 number, 1 where it is not set), so that a sound file that is too large for them can still be read. docs/exit-codes.md
@@ -37,7 +37,7 @@ _KINDS: Final = (
 
 
 def open_input(path: Path) -> io.BufferedReader:
-    """Open a regular file for reading; nothing waits for a writer or a device.
+    """Open a regular file for reading; never waits on a pipe or a device.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def open_input(path: Path) -> io.BufferedReader:
 
 
 def special_kind(mode: int) -> str:
-    """What a path is in words ("a FIFO"), by its mode; empty for a regular file."""
+    """Kind of a path that is no regular file ("a FIFO"), by its mode; empty for a regular file."""
     return next((words for test, words in _KINDS if test(mode)), "")
 
 
@@ -114,12 +114,12 @@ def check_limit(size: int, most: int, *, what: str) -> None:
 
 
 def unpacked_limit(file_bytes: int) -> int:
-    """How many bytes a packed file may unpack to, before ``TACTILE_BAYES_LIMITS``."""
+    """Largest number of bytes that a packed file may unpack to, before ``TACTILE_BAYES_LIMITS``."""
     return max(_UNPACKED_BYTES, _UNPACKED_TIMES * file_bytes)
 
 
 def limit_factor() -> float:
-    """What every limit is multiplied by.
+    """Factor on every limit, from ``TACTILE_BAYES_LIMITS``.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def limit_factor() -> float:
 
 @contextlib.contextmanager
 def decoding(what: str, *, way_out: str) -> Iterator[None]:
-    """Turn whatever a decoder raises on damaged bytes into one `BadDataError`.
+    """Turn any error of a decoder on damaged bytes into one `BadDataError`.
 
     Only calls into decoders of other packages belong inside: each of them has error classes of its own, and damaged
     bytes bring out others as well.
@@ -158,5 +158,5 @@ def decoding(what: str, *, way_out: str) -> Iterator[None]:
 
 
 def unreadable(path: Path, error: OSError) -> BadDataError:
-    """The one line for a file that cannot be opened."""
+    """Error for a file that cannot be opened."""
     return BadDataError(f"cannot be read ({error.strerror or error})", way_out="check the path", path=str(path))

@@ -1,4 +1,4 @@
-"""Scan files: MCAP that Foxglove opens as it is, and that a killed recording leaves readable.
+"""Scan files: MCAP that Foxglove opens, readable after the recording program was killed.
 
 Layout (schema id ``tactile-bayes/scan/1``)
     Metadata and attachments come first, so that even an unfinished file says what it is:
@@ -70,7 +70,7 @@ _LATEST_NS: Final = 2**63 - 1
 
 
 class ScanWriter:
-    """Append one scan to a stream: what describes it first, then messages as they come.
+    """Writer of one scan to a stream: first its description, then messages in order of arrival.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class ScanWriter:
         self._landmark_channel = {name: channel("/landmark", PoseInFrame, name=name) for name in LANDMARK_NAMES}
 
     def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None:
-        """One (rows, columns) frame of raw counts."""
+        """Add one (rows, columns) frame of raw counts."""
         if counts.shape != self._shape:
             raise BadDataError(f"a frame has shape {counts.shape}", way_out=f"this head has {self._shape} taxels")
         stamp = Grid()
@@ -156,12 +156,12 @@ class ScanWriter:
         self._send(self._frame_channel, body, device_ns=device_ns, host_ns=host_ns)
 
     def add_pose(self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int) -> None:
-        """One (3,) position and (4,) quaternion, scalar first, of the tracker's sensor in `base`."""
+        """Add one (3,) position and (4,) quaternion, scalar first, of the tracker's sensor in `base`."""
         message = _pose_message(position_mm, quaternion_wxyz)
         self._send_message(self._pose_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None:
-        """One (3,) point of `LANDMARK_NAMES` in `base`."""
+        """Add one (3,) point of `LANDMARK_NAMES` in `base`."""
         message = _pose_message(position_mm, np.array([1.0, 0.0, 0.0, 0.0]))
         self._send_message(self._landmark_channel[name], message, device_ns=device_ns, host_ns=host_ns)
 
@@ -194,7 +194,7 @@ def _stamp(message: Any, device_ns: int) -> None:
 
 
 def _grid_of(head: HeadGeometry) -> Any:
-    """A grid message without time and counts: what every frame of this head repeats."""
+    """Grid message without time and counts: the constant part of this head's frames."""
     rows, columns = head.shape
     pitch = head.pitch_mm
     grid = Grid(frame_id="scanhead", column_count=rows, row_stride=2 * rows, cell_stride=2)
@@ -265,7 +265,7 @@ def _write_messages(writer: ScanWriter, scan: Scan) -> None:
 
 
 def read_scan(path: Path) -> Scan:
-    """Read a scan; of an unfinished file, everything up to the last complete chunk.
+    """Read a scan; from an unfinished file, everything up to the last complete chunk.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def read_scan(path: Path) -> Scan:
 
 
 def read_scan_report(path: Path) -> ScanFile:
-    """Read a scan with the account of what the file held and what was lost.
+    """Read a scan, with a report of the file's content and losses.
 
     Raises
     ------
@@ -299,13 +299,13 @@ def read_scan_report(path: Path) -> ScanFile:
 
 
 def read_truth(path: Path) -> dict[str, Any] | None:
-    """What a simulated scan was made from; None for a scan that holds no truth."""
+    """Read the truth of a simulated scan; None for a scan without one."""
     truth = scan_records(path, keep=()).metadata.get("truth")
     return None if truth is None else json_object(truth.get("json", ""), name="truth")
 
 
 def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
-    """All records, after the file was found to be a scan of a version this program knows.
+    """Read all records, after checking that the file is a scan of a known version.
 
     Parameters
     ----------
@@ -349,14 +349,14 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
 
 
 def json_attachment(records: McapRecords, name: str) -> dict[str, Any]:
-    """An attached JSON object."""
+    """Read an attached JSON object."""
     if name not in records.attachments:
         raise BadDataError(f"holds no {name}", way_out="the recording was cut off in its header; scan again")
     return json_object(records.attachments[name].decode("utf-8", "replace"), name=name)
 
 
 def json_object(text: str, *, name: str) -> dict[str, Any]:
-    """The JSON object that a part of the file is."""
+    """Parse a JSON object from a part of the file."""
     document = parse_json(text, name=name)
     if not isinstance(document, dict):
         raise BadDataError(f"{name} is a {type(document).__name__}", way_out="it must be a JSON object")
@@ -364,7 +364,7 @@ def json_object(text: str, *, name: str) -> dict[str, Any]:
 
 
 def message_times(messages: Messages, *, topic: str) -> FloatArray:
-    """The messages' times in s.
+    """Times of messages, s.
 
     Raises
     ------
@@ -401,7 +401,7 @@ def _poses(records: McapRecords) -> TrackerPoses:
 
 
 def _pose_table(messages: Messages) -> FloatArray:
-    """A row of position and quaternion, scalar first, for each pose."""
+    """Rows of position and quaternion, scalar first, one per pose."""
     table: FloatArray = np.empty((len(messages), 7))
     for i, body in enumerate(messages.bodies()):
         pose = _decode(PoseInFrame, body).pose
@@ -411,7 +411,7 @@ def _pose_table(messages: Messages) -> FloatArray:
 
 
 def _landmarks(records: McapRecords) -> Landmarks | None:
-    """The last touch of each landmark, and how far the others lie from it; None unless all were touched."""
+    """Last touch of each landmark, and the distance of earlier ones from it; None unless all were touched."""
     points, apart = {}, []
     for name in LANDMARK_NAMES:
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)

@@ -1,4 +1,4 @@
-"""The parts of a scan file that are not MCAP: head and calibration documents, nanoseconds, the reader's account."""
+"""Parts of a scan file besides MCAP: head and calibration documents, times in ns, the reader's report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanFile:
-    """A scan and the account of the file it came from.
+    """A scan and the report on its file.
 
     Parameters
     ----------
@@ -52,17 +52,17 @@ class ScanFile:
     account: Mapping[str, str] = field(default_factory=dict)
 
     def cautions(self) -> list[str]:
-        """What speaks against using the scan, one line each: by its times, and by the recorder's account."""
+        """Reasons against using the scan, one line each: from its times and from the recorder's account."""
         return all_cautions(scan_cautions(self.scan), self.account)
 
 
 def all_cautions(found: list[str], account: Mapping[str, str]) -> list[str]:
-    """The cautions found in a scan, and those that only its recorder could have."""
+    """Cautions found in a scan, and those that its recorder noted."""
     return [*found, *(line for line in account.get("cautions", "").splitlines() if line not in found)]
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
-    """Whole nanoseconds of times in s.
+    """Convert times in s to whole ns.
 
     Seconds and their fraction are converted apart: a time since 1970 times 1e9 does not fit a double's 53 bits.
     """
@@ -72,7 +72,7 @@ def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
 
 
 def s_from_ns(time_ns: NDArray[np.int64]) -> FloatArray:
-    """Times in s of whole nanoseconds; undoes `ns_from_s` to the last bit that a ns can tell apart."""
+    """Convert whole ns to times in s; undoes `ns_from_s` to the bit."""
     seconds, nanos = np.divmod(time_ns, _NS)
     times: FloatArray = seconds + nanos / _NS
     return times
@@ -128,7 +128,7 @@ def _array(document: Mapping[str, Any], key: str, *, ndim: int) -> FloatArray:
 
 
 def _build(name: str, make: Callable[[], _T]) -> _T:
-    """`make()`, with the faults of a foreign document told in one line."""
+    """Call `make`, and turn an error in a foreign document into one line."""
     try:
         return make()
     except BadDataError as error:

@@ -1,4 +1,4 @@
-"""A scan file while it is being recorded: readable at any moment, whatever happens to the program.
+"""A scan file during its recording: readable at any moment, whatever happens to the program.
 
 Beside what every scan file holds there is ``/log``, foxglove.Log: one message for each thing that went wrong, with the
 device time of the frame or pose it belongs to; and, when the recording ended in order, a metadata record
@@ -30,7 +30,7 @@ SYNC_S: Final = 0.5
 
 
 def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
-    """Open a new file for its owner only; not a temporary one, because it must be there after a kill.
+    """Create a new file for its owner only; under its final name, because it must survive a kill.
 
     It is locked until it is closed: another recording, or `repair`, leaves it alone.
 
@@ -55,7 +55,7 @@ def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
 
 
 def refuse_recording(path: Path) -> None:
-    """Raise `UsageError` when a file is being recorded at this moment."""
+    """Raise `UsageError` when a file is being recorded right now."""
     try:
         stream = path.open("rb")
     except OSError:
@@ -74,7 +74,7 @@ def _lock(stream: IO[bytes], path: Path) -> None:
 
 
 class _Syncer:
-    """Sees a file onto the disk again and again, in a thread of its own: who writes does not wait for the disk.
+    """Thread that syncs a file to the disk repeatedly, so that the writer does not wait for the disk.
 
     A thread, because the system lets go of the interpreter while it waits; readers are processes of their own and know
     nothing of it.
@@ -88,13 +88,13 @@ class _Syncer:
         self._thread.start()
 
     def ask(self) -> None:
-        """There is something new; raises what the last time failed with."""
+        """Request a sync; raises the last sync's error."""
         if self._error is not None:
             raise self._error
         self._dirty.set()
 
     def stop(self) -> None:
-        """Wait for the one that is under way."""
+        """Wait for the running sync."""
         self._ended.set()
         self._thread.join()
 
@@ -115,7 +115,7 @@ def _to_disk(descriptor: int) -> None:
 
 
 class RecordingWriter(ScanWriter):
-    """A `ScanWriter` that writes at once what it has when told, and notes what went wrong.
+    """A `ScanWriter` that can flush at once, and stores notes about problems.
 
     Parameters
     ----------
@@ -147,12 +147,12 @@ class RecordingWriter(ScanWriter):
         self.flush()
 
     def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None:
-        """One line about the data at a time."""
+        """Add a line about the data at this time."""
         message = Log(level=Log.WARNING if serious else Log.INFO, message=text, name=device)
         self._send_message(self._log_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def flush(self) -> None:
-        """Close the chunk and hand it to the system: from then on it survives this process.
+        """Close the chunk and hand it to the system, from where it survives this process.
 
         Within `SYNC_S` it is on the disk too, and survives the computer.
 
@@ -167,7 +167,7 @@ class RecordingWriter(ScanWriter):
         self._syncer.ask()
 
     def close(self, account: Mapping[str, Any]) -> None:
-        """Write the account, the index and the footer, and see them onto the disk."""
+        """Write the account, the index and the footer, and sync them to the disk."""
         self.stop_syncing()
         self._writer.flush()
         self._writer.add_metadata(ACCOUNT, {name: str(value) for name, value in account.items()})
@@ -176,16 +176,16 @@ class RecordingWriter(ScanWriter):
         os.fsync(self._stream.fileno())
 
     def stop_syncing(self) -> None:
-        """Let go of the file, whatever comes; to be called before the stream is closed."""
+        """Release the file in any case; call it before closing the stream."""
         if self._syncer is not None:
             self._syncer.stop()
             self._syncer = None
 
 
 def full_disk(path: Path, error: OSError) -> BadDataError:
-    """The one line for a recording that could not be written on."""
+    """Error for a recording that could not be continued because the disk is full."""
     return BadDataError(
-        f"cannot be written on ({error.strerror})",
-        way_out="what was recorded until then is in it; make room, then `tactile-bayes repair` it",
+        f"cannot be written any further ({error.strerror})",
+        way_out="what was recorded before is kept; free space, then `tactile-bayes repair` it",
         path=str(path),
     )

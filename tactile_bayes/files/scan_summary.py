@@ -1,4 +1,4 @@
-"""What a scan file holds, counted while it is read from front to back; no message is kept."""
+"""Summary of a scan file, counted while reading it from front to back; no message is kept."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tactile_bayes.mapping.overlap import Span, overlap_cautions
 
 
 def summarise_scan(path: Path) -> dict[str, Any]:
-    """Frames, poses, duration, losses, session and provenance of a scan; its memory is a time for each message.
+    """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def _touched(records: McapRecords, name: str) -> bool:
 
 
 def _recording(account: Mapping[str, str], topics: Mapping[str, int], time_s: FloatArray) -> dict[str, Any]:
-    """What is missing: by the gaps between the frames' times, and by the recorder's account if it came to give one."""
+    """Losses: gaps between the frames' times, and the recorder's account if the file has one."""
     steps = np.diff(time_s)
     period = float(np.median(steps)) if len(steps) else 0.0
     missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0

@@ -1,4 +1,4 @@
-"""Scenes as TOML: units in the keys, defaults and ranges in one schema, one line for every mistake."""
+"""Scenes as TOML: units in the keys, defaults and ranges in one schema, one error line per mistake."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _TYPES: Final = {
 
 
 def read_scene(path: Path) -> Scene:
-    """Read a scene; whatever is left out takes the default of ``scene.schema.json``.
+    """Read a scene; missing keys take the defaults of ``scene.schema.json``.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def read_scene(path: Path) -> Scene:
 
 
 def scene_from_toml(text: str) -> Scene:
-    """The scene a TOML text describes; see `read_scene` for the errors."""
+    """Parse a scene from a TOML text; for the errors see `read_scene`."""
     document = parse_toml(text, way_out="see the scene in the documentation")
     _check(document)
     return _scene(document)
@@ -77,7 +77,7 @@ def _validator() -> Any:
 
 
 def _told(error: Any) -> BadDataError:
-    """The one line for a rule of the schema that was broken."""
+    """Error line for a broken rule of the schema."""
     where, value, rule = _where(error.path[1:]), error.value, error.definition
     if error.rule == "additionalProperties":
         return _unknown_key(where, value, rule)
@@ -104,7 +104,7 @@ def _short(value: object) -> str:
 
 
 def _range(rule: Mapping[str, Any]) -> str:
-    """The allowed range in words: " above 0, at most 600"."""
+    """Allowed range in words: " above 0, at most 600"."""
     words = []
     for key, word in (
         ("minimum", "at least"),
@@ -131,7 +131,7 @@ def _unknown_key(where: str, table: Mapping[str, Any], rule: Mapping[str, Any]) 
 
 
 def _stem(key: str) -> str:
-    """The key without its unit: ``x_cm`` and ``x_mm`` are one quantity."""
+    """Key without its unit: ``x_cm`` and ``x_mm`` are one quantity."""
     stem, _, unit = key.rpartition("_")
     units = {"mm", "cm", "m", "um", "in", "kpa", "pa", "mpa", "psi", "s", "ms", "us", "min", "hz", "khz", "deg", "rad"}
     return stem if stem and unit.lower() in units else key
@@ -157,7 +157,7 @@ def _scene(document: Mapping[str, Any]) -> Scene:
 
 
 def _lumps(tables: Sequence[Mapping[str, Any]]) -> tuple[tuple[Lump, ...], tuple[SolidLump, ...]]:
-    """The lumps that are bumps, and those that are tissue."""
+    """Lumps that are bumps, and lumps that are tissue."""
     bumps, tissue = [], []
     for i, table in enumerate(tables):
         solid = [key for key in _OF_TISSUE if key in table]

@@ -1,4 +1,4 @@
-"""The schemas in data_schema/: found in a wheel or a checkout, and applied with one-line errors."""
+"""The schemas in data_schema/, from a wheel or a checkout, applied with one-line errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 @cache
 def load_schema(name: str) -> dict[str, Any]:
-    """The schema document ``data_schema/NAME`` (``size_calibration.schema.json``, ``trial.table.json``...)."""
+    """Load the schema ``data_schema/NAME`` (``size_calibration.schema.json``, ``trial.table.json``...)."""
     for folder in (_PACKAGE / "data_schema", _PACKAGE.parent / "data_schema"):
         if (folder / name).is_file():
             document: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
@@ -45,7 +45,7 @@ def check_document(document: object, schema_name: str, *, path: Path) -> None:
 
 
 def _check_kind(document: object, schema_name: str, *, path: Path) -> None:
-    """Refuse a document of another kind by its name, before its fields are held against the wrong schema."""
+    """Refuse a document of another kind by its name, before checking its fields against the wrong schema."""
     wanted = schema_kind(load_schema(schema_name).get("properties", {}).get("schema", {}).get("const"))
     found = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
     if wanted and found and found != wanted:
@@ -62,5 +62,5 @@ def _validator(schema_name: str) -> Any:
 
 
 def dump_json(document: object) -> str:
-    """JSON text with a fixed layout; refuses NaN and infinities, which JSON does not have."""
+    """Format as JSON with a fixed layout; refuses NaN and infinities, which JSON does not have."""
     return json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n"

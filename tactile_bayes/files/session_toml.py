@@ -1,4 +1,4 @@
-"""Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other plain text."""
+"""Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation
 
 
 def read_session(path: Path) -> dict[str, str]:
-    """Read the facts of a session.
+    """Read the session facts.
 
     Raises
     ------

@@ -15,7 +15,7 @@ _NUMBERS: Final = ("fit_radius_mm", "between_map_sd", "accuracy_mm")
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Settings by the names of `pipeline.settings.Settings`; the priors are together under ``prior``.
+    """Read settings by the names of `pipeline.settings.Settings`, the priors together under ``prior``.
 
     Raises
     ------

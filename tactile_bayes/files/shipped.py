@@ -5,24 +5,29 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-SHIPPED: Final = {"solid": "solid.json", "solid-mean": "solid_mean.json", "plane-strain": "plane_strain.json"}
+SHIPPED: Final = {
+    "solid": "solid.json",
+    "eq6": "eq6.json",
+    "solid-mean": "solid_mean.json",
+    "plane-strain": "plane_strain.json",
+}
 DEFAULT: Final = "solid"
 NONE: Final = "none"
 _FOLDER = Path(__file__).resolve().parents[1] / "calibrations"
 
 
 def is_shipped(path: Path) -> bool:
-    """Whether a file came with the program; the tests hold those against their schemas, once for all."""
+    """Whether a file comes with the program; the tests check those against their schemas."""
     return path.parent == _FOLDER
 
 
 def default_for(normalise: str) -> str:
-    """The name of the calibration for maps so normalised, where nothing is said."""
+    """Name of the default calibration for a way to normalise."""
     return "solid-mean" if normalise == "mean" else DEFAULT
 
 
 def size_calibration_path(name: str) -> Path | None:
-    """Where the calibration of a name or path is; None for ``none``.
+    """Path of a calibration given by name or path; None for ``none``.
 
     A file of the same name in the working directory needs a ``./`` before it.
     """

@@ -1,17 +1,20 @@
-"""The part of a log-quadratic size calibration that knows the depth of the fat, as JSON."""
+"""The part of a size calibration over a population that knows the depth of the fat, as JSON."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.size.fat_depth import POWERS, ROUND, FatCubic, FatDepth
+from tactile_bayes.size.fat_depth import ROUND, FatDepth, FatTerms
+
+Terms = TypeVar("Terms", bound=FatTerms)
 
 
-def fat_document(cubic: FatCubic) -> dict[str, Any]:
-    """As plain data, see ``fat_cubic`` in data_schema/size_quadratic.schema.json."""
-    depth, (alpha, p0, w0) = cubic.depth, cubic.centre
+def fat_document(fat: FatTerms, powers: Sequence[Sequence[int]]) -> dict[str, Any]:
+    """As plain data, see ``fat_cubic`` in data_schema/size_quadratic.schema.json; `powers` are the coefficients'."""
+    depth, (alpha, p0, w0) = fat.depth, fat.centre
     return {
         "depth": {
             "profile": list(HEAD_PROFILE),
@@ -22,25 +25,25 @@ def fat_document(cubic: FatCubic) -> dict[str, Any]:
             "most_leverage": number(depth.most_leverage),
             "log_sd": number(depth.log_sd),
         },
-        "powers": [list(one) for one in POWERS],
+        "powers": [list(one) for one in powers],
         "round_powers": [list(one) for one in ROUND],
         "centre": {"log_amplitude": alpha, "log_width": p0, "log_fat": w0},
-        "mean": numbers(cubic.mean),
-        "covariance": numbers(cubic.covariance),
+        "mean": numbers(fat.mean),
+        "covariance": numbers(fat.covariance),
         "round_lumps": {
-            "coefficients": numbers(cubic.round_coefficients),
-            "body_sd": number(cubic.round_sd[0]),
-            "exam_sd": number(cubic.round_sd[1]),
+            "coefficients": numbers(fat.round_coefficients),
+            "body_sd": number(fat.round_sd[0]),
+            "exam_sd": number(fat.round_sd[1]),
         },
-        "information_inverse": numbers(cubic.information_inverse),
-        "most_leverage": number(cubic.most_leverage),
-        "fat_mm": [number(end) for end in cubic.fat_mm],
-        "hidden": None if cubic.hidden is None else hidden_document(cubic.hidden),
-        "fit": {name: number(value) for name, value in cubic.fit.items()},
+        "information_inverse": numbers(fat.information_inverse),
+        "most_leverage": number(fat.most_leverage),
+        "fat_mm": [number(end) for end in fat.fat_mm],
+        "hidden": None if fat.hidden is None else hidden_document(fat.hidden),
+        "fit": {name: number(value) for name, value in fat.fit.items()},
     }
 
 
-def parse_fat(document: dict[str, Any]) -> FatCubic:
+def parse_fat(document: dict[str, Any], form: type[Terms]) -> Terms:
     """From plain data that keeps the schema.
 
     Raises
@@ -51,7 +54,7 @@ def parse_fat(document: dict[str, Any]) -> FatCubic:
     depth, balls, centre = document["depth"], document["round_lumps"], document["centre"]
     low, high = document["fat_mm"]
     arrays = {name: array_of(depth, name) for name in ("centre", "scale", "coefficients")}
-    return FatCubic(
+    return form(
         depth=FatDepth(
             **arrays,
             information_inverse=array_of(depth, "information_inverse"),
@@ -66,6 +69,6 @@ def parse_fat(document: dict[str, Any]) -> FatCubic:
         information_inverse=array_of(document, "information_inverse"),
         most_leverage=float(document["most_leverage"]),
         fat_mm=(float(low), float(high)),
-        hidden=parse_hidden(document["hidden"], terms=len(POWERS)),
+        hidden=parse_hidden(document["hidden"], terms=len(document["information_inverse"])),
         fit={name: float(value) for name, value in document["fit"].items()},
     )

@@ -1,4 +1,4 @@
-"""Size calibrations as JSON: Eq 6 with draws of its coefficients; files of the log-quadratic form are read here too."""
+"""Size calibrations as JSON: Eq 6 with draws of its coefficients; those over a population are read here too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files import size_quadratic_json as quadratic
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance
@@ -26,6 +25,7 @@ from tactile_bayes.size.eq6 import (
 )
 
 if TYPE_CHECKING:
+    from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.calibration import Calibration
 
 SCHEMA = "tactile-bayes/size-calibration/1"
@@ -45,6 +45,7 @@ def write_size_calibration(
         "residual_correlation": number(calibration.residual_correlation),
         "x": _axis_document(calibration.x),
         "y": _axis_document(calibration.y),
+        **({"cautions": list(calibration.cautions)} if calibration.cautions else {}),
         **_left_out_document(calibration.left_out),
         "provenance": provenance.as_dict(),
     }
@@ -53,7 +54,7 @@ def write_size_calibration(
 
 
 def read_size_calibration(path: Path) -> Calibration:
-    """Read a size calibration of either form.
+    """Read a size calibration of any form.
 
     Raises
     ------
@@ -61,12 +62,42 @@ def read_size_calibration(path: Path) -> Calibration:
         When the file is not one, or a field breaks the schema.
     """
     document: Any = load_json(path)
-    wanted = isinstance(document, dict) and document.get("form") == "log-quadratic"
-    if not is_shipped(path):
-        check_document(document, quadratic.SCHEMA_FILE if wanted else SCHEMA_FILE, path=path)
-    if wanted:
+    form = document.get("form") if isinstance(document, dict) else None
+    if form == "log-quadratic":
+        from tactile_bayes.files import size_quadratic_json as quadratic
+
+        _check(document, quadratic.SCHEMA_FILE, path)
         return quadratic.parse_log_quadratic(document, path=path)
+    if form == "eq6-population":
+        from tactile_bayes.files import size_population_eq6_json as population
+
+        _check(document, population.SCHEMA_FILE, path)
+        return population.parse_population_eq6(document, path=path)
+    _check(document, SCHEMA_FILE, path)
     return _eq6(document, path=path)
+
+
+def _check(document: Any, schema_file: str, path: Path) -> None:
+    """Hold a file of somebody else's against its schema."""
+    if not is_shipped(path):
+        check_document(document, schema_file, path=path)
+
+
+def write_body_calibration(
+    path: Path, calibration: BodyCalibration, *, provenance: Provenance, force: bool = False
+) -> None:
+    """Write a calibration over a population of either form atomically."""
+    from tactile_bayes.files.size_population_eq6_json import write_population_eq6
+    from tactile_bayes.files.size_quadratic_json import write_log_quadratic
+    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.population_eq6 import PopulationEq6
+
+    if isinstance(calibration, PopulationEq6):
+        write_population_eq6(path, calibration, provenance=provenance, force=force)
+    elif isinstance(calibration, LogQuadratic):
+        write_log_quadratic(path, calibration, provenance=provenance, force=force)
+    else:
+        raise TypeError(f"a calibration of another form: {type(calibration).__name__}")
 
 
 def _eq6(document: Any, *, path: Path) -> SizeCalibration:
@@ -78,6 +109,7 @@ def _eq6(document: Any, *, path: Path) -> SizeCalibration:
             recipe=Recipe(**document["recipe"]),
             axes=tuple(document["axes"]),
             left_out=_left_out(document.get("left_out")),
+            cautions=tuple(document.get("cautions", ())),
         )
     except BadDataError as error:
         raise error.at(path) from None

@@ -1,4 +1,4 @@
-"""Parts that the documents of log-quadratic calibrations share."""
+"""Parts shared by the documents of log-quadratic calibrations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile_bayes.size.hidden import HiddenTerms
 
 
 def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
-    """As plain data."""
+    """The hidden terms as plain data."""
     return {
         "names": list(hidden.names),
         "expected": numbers(hidden.expected),
@@ -23,7 +23,7 @@ def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
 
 
 def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms | None:
-    """From plain data; `terms` is how many a map has."""
+    """Parse the hidden terms; `terms` is the number of terms of a map."""
     if document is None:
         return None
     names, k = tuple(document["names"]), len(document["names"])
@@ -35,7 +35,7 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
 
 
 def array_of(document: dict[str, Any], name: str) -> FloatArray:
-    """The array that nested lists of numbers make.
+    """Array from nested lists of numbers.
 
     Raises
     ------
@@ -49,12 +49,12 @@ def array_of(document: dict[str, Any], name: str) -> FloatArray:
 
 
 def number(value: float) -> float:
-    """Nine significant digits of it."""
+    """Round to nine significant digits."""
     return float(f"{value:.9g}")
 
 
 def numbers(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> list[Any]:
-    """Nested lists of numbers."""
+    """Nested lists of numbers, rounded to nine significant digits."""
     if values.ndim == 1:
         return [number(value) for value in values]
     return [numbers(row) for row in values]

@@ -1,4 +1,4 @@
-"""Sizes from what `estimate` wrote: its JSON, or the draws in its netCDF."""
+"""Sizes from the output of `estimate`: its JSON, or the draws in its netCDF."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def read_stated_size(path: Path, number: int | None = None) -> StatedSize:
 def fill_from_posteriors(
     columns: Mapping[str, list[Any]], folder: Path, *, fault: Callable[..., BadDataError]
 ) -> tuple[dict[str, list[Any]], list[Path]]:
-    """The columns of a trial table with sizes and intervals from the files in its ``posterior`` column.
+    """Fill sizes and intervals in a trial table from the files in its ``posterior`` column.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def fill_from_posteriors(
 
 
 def _split_number(folder: Path, name: str) -> tuple[Path, int | None]:
-    """The file, and which estimate of its list where the cell ends in #NUMBER."""
+    """Split a cell that ends in #NUMBER into the file and the number of the estimate in it."""
     stem, mark, number = name.rpartition("#")
     if mark and number.isascii() and number.isdigit() and len(number) < 10 and not (folder / name).exists():
         return folder / stem, int(number)
@@ -132,7 +132,7 @@ def _from_json(path: Path, number: int | None) -> StatedSize:
 
 
 def _index(path: Path, length: int, number: int | None) -> int:
-    """Where in a list of estimates the wanted one stands."""
+    """Index of the wanted estimate in a list of estimates."""
     if number is None and length == 1:
         return 0
     if number is None or not 1 <= number <= length:

@@ -1,4 +1,4 @@
-"""Comma-separated tables read under a Table Schema: a cell is what its schema says, or the reader says why not.
+"""Reading of comma-separated tables under a Table Schema, with each bad cell named in one line.
 
 Nothing is guessed or repaired. Each fault is one `BadDataError` naming the file, the line, the column, the value
 and what to do. Two properties of a field go beyond the Table Schema standard: ``"column": "required"`` (the column
@@ -42,7 +42,7 @@ _NOT_TEXT = (
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A table that is in no file: CSV text under a name for its errors."""
+    """A table without a file: CSV text with a name for its errors."""
 
     name: Path
     text: str
@@ -50,7 +50,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A checked table, column by column.
+    """A validated table, column by column.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Table:
         return len(self.line_numbers)
 
     def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
-        """A fault found in one cell after reading, told as the reader tells its own.
+        """Error for a cell found wrong after reading, in the reader's own form.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
 
 
 def read_raw(path: Path) -> tuple[list[int], list[dict[str, str]]]:
-    """The cells of a CSV table of any shape as they stand, under its header, with the line of each row."""
+    """Read the cells of any CSV table as text, under its header, with the line number of each row."""
     rows = _split(path, _decode(path))
     if len(rows) < 2:
         raise BadDataError("holds no rows", way_out="give a header and at least one row", path=str(path))
@@ -130,7 +130,7 @@ def read_raw(path: Path) -> tuple[list[int], list[dict[str, str]]]:
 
 
 def parse_number(path: Path, line: int, column: str, text: str) -> float:
-    """A finite number as text, or the fault of its cell."""
+    """Parse a finite number; an error names its cell."""
     try:
         return _parse_number(text, {"name": column})
     except _CellError as refusal:
@@ -138,7 +138,7 @@ def parse_number(path: Path, line: int, column: str, text: str) -> float:
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
-    """Check that each row points at a row that exists, as the schema's ``foreignKeys`` say.
+    """Check that each row refers to an existing row, by the schema's ``foreignKeys``.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _decode(path: Path) -> str:
 
 
 def _split(path: Path, text: str) -> list[tuple[int, list[str]]]:
-    """Rows that are not blank, each with the line it begins at."""
+    """Rows that are not blank, each with its first line number."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[tuple[int, list[str]]] = []
     before = 0
@@ -229,7 +229,7 @@ def _check_length(path: Path, line: int, cells: Sequence[str], header: Sequence[
 
 
 def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any]) -> Any:
-    """The cell's value in the schema's type, or None where it is blank and may be."""
+    """Parse a cell by the schema's type; None where it is blank and may be."""
     name = field["name"]
     if text == "":
         if _is_required(field):
@@ -246,7 +246,7 @@ def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any]) -
 
 
 class _CellError(Exception):
-    """What is wrong with a cell, before it is known where the cell is."""
+    """Error of a cell whose place is added later."""
 
     def __init__(self, what: str, way_out: str) -> None:
         super().__init__(what)
@@ -273,7 +273,7 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
 
 
 def _comma_fault(text: str) -> tuple[str, str]:
-    """What a comma in a number may mean: three digits after it may be thousands, any other count is a decimal."""
+    """Explain a comma in a number: three digits after it may be thousands, otherwise it is a decimal comma."""
     whole, _, rest = text.partition(",")
     decimal = f"{whole}.{rest}"
     if len(rest) != 3 or whole.lstrip("+-").startswith("0"):

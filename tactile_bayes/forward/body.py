@@ -22,7 +22,7 @@ SEATS = {"centred": 0.0, "resting": 1.0}
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """The body without its lump.
+    """The layered body without a lump.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Layers:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Three layers and the place of a circular lump; its stiffness is not part of the geometry.
+    """Three layers and the place of a circular lump; the lump's stiffness is given elsewhere.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class Body:
 
 
 def parse_seat(text: str) -> float:
-    """The seat that ``centred``, ``resting`` or a number from 0 to 2 names.
+    """Convert ``centred``, ``resting`` or a number from 0 to 2 to a seat.
 
     Raises
     ------

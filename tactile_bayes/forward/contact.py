@@ -1,4 +1,4 @@
-r"""A rigid, frictionless head on a compliant surface: pressure only where it touches, and a given force.
+r"""Frictionless contact of a rigid head with an elastic surface, under a given force.
 
 With C the compliance of the surface cells, g the head's profile and :math:`\delta` the depth it is pushed to, the
 pressures are the one solution of
@@ -86,7 +86,7 @@ class Head:
 
     @property
     def half_face_mm(self) -> float:
-        """Half the width of the rigid face: of the sensing width, and of the shoulders where they lie outside it."""
+        """Half the width of the rigid face: the sensing width, plus the shoulders where they lie outside it."""
         if self.shoulders == SHOULDERS_INSIDE:
             return self.half_width_mm
         return self.half_width_mm + self.shoulder_mm * (1 - self.half_width_mm / self.radius_mm)
@@ -113,7 +113,7 @@ class Head:
         return np.asarray(self.profile_mm(centres[:, None] + 0.5 * cell_mm * points) @ (0.5 * weights))
 
     def sensing_cells(self, cell_mm: float) -> BoolArray:
-        """(n,) for the cells of the face from left to right: whether a cell senses, or only presses."""
+        """(n,) whether each cell of the face, from left to right, senses pressure or only presses."""
         count = round(self.width_mm / cell_mm)
         if count < 2 or abs(count * cell_mm - self.width_mm) > 1e-9 * self.width_mm:
             raise BadDataError(
@@ -125,7 +125,7 @@ class Head:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """The solution at m positions over n cells.
+    """Solutions of the contact at m positions over n cells.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def solve_contact(
     touching: BoolArray | None = None,
     counted: BoolArray | None = None,
 ) -> Contact:
-    """Press a rigid profile on a surface, at many positions at once.
+    """Solve the contact of a rigid profile with a surface at many positions at once.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def solve_contact(
 
 
 def _tolerance(profile_mm: FloatArray, depth_mm: FloatArray) -> FloatArray:
-    """Overlap (m, 1) that is only rounding, of the lengths at play."""
+    """(m, 1) overlap that counts as rounding error, from the lengths involved."""
     return np.asarray(1e-13 * (np.abs(depth_mm) + float(np.abs(profile_mm).max())))[:, None]
 
 
@@ -224,7 +224,7 @@ def _given_contact(
 def _cell_by_cell(
     compliance: FloatArray, profile: FloatArray, total: float, share: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    """The same by moving one cell at a time along a path on which the energy only falls (Lawson & Hanson 1974)."""
+    """Solve one position by an active-set method that moves one cell at a time (Lawson & Hanson 1974)."""
     n = len(profile)
     active, pressure = np.ones(n, dtype=bool), np.full(n, total / share.sum())
     for _ in range(20 * n):

@@ -1,4 +1,4 @@
-"""The face of a rigid head as far as it can touch the skin: the taxels, and the rounded rim around them.
+"""The face of a rigid head that can touch the skin: the taxels and the rounded rim around them.
 
 A flat end without a rim would press like a punch, with a singular pressure along its edge that no taxel array shows.
 """
@@ -83,5 +83,5 @@ def head_face(taxel_mm: FloatArray, *, pitch_mm: float, radius_mm: float, rim_mm
 
 
 def _squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
-    """How many squares beyond `half_mm` have their centres short of `reach_mm`."""
+    """Number of squares beyond `half_mm` whose centres are nearer than `reach_mm`."""
     return max(0, int(np.ceil((reach_mm - half_mm) / pitch_mm - 0.5 - 1e-9)))

@@ -1,4 +1,4 @@
-"""The instrument of a simulated scan, whatever it is pressed on: strokes, gains, noise, converter and tracker."""
+"""The simulated instrument: strokes, gains, noise, converter and tracker, for every forward model."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Depth = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedScan:
-    """A scan and what it was made from.
+    """A simulated scan with its truth.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class SimulatedScan:
 def record(
     scene: Scene, *, felt: Felt, truth: Mapping[str, Any], rng: np.random.Generator, depth: Depth | None = None
 ) -> SimulatedScan:
-    """Make the scan that the scene's instrument records of what its head feels.
+    """Simulate the recording of a scan from the pressures on the head.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def frame_times(scene: Scene) -> FloatArray:
 
 
 def _times(duration_s: float, rate_hz: float) -> FloatArray:
-    """Whole periods from 0, on exact nanoseconds as a scan file keeps them."""
+    """Multiples of a period from 0, rounded to whole nanoseconds as in a scan file."""
     k = np.arange(max(1, int(np.floor(duration_s * rate_hz + 1e-9))))
     return np.asarray(np.rint(k / rate_hz * 1e9) / 1e9, dtype=np.float64)
 
@@ -128,7 +128,7 @@ def head_positions(scene: Scene, time_s: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _stroke(strokes: Strokes, share: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Position (x, y) in mm after a share 0 to 1 of the scan: even speed on the line, rounded turns between lines."""
+    """Position (x, y) in mm after a share 0 to 1 of the scan: constant speed on lines, rounded turns between them."""
     u = np.clip(share, 0.0, 1.0) * strokes.lines
     soft = 0.97  # 1 would be a triangle wave with a jolt at each turn
     x = strokes.half_length_mm * np.arcsin(soft * np.sin(np.pi * (u - 0.5))) / np.arcsin(soft)
@@ -165,7 +165,7 @@ def _break(counts: CountArray, taxels: Taxels) -> None:
 
 
 def _calibration(scene: Scene, *, rng: np.random.Generator) -> tuple[FloatArray, ElementCalibration]:
-    """True gains, and the calibration a bladder would have found."""
+    """True gains, and the calibration that a bladder would give."""
     shape = (scene.head.rows, scene.head.columns)
     nominal = PRESSURE_RANGE_KPA[1] / FULL_SCALE_COUNT
     # Four standard deviations out, a gain could turn negative at the widest spread allowed.
@@ -202,7 +202,7 @@ def _landmarks(scene: Scene) -> Landmarks | None:
 
 
 def _truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
-    """What the scan was made from, as plain data; `model` adds what its tissue was, lumps first of all."""
+    """The truth of a scan as plain data; `model` adds the tissue, beginning with the lumps."""
     base_from_plane = scene.tracker.base_from_plane()
     landmarks = _landmarks(scene)
     patient_from_plane = None

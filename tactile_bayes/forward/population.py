@@ -18,7 +18,7 @@ FRAME_RATE_HZ = 100.0
 
 @dataclass(frozen=True, slots=True)
 class BodyPrior:
-    """Ranges that lumps and bodies are drawn from, independently; sizes, stiffnesses and moduli by their logarithm.
+    """Ranges of lumps and bodies, drawn independently; sizes, stiffnesses and moduli on the log scale.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class BodyPrior:
 
 @dataclass(frozen=True, slots=True)
 class ExamPrior:
-    """Ranges that an examiner's technique and the instrument's errors are drawn from, anew for each scan.
+    """Ranges of an examiner's technique and of the instrument's errors, drawn anew for each scan.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class ExamPrior:
 
 
 def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, SolidLump]:
-    """One body and its lump."""
+    """Draw one body and its lump."""
     d = _log_uniform(prior.d_mm, rng)
     ratio, seat = rng.uniform(*prior.depth_ratio), rng.uniform(*prior.seat)
     stiffness = _log_uniform(prior.stiffness_ratio, rng)
@@ -94,7 +94,7 @@ def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, So
 
 
 def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
-    """One examination of a body still to be named; lumps go to its middle shifted by `off_centre_mm`."""
+    """Draw one examination of a body; the lump lies in the middle, shifted by `off_centre_mm`."""
     lines = int(rng.integers(prior.lines[0], prior.lines[1] + 1))
     mean, drift = rng.uniform(*prior.mean_kpa), rng.uniform(*prior.drift_kpa)
     background = Background(mean_kpa=mean, drift_kpa=drift, drift_period_s=rng.uniform(1.5, 5.0))
@@ -125,7 +125,7 @@ def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
 
 
 def draw_mass(index: int, *, scans: int, seed: int, bodies: BodyPrior | None = None) -> list[Scene]:
-    """The scenes of one mass, examined several times; the same for one index and seed wherever it is drawn."""
+    """Draw the scenes of one mass, examined several times; they depend only on index and seed."""
     rng = np.random.default_rng([seed, index])
     body, lump = draw_body(bodies or BodyPrior(), rng)
     exam_prior = ExamPrior()
@@ -140,7 +140,7 @@ def draw_mass(index: int, *, scans: int, seed: int, bodies: BodyPrior | None = N
 
 
 def centred(bodies: BodyPrior) -> BodyPrior:
-    """The same with every lump's centre on the fat-gland boundary: the paper's own geometry."""
+    """Copy the prior with every lump's centre on the fat-gland boundary, as in the paper."""
     return replace(bodies, seat=(0.0, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""What a simulated scan is made from: lumps, strokes, head, noise and tracker, each checked where it is built.
+"""Input of a simulated scan: lumps, strokes, head, noise and tracker, each validated on creation.
 
 Frames: a scene has its own `plane` frame. Its origin is the centre of the strokes, x runs across the head (along the
 strokes), y along the head, z into the tissue. Lumps and landmarks are given in it; with landmarks, the `patient` frame
@@ -30,7 +30,7 @@ Taxel = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """Mean pressure under the head away from lumps, against time.
+    """Mean pressure under the head away from lumps, over time.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Lump:
 
 @dataclass(frozen=True, slots=True)
 class Strokes:
-    """Back and forth across the head, line after line along it.
+    """Path of the head: back and forth across, line after line along.
 
     Parameters
     ----------
@@ -133,13 +133,13 @@ class Head:
         return SHOULDERS_INSIDE if self.shoulder_mm > 0 else SHOULDERS_OUTSIDE
 
     def with_shoulders(self, shoulders: str) -> Head:
-        """The same head, its shoulders of the same radius where `shoulders`, one of `presets.HEADS`, says."""
+        """Copy of the head with its shoulders placed as `shoulders` says, one of `presets.HEADS`."""
         edge = self.section(shoulders).shoulder_mm
         inside = shoulders == SHOULDERS_INSIDE
         return replace(self, shoulder_mm=edge if inside else 0.0, rim_mm=0.0 if inside else edge)
 
     def section(self, shoulders: str) -> Section:
-        """The section across the head, with shoulders of this head's radius where `shoulders` says.
+        """Section across the head, with shoulders of this head's radius placed as `shoulders` says.
 
         Raises
         ------
@@ -152,7 +152,7 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations of everything random.
+    """Standard deviations of all random errors.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Tracker:
-    """Where the tracker's base stands and how its sensor sits in the handle.
+    """Place of the tracker's base, and the sensor's pose in the handle.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ class SceneLandmarks:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Everything `simulate` needs but the random numbers.
+    """All input of `simulate` except the random numbers.
 
     What lies below the skin is given either as Gaussian bumps (`lumps`) or as tissue (`body`, `solid_lumps`, `ribs`).
     """
@@ -243,7 +243,7 @@ class Scene:
     landmarks: SceneLandmarks = field(default_factory=SceneLandmarks)
 
     def __post_init__(self) -> None:
-        """The rules that join several values; single values are ranged by `scene.schema.json`."""
+        """Check the rules that involve several values; ranges of single values are in `scene.schema.json`."""
         for name in ("duration_s", "frame_rate_hz", "pose_rate_hz"):
             _above_zero(f"scene.{name}", getattr(self, name))
         for i, lump in enumerate(self.lumps):

@@ -1,4 +1,4 @@
-"""A scan with known truth: one of four models of what lies below the skin, felt by a moving, noisy, late instrument."""
+"""Simulation of a scan with known truth, by one of four forward models."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.instrument import SimulatedScan, head_positions, level_kpa, record
 from tactile_bayes.forward.scene import Scene, normalised_pressure
+from tactile_bayes.forward.truth import refuse_bumps
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import SHOULDERS_INSIDE
 
@@ -61,7 +62,7 @@ def simulate(
                 "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
                 way_out="leave --head out, or choose another --fidelity",
             )
-        # In two dimensions that is what the section is without a word, and the scan has the scene's own head.
+        # In two dimensions that is the section's default, and the scan has the scene's own head.
         if chosen == "solid" or head != SHOULDERS_INSIDE:
             scene = replace(scene, head=scene.head.with_shoulders(head))
     if chosen == "solid":
@@ -73,11 +74,76 @@ def simulate(
 
         return simulate_plane(scene, rng=rng, fidelity=chosen, shoulders=head or SHOULDERS_INSIDE, progress=progress)
     if scene.solid_lumps or scene.ribs:
-        named = "lump[0] gives depth_ratio and no amplitude" if scene.solid_lumps else "rib[0] is of tissue"
-        raise BadDataError(
-            named, way_out="use --fidelity solid, or describe the bump with amplitude, sigma_x_mm and sigma_y_mm"
-        )
+        raise _tissue_for_bumps(scene)
     return _simulate_gaussian(scene, rng=rng)
+
+
+def _tissue_for_bumps(scene: Scene) -> BadDataError:
+    named = "lump[0] gives depth_ratio and no amplitude" if scene.solid_lumps else "rib[0] is of tissue"
+    return BadDataError(
+        named, way_out="use --fidelity solid, or describe the bump with amplitude, sigma_x_mm and sigma_y_mm"
+    )
+
+
+def felt_at_poses(
+    scene: Scene,
+    rotation: FloatArray,
+    origin_mm: FloatArray,
+    *,
+    mean_kpa: FloatArray,
+    fidelity: str | None = None,
+    head: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> FloatArray:
+    """What a model's head feels at given poses and mean pressures, without any noise.
+
+    Parameters
+    ----------
+    scene
+        Tissue and head are used; strokes, noise and tracker are not.
+    rotation : (n, 3, 3) array
+        From `scanhead` to the scene's `plane`.
+    origin_mm : (n, 3) array
+        Origin of the head's face in the scene's `plane`.
+    mean_kpa : (n,) array
+        Mean over the taxels of each frame.
+    fidelity, head, progress
+        As in `simulate`.
+
+    Returns
+    -------
+    (n, rows, columns) array of kPa
+
+    Raises
+    ------
+    BadDataError
+        When the model cannot make this scene.
+    """
+    chosen = scene.fidelity if fidelity is None else fidelity
+    if chosen not in FIDELITIES:
+        raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
+    if chosen == "empirical-gaussian":
+        if scene.solid_lumps or scene.ribs:
+            raise _tissue_for_bumps(scene)
+        return _gaussian_frames(scene, rotation, origin_mm, mean_kpa, share_load=True)
+    refuse_bumps(scene, chosen)
+    if head is not None and (chosen == "solid" or head != SHOULDERS_INSIDE):
+        scene = replace(scene, head=scene.head.with_shoulders(head))
+    if chosen == "solid":
+        from tactile_bayes.forward.solid.scan import frames_at_poses
+
+        return frames_at_poses(scene, rotation, origin_mm, mean_kpa=mean_kpa, progress=progress)[0]
+    from tactile_bayes.forward.plane.scan import frames_at_poses as plane_frames_at_poses
+
+    return plane_frames_at_poses(
+        scene,
+        rotation,
+        origin_mm,
+        mean_kpa=mean_kpa,
+        fidelity=chosen,
+        shoulders=head or SHOULDERS_INSIDE,
+        progress=progress,
+    )
 
 
 def _simulate_gaussian(scene: Scene, *, rng: np.random.Generator) -> SimulatedScan:
@@ -92,10 +158,18 @@ def _simulate_gaussian(scene: Scene, *, rng: np.random.Generator) -> SimulatedSc
 def _pressure(scene: Scene, time_s: FloatArray) -> FloatArray:
     """(n, rows, columns) kPa at (n,) times."""
     rotation, origin = head_positions(scene, time_s)
+    level = level_kpa(scene.background, time_s)
+    return _gaussian_frames(scene, rotation, origin, level, share_load=scene.background.load_sharing)
+
+
+def _gaussian_frames(
+    scene: Scene, rotation: FloatArray, origin_mm: FloatArray, level: FloatArray, *, share_load: bool
+) -> FloatArray:
+    """(n, rows, columns) kPa of bumps; with `share_load` the frame's mean is the level, without it the background."""
     surface = scene.head.surface_mm()
     # Only x and y of the plane are needed: the first two rows of each pose.
-    xy = np.einsum("nij,rcj->nirc", rotation[:, :2], surface) + origin[:, :2, None, None]
+    xy = np.einsum("nij,rcj->nirc", rotation[:, :2], surface) + origin_mm[:, :2, None, None]
     shape = normalised_pressure(scene.lumps, xy[:, 0], xy[:, 1])
-    if scene.background.load_sharing:
+    if share_load:
         shape /= shape.mean(axis=(1, 2), keepdims=True)
-    return np.asarray(level_kpa(scene.background, time_s)[:, None, None] * shape)
+    return np.asarray(level[:, None, None] * shape)

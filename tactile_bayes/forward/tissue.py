@@ -1,4 +1,4 @@
-"""Lumps of tissue in a body of tissue, as a scene gives them: sizes, depths and stiffness instead of a bump's shape."""
+"""Lumps of tissue in a body, as a scene gives them: sizes, depths and stiffness instead of a bump's shape."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, THICKNESS_MM
 
-# A scene without lumps and without a word on its fat has this much of it.
+# Default thickness of the fat in a scene without lumps.
 PLAIN_FAT_MM = 15.0
 # Fat thicknesses that lumps imply may differ by this before they are called different.
 _SAME_MM = 0.01
@@ -130,7 +130,7 @@ MOST_BALLS = 60
 
 
 def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:
-    """Depth of the boundary between fat and gland that the scene means, checked against every lump.
+    """Depth of the fat-gland boundary in the scene, checked against every lump.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:
 
 
 def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib] = ()) -> None:
-    """Refuse what cannot be, naming the key, its value and the allowed range.
+    """Raise an error for an impossible body, naming the key, its value and the allowed range.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a simulated scan of tissue records as its truth."""
+"""Truth of a simulated scan of tissue."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tactile_bayes.forward.tissue import SceneBody, SolidLump, fat_thickness
 
 
 def tissue_truth(scene: Scene) -> dict[str, Any]:
-    """What lies below the skin, as plain data; the balls of a rib are no lumps."""
+    """The body and its lumps as plain data; the balls of a rib do not count as lumps."""
     body = scene.body or SceneBody()
     fat = fat_thickness(body, scene.solid_lumps)
     return {
@@ -23,7 +23,7 @@ def tissue_truth(scene: Scene) -> dict[str, Any]:
 
 
 def refuse_bumps(scene: Scene, model: str) -> None:
-    """Raise BadDataError where the scene's lumps are no tissue, which `model` needs."""
+    """Raise BadDataError where a scene gives bumps to a `model` that needs tissue."""
     if scene.lumps:
         raise BadDataError(
             "lump[0] gives no depth_ratio",

@@ -16,7 +16,7 @@ _STUCK_POSES: Final = 10
 
 @dataclass(slots=True)
 class Report:
-    """The account of a recording, in records unless it says bytes."""
+    """The account of a recording; numbers are of records unless the name says bytes."""
 
     frames: int = 0
     frames_lost: int = 0
@@ -43,12 +43,12 @@ class Report:
 
     @property
     def duration_s(self) -> float:
-        """By the head's clock made continuous, from the first frame to the last."""
+        """Time from the first frame to the last by the head's clock, made continuous."""
         return (self.last_ns - self.first_ns) / 1e9
 
 
 def recording_cautions(report: Report, frames: Span, poses: Span, *, passed_s: float, rate_hz: float) -> list[str]:
-    """What to know before a recording is used, one line each.
+    """Cautions before a recording is used, one line each.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def recording_cautions(report: Report, frames: Span, poses: Span, *, passed_s: f
 
 
 def _rates(report: Report, passed_s: float, rate_hz: float) -> Iterator[str]:
-    """The head's clock against the host's, and its frames against its promise."""
+    """Compare the head's clock with the host's, and its frame rate with the promised one."""
     told_s = report.duration_s
     if abs(told_s - passed_s) > max(_RATE_LEAST_S, _RATE_SHARE * passed_s):
         yield f"the head's clock ran {told_s:.1f} s while {passed_s:.1f} s passed on this computer"
@@ -78,7 +78,7 @@ def _rates(report: Report, passed_s: float, rate_hz: float) -> Iterator[str]:
 
 
 def _counters(report: Report) -> Iterator[str]:
-    """How often a clock or a counter did not go on as it should."""
+    """Count the jumps of clocks and sequence counters."""
     for role, steps in (("head", report.head_clock_steps), ("tracker", report.tracker_clock_steps)):
         if steps:
             yield f"the {role}'s clock stepped {_times(steps)}; this computer's clock was used instead"

@@ -1,4 +1,4 @@
-"""Ascension Flock of Birds and miniBIRD, position and quaternion: records to poses.
+"""Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
 
 A record is seven words of 14 bits, each sent as two bytes of seven; bit 7 marks the first byte of a record and no
 other, so that a lost byte costs one record.
@@ -17,7 +17,7 @@ _WORDS: Final = 7
 
 
 class BirdParser(RecordParser):
-    """Flock of Birds records.
+    """Parser of Flock of Birds records.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class BirdParser(RecordParser):
 
 
 def word(low: int, high: int) -> int:
-    """A signed word from its two bytes of seven bits; its two lowest bits are not sent."""
+    """Decode a signed word from its two bytes of seven bits; the two lowest bits are not sent."""
     number = (low & 0x7F) << 2 | (high & 0x7F) << 9
     return number - 65536 if number & 0x8000 else number
 
@@ -53,7 +53,7 @@ def word(low: int, high: int) -> int:
 def record_bytes(
     position_inch: Sequence[float], quaternion_wxyz: Sequence[float], *, scale_inch: float = SCALE_INCH
 ) -> bytes:
-    """The record of a pose, as the device would send it: truncated to 14 bits."""
+    """Encode a pose as the device would: truncated to 14 bits."""
     scaled = [value / scale_inch * 32768 for value in position_inch] + [value * 32768 for value in quaternion_wxyz]
     out = bytearray()
     for value in scaled:

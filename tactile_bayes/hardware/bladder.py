@@ -1,4 +1,4 @@
-"""Calibrate an array from a pressure bladder: steps of known, uniform pressure to a gain and an offset a taxel."""
+"""Calibration of an array by a pressure bladder: steps of uniform pressure give each taxel's gain and offset."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEPS_FOR_CURVATURE: Final = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BladderStep:
-    """The array under one known pressure.
+    """Mean counts of the array under one known pressure.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class BladderStep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayFit:
-    """What the steps say about each taxel.
+    """The fit of each taxel.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class ArrayFit:
 
 
 def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFit:
-    """Least-squares line (and parabola) of pressure on counts for each taxel.
+    """Fit a line (and a parabola) of pressure on counts for each taxel by least squares.
 
     Steps at which a taxel is saturated are left out for it.
 
@@ -129,7 +129,7 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
 def _odd_taxels(
     pressure: FloatArray, counts: FloatArray, valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Taxels that are dead and taxels that are hot, by how much their counts rise."""
+    """Dead taxels and hot taxels, by the rise of their counts."""
     weight = valid.astype(np.float64)
     number = np.maximum(weight.sum(axis=0), 1)
     x = pressure[:, None, None] - (weight * pressure[:, None, None]).sum(axis=0) / number

@@ -1,4 +1,4 @@
-"""Device times that never run backwards, and the tracker's brought onto the head's clock."""
+"""Continuous device times, and the tracker's times on the head's clock."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WRAPS_NS: Final = tuple(
 
 
 class ArrivalClock:
-    """How far a device's clock is from the host's, from when its records arrive.
+    """Offset of a device's clock from the host's, estimated from the arrival of its records.
 
     A record arrives at ``device time + offset + delay`` with a delay that is never negative: the least difference of
     the last seconds is the offset, and the rest is delay. It follows clocks that drift apart.
@@ -39,7 +39,7 @@ class ArrivalClock:
 
     @property
     def known(self) -> bool:
-        """Whether anything has arrived."""
+        """Whether any record has arrived."""
         return self._begun_ns is not None
 
     @property
@@ -48,7 +48,7 @@ class ArrivalClock:
         return min(self._last, self._now)
 
     def observe(self, device_ns: int, host_ns: int) -> None:
-        """Take one record's times."""
+        """Add one record's times."""
         difference = host_ns - device_ns
         if self._begun_ns is None:
             self._begun_ns, self._last, self._now = host_ns, difference, difference
@@ -59,7 +59,7 @@ class ArrivalClock:
 
 
 class Moment(NamedTuple):
-    """When a record was measured.
+    """Time at which a record was measured.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Moment(NamedTuple):
 
 
 class DeviceClock:
-    """Time stamps of one device as one continuous time, whatever its counter does.
+    """Continuous time from one device's time stamps, through wraps and restarts of its counter.
 
     A counter that wraps is unwrapped when its period is one of `WRAPS_NS` and agrees with the host's clock. Any other
     step, back or forward, is replaced by the time that passed on the host since, by `ArrivalClock`; from there the
@@ -98,7 +98,7 @@ class DeviceClock:
         self._host_ns = self._moved_ns = self._last_ns = 0
 
     def read(self, raw_ns: int, host_ns: int) -> Moment:
-        """The time of a record that says `raw_ns` and arrived at `host_ns`."""
+        """Time of a record stamped `raw_ns` that arrived at `host_ns`."""
         moment = self._first(raw_ns) if self._raw_ns is None else self._next(raw_ns, host_ns, self._raw_ns)
         if self._raw_ns is None or moment.time_ns > self._last_ns:
             self._moved_ns = host_ns
@@ -149,7 +149,7 @@ class DeviceClock:
 
 
 def wrap_period(before_ns: int, after_ns: int, *, passed_ns: int) -> int | None:
-    """The period of `WRAPS_NS` after which a counter started again, if one agrees with the time that has passed."""
+    """Period of `WRAPS_NS` that explains a counter's restart by the time passed, if any."""
     for period_ns in WRAPS_NS:
         if before_ns < period_ns and abs(after_ns + period_ns - before_ns - passed_ns) < _SLIP_NS:
             return period_ns
@@ -174,7 +174,7 @@ class PoseClock:
         self._last_ns = 0
 
     def place(self, device_ns: int | None, host_ns: int) -> Moment | None:
-        """Head time of a pose, None before the first frame has come, or when it would lie before the head's zero."""
+        """Time of a pose on the head's clock; None before the first frame, or when it would be negative."""
         if self._shared:
             return None if device_ns is None else self._in_order(self.tracker.read(device_ns, host_ns))
         if not self.head.arrival.known:

@@ -47,7 +47,7 @@ def _bytewise(data: bytes) -> int:
 
 
 def _folded(data: bytes) -> int:
-    """The same, in numpy; zeros in front of a message do not change its CRC."""
+    """As `crc64`, in numpy; leading zeros do not change a CRC."""
     levels = max(0, (-(-len(data) // 8) - 1).bit_length())
     whole = data.rjust(8 << levels, b"\0")
     words = np.frombuffer(whole, dtype=">u8").astype(np.uint64)

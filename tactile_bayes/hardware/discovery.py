@@ -1,4 +1,4 @@
-"""Which serial ports there are, and what may be on them."""
+"""Detection of serial ports and of the devices on them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ADAPTERS: Final = {0x0403: "FTDI", 0x10C4: "Silicon Labs", 0x067B: "Prolific", 
 
 
 class FoundPort(NamedTuple):
-    """One port: its URL, what the system calls it, what may be on it."""
+    """A port: its URL, the system's description, the device probably on it."""
 
     url: str
     description: str
@@ -32,7 +32,7 @@ class FoundPort(NamedTuple):
 
 
 def list_ports() -> list[FoundPort]:
-    """The ports that the system knows, in order, with a guess from their USB ids; nothing is opened."""
+    """List the system's ports, in order, with a guess from their USB ids; opens none of them."""
     from serial.tools.list_ports import comports
 
     found = [FoundPort(port.device, port.description or "", guess(port.vid, port.product or "")) for port in comports()]
@@ -40,7 +40,7 @@ def list_ports() -> list[FoundPort]:
 
 
 def guess(vendor: int | None, product: str) -> str:
-    """What may be on a port, from its USB vendor and what the product calls itself."""
+    """Guess the device on a port from its USB vendor and product name."""
     if vendor in _TRACKER_MAKERS:
         return f"tracker ({_TRACKER_MAKERS[vendor]})"
     if vendor in _CONTROLLERS or "head" in product.lower():
@@ -51,7 +51,7 @@ def guess(vendor: int | None, product: str) -> str:
 
 
 def probe(url: str) -> str:
-    """Ask what is on a port, in each protocol in turn; this writes to it.
+    """Identify the device on a port by trying each protocol; this writes to the port.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How to talk to each device: what sets it up, what starts and stops it, and how to tell that it is there."""
+"""Drivers of the devices: setup, start, stop and identification."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ASK_AGAIN_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class TrackerDriver:
-    """One tracker protocol.
+    """Commands of one tracker protocol.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
 
 
 def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path | None = None) -> Port:
-    """The port of a tracker.
+    """Open the port of a tracker.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def open_tracker(protocol: str, url: str, *, baud: int | None = None, rom: Path 
 
 
 def check_head(port: Port, *, every: int = 1) -> HelloReading:
-    """Ask a head who it is, and refuse a line that is too slow for it.
+    """Ask a head for its identity, and refuse a line too slow for its frames.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Emulated devices: a scan's frames and poses as the bytes of a head or a tracker, faults on request.
+"""Emulated devices: a scan's frames and poses as a head or a tracker sends them, with faults on request.
 
 They are devices like any other: nothing in the recorder knows of them.
 """
@@ -28,7 +28,7 @@ _SETTING: Final = re.compile(rb"[A-Za-z][0-9*,][^\r]*\r")
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What an emulated device does wrong.
+    """Faults of an emulated device.
 
     Parameters
     ----------
@@ -49,11 +49,11 @@ class Faults:
     hold: int = 1
 
     def stalls(self, time_s: float) -> bool:
-        """Whether nothing is sent at a time of the scan."""
+        """Whether the device sends nothing at a time of the scan."""
         return self.stall is not None and self.stall[0] <= time_s < self.stall[0] + self.stall[1]
 
     def disturb(self, record: bytes, rng: np.random.Generator) -> bytes:
-        """The record as it is sent: as it is, with one bit changed, or not at all."""
+        """Apply the faults to a record: unchanged, one bit changed, or dropped."""
         if self.drop and rng.random() < self.drop:
             return b""
         if not self.corrupt or rng.random() >= self.corrupt:
@@ -65,63 +65,63 @@ class Faults:
 
 
 class Device(Protocol):
-    """An emulated device: commands in, answers out, and records at their times."""
+    """Interface of an emulated device: it answers commands and sends records at their times."""
 
     @property
     def times_s(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        """When each record is due after the start, never falling."""
+        """Times of the records after the start, never falling."""
 
     @property
     def streaming(self) -> bool:
-        """Whether it sends, or will when the scan begins."""
+        """Whether the device sends, or will when the scan begins."""
 
     @property
     def starts(self) -> int:
-        """How often it was told to send; each time is a new beginning."""
+        """Number of START commands so far; each begins the scan anew."""
 
     @property
     def stopped(self) -> bool:
-        """Whether the host was the last to say something about sending, and said stop."""
+        """Whether the host's last command about sending was STOP."""
 
     @property
     def said_end(self) -> bool:
-        """Whether its protocol tells the host that it has sent everything, and it did."""
+        """Whether the device has told the host that everything was sent, as some protocols do."""
 
     def greet(self) -> None:
-        """A host has connected."""
+        """React to a new connection."""
 
     def hear(self, data: bytes) -> bytes:
-        """Take commands; the answer."""
+        """Process commands and return the answer."""
 
     def record(self, index: int) -> bytes:
-        """The bytes of one record; empty for one that this device leaves out."""
+        """Bytes of one record; empty for a record left out."""
 
     def end(self, sent: int, dropped: int) -> bytes:
-        """What it says after its last record; it does not stream from then on."""
+        """Last message, after which the device no longer streams."""
 
 
 class _Sender:
-    """What every device that streams remembers of its commands."""
+    """State of a streaming device: started or stopped."""
 
     def __init__(self) -> None:
         self.starts = 0
         self.streaming = self.stopped = self.said_end = False
 
     def start(self) -> None:
-        """The host wants records."""
+        """Begin to send."""
         self.starts += 1
         self.streaming, self.stopped, self.said_end = True, False, False
 
     def stop(self) -> None:
-        """The host wants none."""
+        """Stop sending."""
         self.streaming, self.stopped = False, True
 
     def greet(self) -> None:
-        """Most devices wait for a command."""
+        """Do nothing: most devices wait for a command."""
 
 
 class EmulatedHead(_Sender):
-    """A head in the open framing.
+    """An emulated head in the open framing.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class EmulatedHead(_Sender):
         self._commands = PacketParser()
 
     def hello(self) -> HelloReading:
-        """Who it says it is: the scan's head and array."""
+        """Identity of the scan's head and array."""
         steps = np.diff(self.times_s)
         rate = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else 0.0
         saturation = self._scan.element_calibration.saturation_count
@@ -145,7 +145,7 @@ class EmulatedHead(_Sender):
         return HelloReading(name, *self._scan.head.shape, saturation, rate)
 
     def hear(self, data: bytes) -> bytes:
-        """ASK, START and STOP."""
+        """Process ASK, START and STOP."""
         answer = b""
         for packet in self._commands.feed(data):
             if packet.kind == head.ASK:
@@ -159,20 +159,20 @@ class EmulatedHead(_Sender):
         return answer
 
     def record(self, index: int) -> bytes:
-        """A FRAME."""
+        """Encode a FRAME."""
         if index % self._every:
             return b""
         device_us = round(self.times_s[index] * 1e6)
         return head.encode_frame(self._scan.frames.counts[index], sequence=index, device_us=device_us)
 
     def end(self, sent: int, dropped: int) -> bytes:
-        """An END."""
+        """Encode an END."""
         self.streaming, self.said_end = False, True
         return head.encode_end(sent, dropped)
 
 
 class EmulatedTracker(_Sender):
-    """A tracker of one of the makers, or in the open framing.
+    """An emulated tracker of a maker's protocol, or in the open framing.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class EmulatedTracker(_Sender):
         self._encode = PROTOCOLS[protocol]
 
     def pose(self, index: int) -> PoseReading:
-        """The pose that is sent as the n-th: with its own time, but measured when one was last measured."""
+        """The n-th pose sent: at its own time, with the values of the latest measurement."""
         measured = index - index % self._hold
         x, y, z = (float(value) for value in self._poses.position_mm[measured])
         w, i, j, k = (float(value) for value in self._poses.quaternion_wxyz[measured])
@@ -203,12 +203,12 @@ class EmulatedTracker(_Sender):
         return PoseReading((x, y, z), (w, i, j, k), whole * _NS + round((time_s - whole) * _NS))
 
     def greet(self) -> None:
-        """An OpenIGTLink server sends to whoever connects."""
+        """Start sending in OpenIGTLink, whose servers send to whoever connects."""
         if self._protocol == "igtlink":
             self.start()
 
     def hear(self, data: bytes) -> bytes:
-        """Start, stop, and one record when asked; settings are taken for granted."""
+        """Process start, stop and requests for one record; settings are ignored."""
         if self._protocol == "open":
             return self._hear_open(data)
         answer = b""
@@ -234,11 +234,11 @@ class EmulatedTracker(_Sender):
         return answer
 
     def record(self, index: int) -> bytes:
-        """One record of the protocol."""
+        """Encode one record of the protocol."""
         return self._encode(self.pose(index), index)
 
     def end(self, sent: int, dropped: int) -> bytes:
-        """An END in the open framing; trackers say nothing."""
+        """Encode an END in the open framing; other protocols have none."""
         self.streaming, self.said_end = False, self._protocol == "open"
         return head.encode_end(sent, dropped) if self.said_end else b""
 

@@ -1,4 +1,4 @@
-"""An emulated NDI tracker: the commands of the combined API that a host needs to follow one tool, and their answers.
+"""Emulated NDI tracker: the commands of the combined API that a host needs to follow one tool.
 
 A command is ``NAME:arguments`` and a CRC-16 in hexadecimal, or ``NAME arguments`` without, and a carriage return; so is
 an answer. ``BX`` is answered in binary. References: NDI Combined API guide; CRC-16/ARC.
@@ -35,7 +35,7 @@ def crc16(data: bytes) -> int:
 
 
 class EmulatedNdi:
-    """A tracker that shows each pose from its time on, counted from TSTART; a `Device` that streams nothing by itself.
+    """NDI tracker that answers with the pose of the present time, counted from TSTART; it never sends unasked.
 
     Parameters
     ----------
@@ -72,21 +72,21 @@ class EmulatedNdi:
         self._rest = b""
 
     def hear(self, data: bytes) -> bytes:
-        """Take commands; the answers."""
+        """Process commands and return the answers."""
         *lines, rest = (self._rest + data).split(b"\r")
         self._rest = rest[-_LONGEST:]
         return b"".join(self._answer(line) for line in lines)
 
     def greet(self) -> None:
-        """Nothing is said to a host that connects."""
+        """Do nothing on a connection."""
 
     def record(self, index: int) -> bytes:
-        """Nothing comes unasked."""
+        """Return nothing: records are sent on request only."""
         del index
         return b""
 
     def end(self, sent: int, dropped: int) -> bytes:
-        """Nor does a farewell."""
+        """Return nothing: there is no last message."""
         del sent, dropped
         return b""
 
@@ -105,7 +105,7 @@ class EmulatedNdi:
         return _text(f"ERROR{_UNKNOWN:02X}" if done is None else done)
 
     def _do(self, name: str, rest: str) -> str | None:
-        """What a command answers; None for one that is not known."""
+        """Answer to one command; None for an unknown one."""
         match name:
             case "INIT" | "COMM" | "TSTOP":
                 self._begun = None if name != "COMM" else self._begun

@@ -1,4 +1,4 @@
-"""Serve emulated devices over pseudo-terminals or TCP, at the scan's own rate."""
+"""Serving of emulated devices over pseudo-terminals or TCP, at the scan's own rate."""
 
 from __future__ import annotations
 
@@ -33,29 +33,29 @@ LINGER_S: Final = 5.0
 
 
 class Link(Protocol):
-    """The device's end of a line."""
+    """Interface of the device's end of a connection."""
 
     @property
     def url(self) -> str:
-        """What a host opens."""
+        """URL for the host to open."""
 
     def fileno(self) -> int:
-        """To wait on; for reading it is ready when a command or a caller has come."""
+        """File descriptor to wait on; ready for reading when a command or a connection has come."""
 
     def connected(self) -> bool:
-        """Whether anybody may be listening."""
+        """Whether a host may be listening."""
 
     def read(self) -> bytes:
-        """Bytes from the host, or nothing."""
+        """Read bytes from the host; empty when none have come."""
 
     def write(self, data: bytes) -> int:
-        """Send what fits; how many bytes that was."""
+        """Send as much as fits; return the number of bytes."""
 
     def finish(self, patience_s: float) -> None:
         """Wait until the host has read everything, then close."""
 
     def close(self) -> None:
-        """Pull the cable."""
+        """Close the connection at once."""
 
 
 class PtyLink:
@@ -68,29 +68,29 @@ class PtyLink:
         self.url = os.ttyname(self._far)
 
     def fileno(self) -> int:
-        """The device's end."""
+        """File descriptor of the device's end."""
         return self._near
 
     def connected(self) -> bool:
-        """A terminal does not tell."""
+        """Return True: a pseudo-terminal does not show whether it is open."""
         return True
 
     def read(self) -> bytes:
-        """Bytes from the host."""
+        """Read bytes from the host."""
         try:
             return os.read(self._near, _READ)
         except BlockingIOError:
             return b""
 
     def write(self, data: bytes) -> int:
-        """Into the terminal's buffer, as far as it has room."""
+        """Write into the terminal's buffer as much as fits."""
         try:
             return os.write(self._near, data)
         except BlockingIOError:
             return 0
 
     def finish(self, patience_s: float) -> None:
-        """Wait until nothing is left in the terminal's buffers, which go with the terminal.
+        """Wait until the terminal's buffers are empty, because they are lost when it closes.
 
         Only the last of them says how much it holds, so it must have been empty for a while.
         """
@@ -102,13 +102,13 @@ class PtyLink:
         self.close()
 
     def close(self) -> None:
-        """Both ends go: the host sees the end of the device."""
+        """Close both ends, so that the host sees the device disappear."""
         os.close(self._near)
         os.close(self._far)
 
 
 class TcpLink:
-    """A listening socket that takes one host at a time."""
+    """A listening socket that accepts one host at a time."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -121,15 +121,15 @@ class TcpLink:
         self.url = f"socket://{name}:{number}"
 
     def fileno(self) -> int:
-        """The host's socket, or the listener's while nobody is there."""
+        """File descriptor of the host's socket, or of the listener without a host."""
         return (self._host or self._listener).fileno()
 
     def connected(self) -> bool:
-        """Whether a host is there."""
+        """Whether a host is connected."""
         return self._host is not None
 
     def read(self) -> bytes:
-        """Bytes from the host; takes a new host when there is none."""
+        """Read bytes from the host; accepts a new host when there is none."""
         if self._host is None:
             self._host, _ = self._listener.accept()
             self._host.setblocking(False)
@@ -147,7 +147,7 @@ class TcpLink:
         return data
 
     def write(self, data: bytes) -> int:
-        """Into the socket's buffer, as far as it has room."""
+        """Write into the socket's buffer as much as fits."""
         if self._host is None:
             return len(data)
         try:
@@ -158,7 +158,7 @@ class TcpLink:
             return len(data)
 
     def finish(self, patience_s: float) -> None:
-        """Say that nothing more comes, and hear the host out: closing on unread bytes loses what is on its way."""
+        """End the sending side and read the rest: closing with unread bytes loses what is still on its way."""
         if self._host is not None:
             with contextlib.suppress(OSError):
                 self._host.shutdown(socket.SHUT_WR)
@@ -176,7 +176,7 @@ class TcpLink:
 
 @dataclass(slots=True)
 class Served:
-    """What was sent, in records."""
+    """Numbers of records sent, dropped and changed by faults."""
 
     sent: int = 0
     dropped: int = 0
@@ -184,7 +184,7 @@ class Served:
 
 
 class Stage:
-    """When a scan is played, for all devices that play it together: real devices share the time they measure in.
+    """Clock of a scan being played, shared by all devices that play it together.
 
     Parameters
     ----------
@@ -199,25 +199,25 @@ class Stage:
         self._begun: tuple[int, float | None] = (0, None)  # one value: devices look from threads of their own
 
     def begin(self) -> None:
-        """Play from the start, now."""
+        """Start playing from the beginning."""
         self._begun = (self._begun[0] + 1, self._clock())
 
     def end(self) -> None:
-        """Go back to the start and wait."""
+        """Return to the beginning and wait."""
         self._begun = (self._begun[0], None)
 
     def now(self) -> tuple[int, float | None]:
-        """How often the scan was begun, and s of the scan since; None while it waits."""
+        """Number of starts, and time of the scan in s since the last; None while waiting."""
         number, begun = self._begun
         return number, None if begun is None else (self._clock() - begun) * self._speed
 
     def wait_s(self, scan_s: float) -> float:
-        """Seconds that so much of the scan takes."""
+        """Seconds that a stretch of the scan takes to play."""
         return scan_s / self._speed
 
 
 class Emulator:
-    """Runs a device on a link.
+    """Runs an emulated device on a link.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ class Emulator:
         self.unplugged = False
 
     def run(self, *, once: bool = False) -> Served:
-        """Serve until the cable is pulled, or, with `once`, until a scan has been sent and read."""
+        """Serve until the link breaks, or, with `once`, until a scan has been sent and read."""
         while not self.unplugged:
             self._step()
             if once and self._finished_at and self._left_alone():
@@ -262,7 +262,7 @@ class Emulator:
         return self.served
 
     def _step(self) -> None:
-        """Wait for what comes first, and deal with it."""
+        """Wait for the next event and handle it."""
         writable = [self._link] if self._waiting else []
         readable, _, _ = select.select([self._link], writable, [], self._patience_s())
         if readable:
@@ -279,7 +279,7 @@ class Emulator:
         self._pass_on()
 
     def _left_alone(self) -> bool:
-        """Whether the host has what it needs: the device's own END or the host's STOP, or enough time for it."""
+        """Whether the host is done: the device's END, the host's STOP, or time enough has passed."""
         if self._waiting:
             return False
         return self._device.said_end or self._device.stopped or time.monotonic() - self._finished_at > LINGER_S
@@ -306,7 +306,7 @@ class Emulator:
             self._waiting.clear()
 
     def _follow_commands(self) -> None:
-        """Each START begins anew, also while the device streams; a device that leads takes the others with it."""
+        """Begin anew at each START, also while streaming; a device that leads starts the others too."""
         if self._device.starts != self._starts:
             self._starts, self._held_at, self._held = self._device.starts, time.monotonic(), False
             if self._leads:
@@ -315,7 +315,7 @@ class Emulator:
             self._stage.end()
 
     def _hold_still(self) -> None:
-        """Repeat the first record now and then; not just after a START, when the scan is about to begin."""
+        """Repeat the first record now and then; not right after a START, when the scan is about to begin."""
         if time.monotonic() - self._held_at > (_HOLD_S if self._held else _SETTLE_S):
             self._held_at, self._held = time.monotonic(), True
             self._waiting += self._device.record(0)

@@ -1,4 +1,4 @@
-"""What a recording shows to its live view: through a pipe that never makes the recorder wait.
+"""Feed of a recording to its live view, through a pipe on which the recorder never waits.
 
 A message is ``kind u8, length u32, payload``; one that does not fit is left out, and the view misses it while the file
 does not.
@@ -35,7 +35,7 @@ _POINT: Final = struct.Struct("<3d")
 
 
 class SeenFrame(NamedTuple):
-    """One frame with the device's time and the host's when it was recorded."""
+    """One frame, with the device's and the host's time of its recording."""
 
     counts: CountArray
     device_ns: int
@@ -61,7 +61,7 @@ Seen = SeenFrame | SeenPose | SeenLandmark | dict[str, Any]
 
 
 class Feed:
-    """The recorder's end; an `Observer`.
+    """The recorder's end of the feed; an `Observer`.
 
     Parameters
     ----------
@@ -77,20 +77,20 @@ class Feed:
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
     def frame(self, counts: CountArray, device_ns: int) -> None:
-        """A frame was recorded."""
+        """Send a recorded frame."""
         times = _TIMES.pack(device_ns, time.monotonic_ns())
         self._send(FRAME, times + struct.pack("<BB", *counts.shape) + counts.astype("<u2").tobytes())
 
     def pose(self, pose: PoseReading, device_ns: int) -> None:
-        """A pose was recorded."""
+        """Send a recorded pose."""
         self._send(POSE, _POSE.pack(device_ns, *pose.position_mm, *pose.quaternion_wxyz))
 
     def landmark(self, name: str, position_mm: FloatArray) -> None:
-        """A landmark was touched, or is known from a file."""
+        """Send a landmark, touched or read from a file."""
         self._send(LANDMARK, _POINT.pack(*position_mm.tolist()) + name.encode())
 
     def told(self, report: Report) -> None:
-        """The account so far."""
+        """Send the account so far."""
         self._send(REPORT, json.dumps(asdict(report)).encode()[: select.PIPE_BUF - _HEADER.size])
 
     def _send(self, kind: int, payload: bytes) -> None:
@@ -106,12 +106,12 @@ class Feed:
             self.missed += 1  # the view was closed; the recording goes on
 
     def close(self) -> None:
-        """The view ends when it has seen what is in the pipe."""
+        """Close the feed; the view ends after reading the rest of the pipe."""
         os.close(self._pipe)
 
 
 class FeedReader:
-    """The view's end.
+    """The live view's end of the feed.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ class FeedReader:
         os.set_blocking(pipe, False)
 
     def read(self, wait_s: float) -> list[Seen]:
-        """What has come after so long; sets `ended` when the recorder has gone.
+        """Read what comes within a time; sets `ended` when the recorder has gone.
 
         It does not return with the first message: taken one by one, frames cost eight times as much.
         """

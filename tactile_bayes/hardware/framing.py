@@ -1,4 +1,4 @@
-"""The open framing of scan heads: COBS between zero bytes, version, type, sequence, device time and a checksum.
+"""The open framing of scan heads: COBS between zero bytes, version, type, sequence, device time, checksum.
 
 A packet is ``version u8, type u8, sequence u32, device time u64 in microseconds, payload, CRC-32 u32``, little-endian.
 On the wire it is COBS-encoded, with a zero byte before and after it, so that a damaged delimiter costs nothing more
@@ -23,7 +23,7 @@ _LONGEST: Final = MAX_PACKET_BYTES + MAX_PACKET_BYTES // 254 + 1
 
 
 class Packet(NamedTuple):
-    """One packet, checked.
+    """One valid packet.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(data: bytes) -> bytes | None:
-    """Undo `cobs_encode`; None when the codes do not end where the data does.
+    """Undo `cobs_encode`; None for an invalid code.
 
     A code byte stands where a zero was, so most of the work is to put the zeros back in place.
     """
@@ -88,7 +88,7 @@ def cobs_decode(data: bytes) -> bytes | None:
 
 
 def encode_packet(kind: int, payload: bytes, *, sequence: int, device_us: int) -> bytes:
-    """The bytes of one packet on the wire, a zero byte before and after it.
+    """Encode one packet for the wire, with a zero byte before and after it.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def encode_packet(kind: int, payload: bytes, *, sequence: int, device_us: int) -
 
 @dataclass(slots=True)
 class FramingCounts:
-    """What a stream was made of, in packets and bytes.
+    """Counts of a stream's packets and bytes.
 
     Parameters
     ----------
@@ -129,14 +129,14 @@ class FramingCounts:
 
 
 class PacketParser:
-    """Bytes in as they come, whole packets out; garbage is counted and the next packet is found again."""
+    """Parser of packets from a stream; skips and counts garbage."""
 
     def __init__(self) -> None:
         self.counts = FramingCounts()
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Packet]:
-        """Packets that are complete with `data`."""
+        """Parse `data`; return the packets completed by it."""
         *parts, self._rest = (self._rest + data).split(b"\0")
         if len(self._rest) > _LONGEST:
             self._damage(self._rest)

@@ -1,4 +1,4 @@
-"""The scan head's packets, and a tracker's in the same framing: what each payload holds and how it is read.
+"""Packets of the scan head, and of a tracker in the same framing: encoding and decoding of payloads.
 
 All numbers are little-endian. Kinds below 128 go from the device to the host, the others from the host to the device.
 """
@@ -40,37 +40,37 @@ _MAX_ID: Final = 64
 
 
 def encode_hello(hello: HelloReading, *, sequence: int = 0, device_us: int = 0) -> bytes:
-    """Who the device is: rows and columns (0 for a tracker), saturation count, rate, name."""
+    """Encode a device's identity: rows and columns (0 for a tracker), saturation count, rate, name."""
     numbers = _HELLO.pack(hello.rows, hello.columns, hello.saturation_count, round(hello.rate_hz * 1000))
     name = hello.device_id.encode()[:_MAX_ID]
     return encode_packet(HELLO, numbers + name, sequence=sequence, device_us=device_us)
 
 
 def encode_frame(counts: CountArray, *, sequence: int, device_us: int) -> bytes:
-    """One (rows, columns) frame: row after row, each along the head."""
+    """Encode one (rows, columns) frame row by row."""
     return encode_packet(FRAME, counts.astype("<u2").tobytes(), sequence=sequence, device_us=device_us)
 
 
 def encode_end(sent: int, dropped: int, *, sequence: int = 0, device_us: int = 0) -> bytes:
-    """The device stops, and says what it sent and what it could not send."""
+    """Encode the end of sending, with the numbers of records sent and dropped."""
     return encode_packet(END, _END.pack(sent, dropped), sequence=sequence, device_us=device_us)
 
 
 def encode_pose(pose: PoseReading, *, sequence: int) -> bytes:
-    """A pose without rounding: doubles in mm, and the nanoseconds that the header's microseconds leave."""
+    """Encode a pose without rounding: doubles in mm, and the nanoseconds that the header's microseconds leave out."""
     device_us, rest_ns = divmod(pose.device_ns or 0, 1000)
     payload = _POSE.pack(rest_ns, *pose.position_mm, *pose.quaternion_wxyz)
     return encode_packet(POSE, payload, sequence=sequence, device_us=device_us)
 
 
 def encode_command(kind: int, *, every: int = 1) -> bytes:
-    """`ASK`, `START` (send every n-th frame) or `STOP`."""
+    """Encode `ASK`, `START` (send every n-th frame) or `STOP`."""
     payload = struct.pack("<B", every) if kind == START else b""
     return encode_packet(kind, payload, sequence=0, device_us=0)
 
 
 class HeadParser:
-    """Readings of a device that speaks the open framing, head or tracker."""
+    """Parser of a device in the open framing, head or tracker."""
 
     def __init__(self, *, every: int = 1) -> None:
         self.packets = PacketParser()
@@ -81,11 +81,11 @@ class HeadParser:
 
     @property
     def garbage_bytes(self) -> int:
-        """Bytes that belong to no valid packet."""
+        """Number of bytes that belong to no valid packet."""
         return self.packets.counts.damaged_bytes
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Readings that are complete with `data`; a packet whose payload does not fit its kind is counted."""
+        """Parse `data`; return the completed readings; counts packets with invalid payloads."""
         found = []
         for packet in self.packets.feed(data):
             reading = self._read(packet)
@@ -139,13 +139,13 @@ class HeadParser:
 
 
 def frame_bytes_on_wire(taxels: int) -> int:
-    """The most bytes that one frame can take: header, checksum, stuffing, a zero byte at each end."""
+    """Largest number of bytes of one frame: header, checksum, stuffing, a zero byte at each end."""
     body = 14 + 2 * taxels + 4
     return body + body // 254 + 1 + 2
 
 
 def needed_baud(taxels: int, *, rate_hz: float) -> int:
-    """Line rate in baud that the frames need, with a start and a stop bit for each byte."""
+    """Line rate in baud that the frames need, with start and stop bits."""
     return round(frame_bytes_on_wire(taxels) * rate_hz * BITS_PER_BYTE_8N1)
 
 

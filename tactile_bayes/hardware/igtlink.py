@@ -1,4 +1,4 @@
-"""OpenIGTLink TRANSFORM messages, as PlusServer and 3D Slicer send them over TCP: messages to poses.
+"""Parser for OpenIGTLink TRANSFORM messages, as PlusServer and 3D Slicer send them over TCP.
 
 A message is a header of 58 bytes and a body, big-endian, with a CRC-64 of the body. A transform's body is the 3 x 4
 matrix column by column, float32, in mm.
@@ -24,7 +24,7 @@ _RIGID_SLACK: Final = 0.02
 
 
 class IgtlinkParser:
-    """TRANSFORM messages of one device name (any, when empty); other messages are passed over.
+    """Parser of one device name's TRANSFORM messages (any device's, when empty); skips other messages.
 
     The header has no checksum: a spoilt size may claim a megabyte of what follows. While a message waits for its end, a
     whole transform inside it shows that the size was wrong.
@@ -36,7 +36,7 @@ class IgtlinkParser:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Poses that are complete with `data`."""
+        """Parse `data`; return the completed poses."""
         buffer, place = self._rest + data, 0
         found: list[Reading] = []
         while len(buffer) - place >= _HEADER.size:
@@ -67,7 +67,7 @@ class IgtlinkParser:
 
 
 def _whole_transform(buffer: bytes, start: int) -> int:
-    """Where the first transform whose checksum holds begins at `start` or later; -1 without one."""
+    """Index of the first valid transform from `start` on; -1 without one."""
     place = buffer.find(_TRANSFORM, start + _KIND_AT)
     while place >= 0:
         begin = place - _KIND_AT
@@ -97,7 +97,7 @@ def _pose(body: bytes, seconds: int, fraction: int) -> list[Reading]:
 
 
 def encode_transform(pose: PoseReading, rotation: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bytes:
-    """The message of a pose whose rotation matrix is given too."""
+    """Encode a pose with its rotation matrix as a message."""
     body = _BODY.pack(*rotation.T.ravel(), *pose.position_mm)
     seconds, rest_ns = divmod(pose.device_ns or 0, 1_000_000_000)
     fraction = -(-(rest_ns << 32) // 1_000_000_000)  # rounded up, so that whole nanoseconds come back

@@ -1,4 +1,4 @@
-"""Where the head's apex touched a landmark: averaged over samples, with their spread."""
+"""Touching of landmarks with the head's apex: the mean of several poses, and their spread."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEADY_MM: Final = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Touch:
-    """One landmark, touched.
+    """A touched landmark.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class Touch:
 
     @property
     def steady(self) -> bool:
-        """Whether the head was held still."""
+        """Whether the head was held still enough."""
         return self.spread_mm <= STEADY_MM
 
     def __str__(self) -> str:
@@ -51,7 +51,7 @@ class Touch:
 
 
 class LandmarkTouch:
-    """Collects the next poses for one landmark.
+    """Collects the next poses to average one landmark.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class LandmarkTouch:
         self._points: list[FloatArray] = []
 
     def add(self, pose: PoseReading) -> Touch | None:
-        """Take one pose; the landmark when there are enough. Poses the tracker doubts are passed over."""
+        """Add one pose; returns the landmark when there are enough. Poses that the tracker flags are skipped."""
         if pose.flags:
             return None
         rotation = rotation_from_quaternion(np.array(pose.quaternion_wxyz))

@@ -1,4 +1,4 @@
-"""The map as it grows during a recording, and how hard the head presses: what a live view shows."""
+"""The growing map and the pressure during a recording, for a live view."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PATIENCE_NS: Final = 150_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveState:
-    """Everything a view draws.
+    """Data of one drawing of the live view.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class LiveState:
 
     @property
     def size_words(self) -> str:
-        """The estimate, or why there is none yet."""
+        """The estimate in words, or why there is none yet."""
         if self.size:
             return self.size
         if self.tactile_map is not None:
@@ -79,12 +79,12 @@ class LiveState:
 
     @property
     def pressure_words(self) -> str:
-        """Mean pressure of the last frame; empty where there is none."""
+        """Mean pressure of the last frame in words; empty without a frame."""
         return f"{self.pressure_kpa:.1f} kPa" if np.isfinite(self.pressure_kpa) else ""
 
     @property
     def lump_mm(self) -> tuple[float, float] | None:
-        """Centre of the estimate's lump on the present map's plane."""
+        """Centre of the estimated lump on the present map's plane."""
         if self.lump_base_mm is None or self.tactile_map is None or self.tactile_map.plane_from_base is None:
             return None
         x, y, _ = apply(self.tactile_map.plane_from_base, self.lump_base_mm).tolist()
@@ -92,7 +92,7 @@ class LiveState:
 
     @property
     def tone(self) -> str:
-        """``low``, ``in``, ``high``, or ``off`` before the first frame."""
+        """Tone for the pressure: ``low``, ``in``, ``high``, or ``off`` before the first frame."""
         if not np.isfinite(self.pressure_kpa):
             return "off"
         low, high = self.window_kpa
@@ -108,7 +108,7 @@ class LiveState:
 
 @dataclass(slots=True)
 class LiveMap:
-    """Takes what a `Feed` sends and makes a map of it.
+    """Builds a map from a `Feed`.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class LiveMap:
     _host_ns: int = 0
 
     def take(self, seen: Iterable[Seen]) -> None:
-        """Add what was seen; frames wait until the tracker has passed them."""
+        """Add frames, poses and landmarks; frames wait for the tracker's next pose."""
         youngest = None
         for one in seen:
             match one:
@@ -174,7 +174,7 @@ class LiveMap:
         self._refit()
 
     def _refit(self) -> None:
-        """Put the map on the best plane of the frames so far, now and then."""
+        """Move the map to the best-fit plane of the frames so far, from time to time."""
         if self._map is None or self._refits >= len(REFIT_AT):
             return
         if self._map.figures["frames_used"] < REFIT_AT[self._refits]:
@@ -186,7 +186,7 @@ class LiveMap:
             return  # still too nearly a line: the plane under the head will do until the next time
 
     def _snapshot(self) -> TactileMap | None:
-        """The map so far, with the patient's axes where they are known."""
+        """The map so far, with the patient's axes if known."""
         if self._map is None or not self._map.figures["frames_used"]:
             return None
         found = self._map.snapshot()
@@ -199,7 +199,7 @@ class LiveMap:
             return found  # two landmarks in one place give no axes
 
     def state(self, *, size: str = "", lump_base_mm: FloatArray | None = None) -> LiveState:
-        """As it is now."""
+        """The present state for the view."""
         figures = self._map.figures if self._map else {"frames_used": 0.0, "frames_total": 0.0}
         report = self._report
         return LiveState(
@@ -218,7 +218,7 @@ class LiveMap:
 
 
 def colour_limits(values: FloatArray) -> tuple[float, float] | None:
-    """The 2 % and 98 % quantiles of the finite values, between which the colours run; None where there are none."""
+    """The 2 % and 98 % quantiles of the finite values, the ends of the colour scale; None without values."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return None
@@ -227,7 +227,7 @@ def colour_limits(values: FloatArray) -> tuple[float, float] | None:
 
 
 def grey_levels(values: FloatArray) -> FloatArray:
-    """Map values to 0..1 between their `colour_limits`; NaN stays."""
+    """Scale map values to 0..1 between their `colour_limits`; NaN stays."""
     limits = colour_limits(values)
     if limits is None:
         return np.full(values.shape, np.nan)

@@ -37,7 +37,7 @@ _TRANSFORMS: Final = 0x0001  # without 0x0800: a tool outside the volume that wa
 
 
 class NdiTracker:
-    """One tracker with one tool, set up and tracking.
+    """A connected NDI tracker that follows one tool.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class NdiTracker:
         return device
 
     def _begin(self) -> None:
-        """INIT, after a reset where the tracker still runs at the rate of an earlier session."""
+        """Send INIT, after a reset where the tracker still has an earlier session's line rate."""
         wired = not self._url.startswith("socket://")
         try:
             self._command("INIT:")
@@ -92,7 +92,7 @@ class NdiTracker:
         number = self._api.ndiGetError(self._device)
         if number != self._api.NDI_OKAY:
             words = self._api.ndiErrorString(number)
-            raise DeviceError(f"{text.partition(':')[0]} was not done ({words}); check its power, cable and tool")
+            raise DeviceError(f"{text.partition(':')[0]} failed ({words}); check its power, cable and tool")
         return reply if isinstance(reply, str) else ""
 
     def _handles(self, kind: int) -> list[int]:
@@ -102,14 +102,16 @@ class NdiTracker:
         return [self._api.ndiGetPHSRHandle(self._device, one) for one in range(number)]
 
     def _tool(self, rom: Path | None) -> int:
-        """Initialise and enable what is there; the handle of the tool that is followed."""
+        """Initialise and enable the tools; return the handle of the one to follow."""
         for handle in self._handles(1):
             self._command("PHF:%02X", handle)
         if rom is not None:
             self._command(_WIRELESS)
             handle = self._api.ndiGetPHRQHandle(self._device)
             if self._api.ndiPVWRFromFile(self._device, handle, str(rom)) != 0:
-                raise DeviceError(f"the tool's description {rom} was not taken; check that it is the tool's .rom file")
+                raise DeviceError(
+                    f"the tool's description {rom} was refused by the tracker; check that it is the tool's .rom file"
+                )
         for handle in self._handles(2):
             self._command("PINIT:%02X", handle)
         for handle in self._handles(3):
@@ -120,7 +122,7 @@ class NdiTracker:
         return enabled[0]
 
     def pose(self) -> PoseReading | None:
-        """The pose of a frame not seen before; None while there is none, or the tool is out of sight.
+        """Next pose; None while there is no new one, or the tool is out of sight.
 
         Raises
         ------
@@ -146,7 +148,7 @@ class NdiTracker:
 
 
 def serve(tracker: NdiTracker, line: socket.socket) -> None:
-    """Be a tracker in the open framing until the other end has gone."""
+    """Serve the tracker in the open framing until the other end closes."""
     commands, sending, number = PacketParser(), False, 0
     line.setblocking(False)
     while True:
@@ -166,7 +168,7 @@ def serve(tracker: NdiTracker, line: socket.socket) -> None:
 
 
 class NdiPort(Port):
-    """A tracker that is asked by a process of its own, as a port that speaks the open framing.
+    """An NDI tracker in a process of its own, as a port in the open framing.
 
     Raises
     ------
@@ -207,7 +209,7 @@ class NdiPort(Port):
             raise DeviceError(f"{self.name}: {told or 'the tracker said nothing; check its power and cable'}")
 
     def close(self) -> None:
-        """End the process; it leaves when its line is closed."""
+        """Close the line, on which the process ends."""
         super().close()
         if self._process.stdout is not None:
             self._process.stdout.close()
@@ -216,7 +218,7 @@ class NdiPort(Port):
 
 
 class _SocketLine:
-    """As much of a serial port as `Port` uses, over a socket."""
+    """The part of a serial port that `Port` uses, over a socket."""
 
     def __init__(self, line: socket.socket) -> None:
         self._line = line
@@ -237,19 +239,19 @@ class _SocketLine:
         self._line.sendall(data)
 
     def flush(self) -> None:
-        """Nothing waits here."""
+        """Do nothing: a socket has no buffer to flush here."""
 
     def close(self) -> None:
         self._line.close()
 
 
 def _say(words: str) -> None:
-    """One line to who started this process."""
+    """Print one line to the parent process."""
     os.write(sys.stdout.fileno(), f"{words}\n".encode())
 
 
 def main(words: list[str]) -> int:
-    """``python -m tactile_bayes.hardware.ndi FD URL [ROM]``: one line on stdout says ``ready``, or what is wrong."""
+    """Run ``python -m tactile_bayes.hardware.ndi FD URL [ROM]``: prints ``ready``, or what is wrong."""
     import importlib
 
     line = socket.socket(fileno=int(words[0]))

@@ -1,4 +1,4 @@
-"""Polhemus FASTRAK, LIBERTY and PATRIOT: records to poses.
+"""Parsers for Polhemus FASTRAK, LIBERTY and PATRIOT trackers.
 
 FASTRAK numbers its output items otherwise than LIBERTY and PATRIOT: 11 is a quaternion there, the distortion here.
 Positions are asked for in inches, because that is what both give after a reset; quaternions are scalar first.
@@ -43,7 +43,7 @@ _LONGEST_LINE: Final = 512
 
 
 class FastrakParser(RecordParser):
-    """FASTRAK records, ASCII or binary, found again after garbage by their fixed layout.
+    """Parser of FASTRAK records, ASCII or binary; their fixed layout finds the next record after garbage.
 
     Binary records carry no checksum: the station, the error byte, the closing space and the length of the quaternion
     tell a record from noise.
@@ -91,7 +91,7 @@ _DECIMALS: Final = {"position": 2, "euler": 2, "quaternion": 4}
 
 
 def _columns(text: bytes, *, decimals: int) -> tuple[float, ...] | None:
-    """Numbers in columns of seven: nothing need stand between two of them."""
+    """Parse numbers in columns of seven characters, which may touch."""
     pattern = rb" *[+-]? *\d*\.\d{%d}" % decimals
     cells = [text[i : i + 7] for i in range(0, len(text), 7)]
     if not all(re.fullmatch(pattern, cell) for cell in cells):
@@ -103,7 +103,7 @@ def _columns(text: bytes, *, decimals: int) -> tuple[float, ...] | None:
 
 
 class LibertyParser(RecordParser):
-    """LIBERTY, PATRIOT and Latus binary records, read by their list of items.
+    """Parser of LIBERTY, PATRIOT and Latus binary records, by their list of items.
 
     The header's size is a check with a tolerance of the closing space, which firmware may or may not count.
     """
@@ -131,7 +131,7 @@ class LibertyParser(RecordParser):
 
 
 class LibertyAsciiParser:
-    """LIBERTY and PATRIOT text records: two characters of station, one of error, then numbers between spaces."""
+    """Parser of LIBERTY and PATRIOT text records: station, error, then numbers between spaces."""
 
     def __init__(self, items: Sequence[int] = LIBERTY_ASCII) -> None:
         self.garbage_bytes = 0
@@ -139,7 +139,7 @@ class LibertyAsciiParser:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Poses that are complete with `data`."""
+        """Parse `data`; return the completed poses."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > _LONGEST_LINE:
             self.garbage_bytes += len(self._rest)
@@ -170,7 +170,7 @@ class LibertyAsciiParser:
 def pose_from_items(
     values: Mapping[str, tuple[float, ...]], *, flags: tuple[str, ...], station: int
 ) -> PoseReading | None:
-    """A pose from a record's items in inches; None when they cannot be one (the record is noise)."""
+    """Pose from a record's items in inches; None for items that cannot be a pose."""
     position = [number * MM_PER_INCH for number in values["position"]]
     quaternion = values.get("quaternion") or quaternion_from_euler(*values["euler"])
     if not plausible(position, quaternion):

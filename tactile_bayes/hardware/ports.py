@@ -1,4 +1,4 @@
-"""Ports by URL: a serial device, a socket, another program's terminal.
+"""Ports by URL: a serial device, a socket, or another program's terminal.
 
 A `DeviceError` from here is one line: which port, what was expected, what came, what to try.
 """
@@ -49,16 +49,16 @@ class Port:
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name for messages."""
         return f"{self.role} {self.url}"
 
     @property
     def has_line_rate(self) -> bool:
-        """Whether bytes pass at the line rate: not over sockets."""
+        """Whether the line has a baud rate: sockets have none."""
         return not self.url.startswith(("socket://", "rfc2217://", "loop://"))
 
     def write(self, data: bytes) -> None:
-        """Send; a device that went away is told in one line."""
+        """Send bytes; a device that has gone is one error line."""
         try:
             self._serial.write(data)
             self._serial.flush()
@@ -66,7 +66,7 @@ class Port:
             raise DeviceError(f"{self.name}: cannot be written to ({_reason(error)}); check its cable") from None
 
     def read_some(self, timeout_s: float) -> bytes:
-        """What comes within the time, as soon as anything does; empty when nothing did."""
+        """Read what comes within the time, returning with the first bytes; empty when nothing came."""
         end = time.monotonic() + timeout_s
         try:
             while True:
@@ -79,7 +79,7 @@ class Port:
             raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); check its cable") from None
 
     def drain(self, quiet_s: float = 0.05) -> int:
-        """Read until nothing comes for a while (at most 2 s); how many bytes that was."""
+        """Discard input until the line is quiet (at most 2 s); return the number of bytes."""
         count, end = 0, time.monotonic() + 2.0
         while time.monotonic() < end:
             data = self.read_some(quiet_s)
@@ -90,7 +90,7 @@ class Port:
 
     @contextlib.contextmanager
     def descriptor(self) -> Iterator[int]:
-        """A file descriptor that a reading process can inherit.
+        """File descriptor that a reading process can inherit.
 
         A port without one (rfc2217, loop) is read by a thread here that passes its bytes on; under load a thread is
         less sure to be in time than a process.
@@ -105,7 +105,7 @@ class Port:
             yield far.fileno()
 
     def close(self) -> None:
-        """Close; nothing is wrong if it has gone already."""
+        """Close the port; no error if the device has gone already."""
         with contextlib.suppress(*GONE):
             self._serial.close()
         if self._relayed is not None:
@@ -147,13 +147,13 @@ def _relay(port: Any, sink: socket.socket) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """The system's words without pyserial's around them."""
+    """The system's error text without pyserial's wrapping."""
     number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
     return os.strerror(number) if isinstance(number, int) else str(error).split(": ")[-1].strip("[]'\" ")
 
 
 def shown(data: bytes) -> str:
-    """The start of what came, for a message: as text if it is, as hex if not."""
+    """Beginning of received bytes for a message: as text if printable, else as hex."""
     if not data:
         return "nothing"
     part = data[:_SHOWN_BYTES]

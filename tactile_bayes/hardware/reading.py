@@ -1,4 +1,4 @@
-"""The process that reads one device: wait, read, stamp, hand over, and nothing else.
+"""Process that reads one device: it waits, reads, adds time stamps and passes on.
 
 Run as a file, with no package around it, so that it starts in 20 ms and holds nothing that could pause it:
 ``python reading.py DEVICE_FD PIPE_FD``. Each record on the pipe is ``host time u64 in ns (monotonic), bytes lost so far
@@ -25,7 +25,7 @@ _LOOK_UP_S = 1.0
 
 
 def read_device(device: int, pipe: int) -> None:
-    """Pass on what comes from `device` until it or the other end of the pipe has gone."""
+    """Pass on the bytes of `device` until it or the other end of the pipe has gone."""
     parent, lost = os.getppid(), 0
     os.set_blocking(device, False)
     os.set_blocking(pipe, False)
@@ -55,7 +55,7 @@ def read_device(device: int, pipe: int) -> None:
 
 
 def ask_for_priority() -> None:
-    """Be served before programs that only compute, where the system allows it; a reader sleeps most of the time."""
+    """Raise this process's priority where the system allows it; a reader sleeps most of the time."""
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     except (AttributeError, OSError):
@@ -64,7 +64,7 @@ def ask_for_priority() -> None:
 
 
 def main() -> None:
-    """Freeze the garbage collector and read."""
+    """Run the reader with the garbage collector frozen."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the recorder, which still needs what is on its way
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     ask_for_priority()

@@ -1,4 +1,4 @@
-"""Protocol-independent device readings: frames, poses, identity and end of transmission."""
+"""Device readings, independent of the protocol: frames, poses, identity and end of transmission."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class PoseReading(NamedTuple):
 
 
 class HelloReading(NamedTuple):
-    """Who a device is, in its own words."""
+    """Identity that a device reports."""
 
     device_id: str
     rows: int
@@ -68,7 +68,7 @@ class HelloReading(NamedTuple):
 
 
 class EndReading(NamedTuple):
-    """The device has stopped by itself, with its own account of what it measured and what it had to drop."""
+    """End of transmission, with the device's own count of measured and dropped records."""
 
     sent: int
     dropped: int
@@ -78,18 +78,18 @@ Reading = FrameReading | PoseReading | HelloReading | EndReading
 
 
 class Parser(Protocol):
-    """Bytes as they come in, readings out."""
+    """Interface of a protocol's parser."""
 
     @property
     def garbage_bytes(self) -> int:
-        """Bytes so far that belong to no valid record."""
+        """Number of bytes so far that belong to no valid record."""
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Readings that are complete with `data`."""
+        """Parse `data`; return the completed readings."""
 
 
 class RecordParser:
-    """A parser of records of one fixed length, found again after garbage by trying the next byte.
+    """Parser of fixed-length records; after garbage it tries again at each next byte.
 
     A subclass sets `record_bytes` and says what `_record` makes of that many bytes.
     """
@@ -101,7 +101,7 @@ class RecordParser:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Poses that are complete with `data`."""
+        """Parse `data`; return the completed poses."""
         buffer, place, size = self._rest + data, 0, self.record_bytes
         found: list[Reading] = []
         while len(buffer) - place >= size:
@@ -116,12 +116,12 @@ class RecordParser:
         return found
 
     def _record(self, record: bytes) -> PoseReading | None:
-        """The record's pose, or None when the bytes are not a record."""
+        """Parse one record; None when the bytes are not a record."""
         raise NotImplementedError
 
 
 def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) -> bool:
-    """Whether numbers can be a pose: finite, within 25 m, a quaternion of unit length within a scan's tolerance."""
+    """Whether numbers can be a pose: finite, within 25 m, quaternion of unit length within tolerance."""
     if not all(map(math.isfinite, (*position_mm, *quaternion_wxyz))):
         return False
     return max(map(abs, position_mm)) < 25_000 and abs(math.hypot(*quaternion_wxyz) - 1) < 0.009
@@ -132,7 +132,7 @@ MOST_LOST: Final = 100_000
 
 
 class SequenceCheck:
-    """Counts what is missing by a counter of 32 bits that wraps.
+    """Counts missing records by a 32-bit counter that wraps.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class SequenceCheck:
         self.restarts = 0
 
     def missing_before(self, sequence: int) -> int:
-        """How many are missing just before `sequence`; 0 when the counter restarted or is damaged."""
+        """Number missing just before `sequence`; 0 when the counter restarted or is damaged."""
         expected = sequence if self._expected is None else self._expected
         gap = (sequence - expected) % 2**32
         self._expected = (sequence + 1) % 2**32

@@ -1,4 +1,4 @@
-"""Recorder: hands what devices send to a writer without loss, and reports what was lost on the way."""
+"""Recorder: passes what devices send to a writer without loss, and reports losses on the way."""
 
 from __future__ import annotations
 
@@ -30,43 +30,43 @@ _TICK_S: Final = 0.05
 
 
 class Sink(Protocol):
-    """Where a recording goes; `files` has the one for scan files."""
+    """Interface of a recording's destination; `files` has the one for scan files."""
 
     def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None:
-        """One frame."""
+        """Add one frame."""
 
     def add_pose(self, position_mm: FloatArray, quaternion_wxyz: FloatArray, *, device_ns: int, host_ns: int) -> None:
-        """One pose."""
+        """Add one pose."""
 
     def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None:
-        """One touch."""
+        """Add one touched landmark."""
 
     def add_note(self, text: str, *, device: str, device_ns: int, host_ns: int, serious: bool = False) -> None:
-        """Something to know about the data at this time."""
+        """Add a remark about the data at this time."""
 
     def flush(self) -> None:
-        """What was added so far is safe when this process dies."""
+        """Store what was added so far, so that it survives the end of this process."""
 
 
 class Observer(Protocol):
-    """Who looks on while a recording runs; must not wait."""
+    """Interface of a recording's spectator, which must never wait."""
 
     def landmark(self, name: str, position_mm: FloatArray) -> None:
-        """A landmark was touched."""
+        """Receive a touched landmark."""
 
     def frame(self, counts: CountArray, device_ns: int) -> None:
-        """A frame was recorded."""
+        """Receive a recorded frame."""
 
     def pose(self, pose: PoseReading, device_ns: int) -> None:
-        """A pose was recorded."""
+        """Receive a recorded pose."""
 
     def told(self, report: Report) -> None:
-        """Several times a second: the account so far."""
+        """Receive the account so far, several times a second."""
 
 
 @dataclass(slots=True)
 class Line:
-    """One device in use: its port, its reading process, its parser, the commands that start and stop it."""
+    """A device in use: port, reading process, parser, and commands to start and stop it."""
 
     role: str
     port: Port
@@ -134,14 +134,14 @@ class Recorder:
         self.recording = False
 
     def start(self) -> None:
-        """Let the devices send and record it."""
+        """Start the devices and record them."""
         for line in reversed(self._lines):  # the tracker first, so that no frame is without a pose
             line.port.write(line.start)
             line.heard_ns = self._now_ns()
         self.recording = True
 
     def listen(self) -> None:
-        """Let the tracker send for landmarks, before the scan starts."""
+        """Start the tracker alone, for landmarks before the scan."""
         if self._tracker is not None:
             self._tracker.port.write(self._tracker.start)
 
@@ -150,7 +150,7 @@ class Recorder:
         self._touch = landmark
 
     def stop(self, why: str) -> None:
-        """End the recording when what is on its way has arrived."""
+        """End the recording once data on their way have arrived."""
         if not self.report.ended_by:
             self.report.ended_by = why
             self._drain_until_ns = self._now_ns() + round(DRAIN_S * 1e9)
@@ -179,7 +179,7 @@ class Recorder:
         return self.report
 
     def _take(self) -> None:
-        """Wait a moment for bytes and deal with all of them."""
+        """Wait briefly for bytes, and process all of them."""
         waiting = [line.stream for line in self._lines if not line.stream.ended]
         if not waiting:
             time.sleep(_TICK_S)
@@ -255,7 +255,7 @@ class Recorder:
             self._observer.pose(reading, device_ns)
 
     def _flags(self, reading: PoseReading) -> tuple[str, ...]:
-        """What the device says against a pose, and whether it repeats the last one."""
+        """Flags that the device set on a pose, and whether it repeats the last one."""
         self.report.poses_flagged += bool(reading.flags)
         last, self._last_pose = self._last_pose, reading
         if last is None or (last.position_mm, last.quaternion_wxyz) != (reading.position_mm, reading.quaternion_wxyz):
@@ -287,7 +287,7 @@ class Recorder:
             self.stop("the head stopped")
 
     def _gone(self, line: Line) -> None:
-        """The cable was pulled, or the device's program ended."""
+        """Handle a device that disappeared: cable pulled, or its program ended."""
         line.finished = True
         if self.report.ended_by:
             return
@@ -310,7 +310,7 @@ class Recorder:
                 self.stop(f"the {line.role} fell silent")
 
     def _look_at_host_time(self, now_ns: int) -> None:
-        """End a recording with a duration although the head's clock is behind."""
+        """End a recording of limited duration by the host's clock when the head's is behind."""
         if self._duration_ns is None or not self.report.frames:
             return
         passed_ns = now_ns - self._zero_ns - self._begun_ns
@@ -318,7 +318,7 @@ class Recorder:
             self.stop("duration, by this computer's clock")
 
     def _judge(self) -> None:
-        """What to know before the recording is used; a tracker none of whose poses is of use is a fault."""
+        """Add cautions for the recording; a tracker without one usable pose is an error."""
         report, clock = self.report, self._clock
         report.head_clock_steps, report.head_clock_wraps = clock.head.steps, clock.head.wraps
         report.tracker_clock_steps, report.tracker_clock_wraps = clock.tracker.steps, clock.tracker.wraps
@@ -332,7 +332,7 @@ class Recorder:
             )
 
     def _done(self) -> bool:
-        """Whether all that belongs to the recording has arrived."""
+        """Whether all data of the recording have arrived."""
         if self._drain_until_ns is None:
             return False
         tracker = self._tracker
@@ -348,7 +348,7 @@ class Recorder:
             self._observer.told(report)
 
     def _hush(self) -> None:
-        """Tell the devices to stop; those that have gone need no telling."""
+        """Send stop commands to the devices that are still there."""
         for line in self._lines:
             with contextlib.suppress(DeviceError):
                 line.port.write(line.stop)
@@ -356,7 +356,7 @@ class Recorder:
 
 
 def _oddities(reading: FrameReading, event: str) -> Iterator[str]:
-    """What to note about a frame."""
+    """Remarks about a frame."""
     if event:
         yield event
     if reading.restarted:

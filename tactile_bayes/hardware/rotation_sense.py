@@ -17,7 +17,7 @@ CLEAR: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class RotationSense:
-    """How well each sense fits a fixed point, and how far the sensor was turned.
+    """Fit of a fixed point under each sense of rotation, and the angle that the sensor was turned by.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Serve the live view to a browser on this computer: one page, one websocket, one secret in the address.
+"""Server of the live view to a browser on this computer: one page, one websocket, a secret in the address.
 
 The page loads nothing from anywhere else. The websocket takes only pages of its own origin, so that no other site that
 is open in the browser can look on.
@@ -36,7 +36,7 @@ _SECURITY: Final = (
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """HOST:PORT of a server that only this computer can reach.
+    """Parse the HOST:PORT of a server that only this computer can reach.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def address_of(text: str) -> tuple[str, int]:
 
 
 class LiveServer:
-    """Shows states to whoever has the address.
+    """Sends states to the pages whose address has the secret.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class LiveServer:
 
     @property
     def url(self) -> str:
-        """What to open in a browser."""
+        """Address to open in a browser."""
         return f"http://{self._authority}/?token={self._token}"
 
     def show(self, state: LiveState) -> None:
@@ -107,7 +107,7 @@ class LiveServer:
             self._news.notify_all()
 
     def close(self) -> None:
-        """Tell the pages that it is over, and stop; pages that do not read are cut off."""
+        """Tell the pages that the recording is over, and stop; pages that do not read are cut off."""
         with self._news:
             self._over = True
             self._news.notify_all()
@@ -122,7 +122,7 @@ class LiveServer:
         closing.join(CLOSE_S)
 
     def _admit(self, connection: Any, request: Any) -> Any:
-        """The page or a refusal; None lets a websocket through."""
+        """Return the page or a refusal; None accepts a websocket."""
         address = urlsplit(request.path)
         given = parse_qs(address.query).get("token", [""])[0]
         if not hmac.compare_digest(given.encode(), self._token.encode()):
@@ -149,7 +149,7 @@ class LiveServer:
         return response
 
     def _talk(self, connection: Any) -> None:
-        """Send each new state until the page or the recording goes."""
+        """Send each new state until the page closes or the recording ends."""
         with self._news:
             self._pages.add(connection)
         try:
@@ -176,7 +176,7 @@ class LiveServer:
 
 
 def document(state: LiveState) -> dict[str, Any]:
-    """A state as the page takes it."""
+    """A state as JSON for the page."""
     known = math.isfinite(state.pressure_kpa)
     return {
         "tone": state.tone,
@@ -192,7 +192,7 @@ def document(state: LiveState) -> dict[str, Any]:
 
 
 def _map_document(state: LiveState) -> dict[str, Any] | None:
-    """The picture row by row from its top left corner, with all that is drawn over it, in cells from that corner."""
+    """Picture row by row from its top left corner, with the overlays, in cells from that corner."""
     tactile_map = state.tactile_map
     if tactile_map is None:
         return None

@@ -1,4 +1,4 @@
-"""The recorder's end of a reading process: its pipe, its bytes with their times, what was lost on the way."""
+"""The recorder's end of a reading process: pipe, bytes with arrival times, losses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ READY_S: Final = 15.0
 
 
 class Piece(NamedTuple):
-    """Bytes of a device with the host's time (monotonic ns) at which they were read."""
+    """Bytes of a device with the host's time of reading (monotonic ns)."""
 
     host_ns: int
     data: bytes
@@ -31,7 +31,7 @@ class Piece(NamedTuple):
 
 @dataclass(slots=True)
 class Stream:
-    """One device being read by a process of its own.
+    """A device read by a process of its own.
 
     Parameters
     ----------
@@ -56,11 +56,11 @@ class Stream:
     _rest: bytes = field(default=b"", repr=False)
 
     def fileno(self) -> int:
-        """For `select`."""
+        """File descriptor for `select`."""
         return self.pipe
 
     def wait_until_ready(self, timeout_s: float = READY_S) -> None:
-        """Return when the reader reads: before that, what a device sends piles up in a buffer of 4 KiB.
+        """Wait until the reader reads: before, a device's data would pile up in a buffer of 4 KiB.
 
         A reader that takes longer is waited for no more; what it loses is counted. What comes meanwhile is not asked
         for: devices are told to send afterwards.
@@ -71,7 +71,7 @@ class Stream:
                 self.read()
 
     def read(self) -> list[Piece]:
-        """What has come since; sets `ended` after the last of it."""
+        """Read the pieces that have come; sets `ended` after the last."""
         try:
             data = os.read(self.pipe, PIPE_BYTES)
         except BlockingIOError:
@@ -99,12 +99,12 @@ class Stream:
         return pieces
 
     def stop(self) -> None:
-        """End the reader; what it has handed over can still be read."""
+        """Stop the reader; what it has passed on can still be read."""
         with contextlib.suppress(ProcessLookupError):
             self.process.terminate()
 
     def close(self) -> None:
-        """End the reader, account for its CPU time, and let go of the pipe."""
+        """Stop the reader, add up its CPU time, and close the pipe."""
         self.stop()
         if self.process.returncode is None:
             _, status, usage = os.wait4(self.process.pid, 0)
@@ -114,7 +114,7 @@ class Stream:
 
 
 def read_in_process(port: Port) -> Stream:
-    """Start to read a port in a process of its own."""
+    """Start a process that reads a port."""
     ours, theirs = os.pipe()
     os.set_blocking(ours, False)
     if hasattr(fcntl, "F_SETPIPE_SZ"):

@@ -1,1 +1,1 @@
-"""Bayesian inference for any log density: fits, draws, their diagnostics and summaries. Knows no map."""
+"""Bayesian inference for any log density: fits, draws, diagnostics and summaries."""

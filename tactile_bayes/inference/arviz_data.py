@@ -1,4 +1,4 @@
-"""The one door to arviz: chain diagnostics, and draws as arviz has them."""
+"""The only use of arviz: chain diagnostics, and draws as InferenceData."""
 
 from __future__ import annotations
 
@@ -34,8 +34,32 @@ def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
     }
 
 
+def convergence(draws: FloatArray) -> dict[str, float]:
+    """R-hat, effective draws and Monte-Carlo errors of one quantity.
+
+    Parameters
+    ----------
+    draws : (chain, draw) array
+        Draws without a value (NaN) count as the smallest, as they do among ranks.
+
+    Returns
+    -------
+    dict
+        ``rhat`` (rank-normalised, split), ``ess_bulk``, ``ess_tail``, and ``mcse_median``, ``mcse_low``, ``mcse_high``
+        of the median and the ends of the central 95 %, in the quantity's unit.
+    """
+    known = np.where(np.isfinite(draws), draws, np.nanmin(draws))
+    errors = {"mcse_median": 0.5, "mcse_low": 0.025, "mcse_high": 0.975}
+    return {
+        "rhat": float(arviz.rhat(known, method="rank")),
+        "ess_bulk": float(arviz.ess(known, method="bulk")),
+        "ess_tail": float(arviz.ess(known, method="tail")),
+        **{name: float(arviz.mcse(known, method="quantile", prob=at)) for name, at in errors.items()},
+    }
+
+
 def inference_data(draws: Mapping[str, FloatArray]) -> Any:
-    """Draws as `arviz.InferenceData` with one group, ``posterior``.
+    """Convert draws to `arviz.InferenceData` with one group, ``posterior``.
 
     Parameters
     ----------

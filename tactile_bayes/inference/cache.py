@@ -1,4 +1,4 @@
-"""What is linear in a map, solved where the density is evaluated and kept for the draws that come from there."""
+"""Cache of conditional (linear) solutions by parameter vector, reused when those points become draws."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Solution = tuple[FloatArray, ...]
 
 
 class Solved:
-    """A memory of solutions, found again by the parameter vector that they belong to.
+    """Cache of solutions by parameter vector.
 
     Importance sampling evaluates the density at points that its draws are then chosen from. Solving those a second
     time for the amplitude, level and noise scale of the draws cost as much as the sampling.
@@ -38,7 +38,7 @@ class Solved:
         self._index = None
 
     def __call__(self, theta: FloatArray) -> Solution:
-        """The solution at (m, p) parameter vectors: kept ones where all are known, else solved anew."""
+        """Solutions at (m, p) parameter vectors: cached where all are known, else computed."""
         if not self._theta:
             return self._solve(theta)
         points, kept = self._sorted()
@@ -48,7 +48,7 @@ class Solved:
         return tuple(one[row] for one in kept)
 
     def _sorted(self) -> tuple[FloatArray, Solution]:
-        """All points by their first coordinate, in which no two random points agree, and their solutions."""
+        """All points in order of their first coordinate, which random points never share, and their solutions."""
         if self._index is None:
             theta = np.concatenate(self._theta)
             order = np.argsort(theta[:, 0], kind="stable")
@@ -58,7 +58,7 @@ class Solved:
 
 
 def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The distinct rows in order, and for each row its place among them: ``np.unique``, quicker for random points.
+    """Distinct rows in order, and the index of each row among them: ``np.unique``, quicker for random points.
 
     No two of those agree in their first coordinate; where some do, rows are compared as a whole.
     """

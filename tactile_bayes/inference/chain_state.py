@@ -1,4 +1,4 @@
-"""The state of an interrupted ensemble: what must be kept so that it goes on as if it had never stopped."""
+"""State of an interrupted ensemble, from which it continues exactly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tactile_bayes.geometry import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainState:
-    """All ensembles after the same number of steps.
+    """State of all ensembles after the same number of steps.
 
     Parameters
     ----------
@@ -36,15 +36,15 @@ class ChainState:
     cursor: FloatArray
 
     def as_arrays(self) -> Mapping[str, Any]:
-        """The arrays by name."""
+        """The state as arrays by name."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
 class ChainStore(Protocol):
-    """Somewhere to keep a state, under a key that says what it belongs to."""
+    """Interface of a store for the state, under a key for what it belongs to."""
 
     def load(self, key: str) -> ChainState | None:
-        """The state kept under this key; None where there is none yet. Another key's state is an error."""
+        """Load the state of this key; None without one. Another key's state is an error."""
 
     def save(self, key: str, state: ChainState) -> None:
-        """Keep a state in place of the last one."""
+        """Store a state in place of the last one."""

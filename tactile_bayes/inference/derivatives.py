@@ -1,4 +1,4 @@
-"""Gradient and Hessian of a scalar function by central differences, all points in one call."""
+"""Gradient and Hessian of a scalar function by central differences, evaluated in one call."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tactile_bayes.geometry import FloatArray
 
 
 def stencil(theta: FloatArray, *, step: FloatArray) -> FloatArray:
-    """(1 + 2 p^2, p) points of central first and second differences, `theta` first."""
+    """(1 + 2 p^2, p) points for central first and second differences, `theta` first."""
     shifts = np.diag(step)
     points = [theta[None], theta + shifts, theta - shifts]
     for i, j in _pairs(len(theta)):

@@ -1,4 +1,4 @@
-"""What every method returns: draws of the model's parameters, with how they were obtained."""
+"""Draws of a model's parameters, the result of every method."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Labels = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 def even_replicates(number: int) -> Labels:
-    """(number,) labels that divide independent draws into `REPLICATES` parts."""
+    """(number,) labels that divide independent draws into `REPLICATES` parts of equal size."""
     return np.arange(number) * REPLICATES // max(number, 1)
 
 
@@ -37,16 +37,20 @@ class ParameterDraws:
         Figures of the method (R-hat, effective draws, evaluations...), for the report.
     labels : (chain * draw,) array or None
         The independent replicate that each draw comes from, for draws in one chain; None for independent draws.
+    statistics
+        (chain, draw) arrays of the sampler by name: ``lp``, the log density at the draw; ``log_weight``, of the point
+        that importance sampling took it from; ``accepted``, 1 where the chain's walker moved there in that step.
     """
 
     theta: FloatArray
     method: str
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     labels: Labels | None = None
+    statistics: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def flat(self) -> FloatArray:
-        """(chain * draw, p) all draws."""
+        """(chain * draw, p) draws of all chains."""
         return self.theta.reshape(-1, self.theta.shape[-1])
 
     @property
@@ -59,7 +63,7 @@ class ParameterDraws:
 
     @property
     def effective_draws(self) -> float:
-        """Draws this set is worth for an end point: the smallest tail ESS, or all when they are independent."""
+        """Effective draws for an interval's end: the smallest tail ESS, or all when independent."""
         return float(min(self.diagnostics.get("ess_tail", np.inf), len(self.flat)))
 
 

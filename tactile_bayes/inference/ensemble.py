@@ -1,4 +1,4 @@
-"""Markov chain Monte Carlo by independent emcee ensembles that must agree with each other before they stop."""
+"""Markov chain Monte Carlo by several independent emcee ensembles, which must agree before they stop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WALKERS_PER_PARAMETER = 4
 
 @dataclass(frozen=True, slots=True)
 class EnsembleOptions:
-    """When to stop.
+    """Stopping rule of the ensembles.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class EnsembleOptions:
     keep: int = 8000
 
     def identity(self) -> str:
-        """What a checkpoint is bound to: everything but how long to go on."""
+        """Settings that a checkpoint belongs to: all but the number of steps."""
         return str({"ensembles": self.ensembles, "walkers_per_parameter": WALKERS_PER_PARAMETER, "block": self.block})
 
 
@@ -62,7 +62,7 @@ def ensemble(
     store: ChainStore | None = None,
     key: str = "",
 ) -> ParameterDraws:
-    """Draw from a log density, starting from draws of it, or from overdispersed normal draws about its mode.
+    """Draw from a log density, starting from given draws or from overdispersed normal draws about its mode.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def ensemble(
             figures |= {"steps": float(steps), "walkers": float(samplers[0].walkers), "ensembles": len(samplers)}
             figures |= {"evaluations": float(steps * samplers[0].walkers * len(samplers))}
             figures |= {"acceptance": float(np.mean([sampler.acceptance() for sampler in samplers]))}
-            return ParameterDraws(_thin(chains, options.keep), "ensemble", figures)
+            return _kept_draws(samplers, chains, figures, log_density=log_density, keep=options.keep)
     if not figures:
         raise NotConvergedError(f"the checkpoint has {samplers[0].steps} steps, more than max_steps allows")
     raise NotConvergedError(_advice(figures, options), diagnostics=figures)
@@ -146,15 +146,16 @@ class _Ensemble:
         random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
         self._state = emcee.State((begin - self._centre) / self._scale, random_state=random_state)
         self._chain = np.empty((0, self.walkers, p))
+        self._log_density = np.empty((0, self.walkers))
         self._accepted = 0.0
 
     def _standardised(self, log_density: LogDensity) -> LogDensity:
-        """The density of ``(theta - centre) / scale``: emcee judges the walkers' independence by their numbers."""
+        """Density of ``(theta - centre) / scale``: emcee tests the walkers' independence by their condition number."""
         return lambda z: log_density(self._centre + self._scale * z)
 
     @property
     def steps(self) -> int:
-        """Steps taken."""
+        """Number of steps taken."""
         return len(self._chain)
 
     def advance(self, steps: int) -> None:
@@ -162,26 +163,35 @@ class _Ensemble:
         self._sampler.reset()
         self._state = self._sampler.run_mcmc(self._state, steps)
         self._chain = np.concatenate([self._chain, self._sampler.get_chain()])
+        self._log_density = np.concatenate([self._log_density, self._sampler.get_log_prob()])
         self._accepted += float(np.mean(self._sampler.backend.accepted))
 
     def chain(self) -> FloatArray:
-        """(draw, p): the last two thirds, walker after walker: neighbours in the array are neighbours in time."""
+        """(draw, p) last two thirds, walker after walker, so that neighbours in the array are neighbours in time."""
         kept = self._centre + self._scale * self._chain[self.steps // 3 :]
         return np.asarray(np.swapaxes(kept, 0, 1).reshape(-1, kept.shape[-1]))
 
+    def statistics(self) -> dict[str, FloatArray]:
+        """(draw,) log densities and whether the walker moved, in the order of `chain`; NaN before a restored state."""
+        first = self.steps // 3
+        moved = np.any(self._chain[1:] != self._chain[:-1], axis=2)
+        accepted = np.concatenate([np.ones((1, self.walkers)), moved])
+        return {"lp": self._log_density[first:].T.ravel(), "accepted": accepted[first:].T.ravel()}
+
     def acceptance(self) -> float:
-        """Share of the proposals that were taken."""
+        """Share of accepted proposals."""
         return self._accepted / self.steps
 
     def kept(self) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
-        """Chain, last log densities, accepted proposals, generator's key and its cursor."""
+        """State: chain, last log densities, accepted proposals, generator's key and cursor."""
         _, key, position, has_normal, normal = self._state.random_state
         cursor = np.array([position, has_normal, normal], dtype=np.float64)
         return self._chain, np.asarray(self._state.log_prob), self._accepted, key, cursor
 
     def restore(self, state: ChainState, index: int) -> None:
-        """Go on from a kept state."""
+        """Continue from a stored state."""
         self._chain, self._accepted = state.chain[index], float(state.accepted[index])
+        self._log_density = np.full(self._chain.shape[:2], np.nan)
         position, has_normal, normal = state.cursor[index]
         random_state = ("MT19937", state.twister[index], int(position), int(has_normal), float(normal))
         self._state = emcee.State(
@@ -206,9 +216,18 @@ def _finite_start(
     raise NotConvergedError("the posterior is not finite near its mode; check the map")
 
 
-def _thin(chains: FloatArray, keep: int) -> FloatArray:
+def _kept_draws(
+    samplers: list[_Ensemble], chains: FloatArray, figures: dict[str, float], *, log_density: LogDensity, keep: int
+) -> ParameterDraws:
+    """Chains thinned evenly, with their statistics; log densities that a checkpoint does not hold are worked out."""
     stride = max(1, (chains.shape[0] * chains.shape[1]) // keep)
-    return np.ascontiguousarray(chains[:, ::stride])
+    theta = np.ascontiguousarray(chains[:, ::stride])
+    each = [sampler.statistics() for sampler in samplers]
+    statistics = {name: np.stack([one[name] for one in each])[:, ::stride] for name in each[0]}
+    unknown = np.isnan(statistics["lp"])
+    if unknown.any():
+        statistics["lp"][unknown] = log_density(theta[unknown])
+    return ParameterDraws(theta, "ensemble", figures, statistics=statistics)
 
 
 def _advice(figures: dict[str, float], options: EnsembleOptions) -> str:

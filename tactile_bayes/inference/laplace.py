@@ -1,4 +1,4 @@
-"""The approximation by mode and curvature: normal given the noise scale."""
+"""Laplace approximation, from mode and curvature: normal given the noise scale."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def laplace(
     dof: float,
     rng: np.random.Generator,
 ) -> ParameterDraws:
-    """Draws from the t density with the mode and the curvature of a log density.
+    """Draw from the t density with the mode and curvature of a log density.
 
     Given the noise scale the approximation is normal; that scale has `dof` degrees of freedom, so the draws are those
     of a multivariate t. For a linear model this is exact. `log_density`, `start` and `scale` as in
@@ -38,7 +38,7 @@ def laplace(
 def mode_and_covariance(
     log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Mode of a log density by damped Newton steps, and the inverse of its negative Hessian there.
+    """Find the mode of a log density by damped Newton steps, and the inverse of its negative Hessian there.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def find_mode(
 
 
 def _slopes(log_density: LogDensity, theta: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gradient and Hessian, or an error where a neighbouring point has no density."""
+    """Gradient and Hessian; an error where a neighbouring point has no density."""
     values = log_density(stencil(theta, step=step))
     if not np.isfinite(values).all():
         raise NotConvergedError(
@@ -107,7 +107,7 @@ def _slopes(log_density: LogDensity, theta: FloatArray, *, step: FloatArray) -> 
 
 
 def _newton_step(gradient: FloatArray, curvature: FloatArray, damping: float) -> FloatArray:
-    """Uphill step in standardised units; negative curvature is turned round."""
+    """Uphill step in standardised units; directions of negative curvature are flipped."""
     values, vectors = np.linalg.eigh(curvature)
     safe = np.maximum(np.abs(values), 1e-3) + damping * max(1.0, float(np.abs(values).max()))
     return np.asarray(np.clip(vectors @ ((vectors.T @ gradient) / safe), -2.0, 2.0))

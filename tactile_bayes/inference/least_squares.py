@@ -1,4 +1,4 @@
-"""Nonlinear least squares for small models: Levenberg-Marquardt in numpy, so that a fit needs no slow import."""
+"""Nonlinear least squares for small models: Levenberg-Marquardt in numpy, which starts fast."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def inverse_information(jacobian: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def numerical_jacobian(model: ModelFunction, theta: FloatArray, *, scale: FloatArray) -> FloatArray:
-    """Central differences, (k, p); `scale` (p,) is the size over which the model bends in each parameter."""
+    """(k, p) Jacobian by central differences; `scale` (p,) is the model's typical length in each parameter."""
     step = 1e-5 * scale
     shifts = np.diag(step)
     values = model(np.concatenate([theta + shifts, theta - shifts]))

@@ -1,4 +1,4 @@
-"""The normal distribution function and its inverse, without a slow import."""
+"""The normal distribution function and its inverse, without the slow import of scipy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's method: least squares (Eq 7) and its covariance, no prior."""
+"""The paper's method: least squares (Eq 7) with its covariance and no prior."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def optimise(
     dof: float,
     rng: np.random.Generator,
 ) -> ParameterDraws:
-    """Draws about the least-squares estimate with its covariance and the t tails of an estimated noise.
+    """Draw about the least-squares estimate, with its covariance and t tails for the estimated noise.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Draws with a small Monte-Carlo error of what is open beside a map: evenly spread points, and smoothed quantiles."""
+"""Evenly spread points and smoothed quantiles, for small Monte-Carlo errors of quantities not read from the map."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEAST_SD = 1e-2
 
 
 def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.random.Generator) -> FloatArray:
-    """Uniform points in (0, 1) to draw further quantities from, one point a draw.
+    """Uniform points in (0, 1) for drawing further quantities, one point per draw.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.r
 
 
 def evened(values: FloatArray, mean: FloatArray, sd: FloatArray, replicates: Labels) -> FloatArray:
-    """Draws of a normal each, with the quantiles of the mixture of these normals in place of those by chance.
+    """Replace normal draws by evenly spaced quantiles of the mixture of their normals.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def _mixture_quantiles(mean: FloatArray, sd: FloatArray) -> FloatArray:
 
 
 def _merged(mean: FloatArray, sd: FloatArray, *, by: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fewer normals: each `MERGED` neighbours in the order of `by` become one of their mean and variance."""
+    """Merge each `MERGED` neighbours, in the order of `by`, into one normal of their mean and variance."""
     n = len(mean) // MERGED * MERGED
     if n < LEAST_MERGED:
         return mean, sd

@@ -1,4 +1,4 @@
-"""Pareto-smoothed importance weights, and the shape that says whether importance sampling can be trusted."""
+"""Pareto-smoothed importance sampling (PSIS): smoothed weights, and the shape that shows if they can be trusted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TRUSTED_SHAPE = 0.7
 
 
 def smooth_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
-    """Normalised weights with their upper tail replaced by the quantiles of a fitted Pareto tail.
+    """Smooth weights (PSIS): replace the upper tail by quantiles of a fitted Pareto tail, and normalise.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def smooth_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
 
 
 def fit_generalised_pareto(excess: FloatArray) -> tuple[float, float]:
-    """Shape and scale of a generalised Pareto distribution from ascending positive excesses.
+    """Fit shape and scale of a generalised Pareto distribution to ascending positive excesses.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Whether ranks are uniform: what simulation-based calibration asks of a posterior's draws.
+"""Tests of uniform ranks, for simulation-based calibration.
 
 References
 ----------
@@ -23,7 +23,7 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How often the central interval of a nominal probability held the truth, with its binomial standard error."""
+    """Share of truths that a central interval of nominal probability covered, with its binomial standard error."""
 
     probability: float
     covered: float
@@ -32,7 +32,7 @@ class Coverage:
 
 @dataclass(frozen=True, slots=True)
 class RankTest:
-    """What the ranks of one parameter say.
+    """Results of the tests on one parameter's ranks.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class RankTest:
 
 
 def rank_test(name: str, ranks: IntArray, *, draws: int, strays: FloatArray | None = None) -> RankTest:
-    """All tests of one parameter's ranks.
+    """Run all tests on one parameter's ranks.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def rank_test(name: str, ranks: IntArray, *, draws: int, strays: FloatArray | No
 
 
 def chi2_p(ranks: IntArray, draws: int) -> float:
-    """P value of the numbers in equal bins of ranks: at most 20, each with `LEAST_IN_BIN` or more expected."""
+    """P value of the counts in equal bins of ranks: at most 20 bins, each with `LEAST_IN_BIN` or more expected."""
     from scipy.stats import chi2
 
     bins = [b for b in range(2, 21) if (draws + 1) % b == 0 and len(ranks) >= LEAST_IN_BIN * b]
@@ -104,7 +104,7 @@ def chi2_p(ranks: IntArray, draws: int) -> float:
 
 
 def coverage(ranks: IntArray, draws: int, probability: float) -> Coverage:
-    """Share of truths in the central interval between two draws, which holds exactly the nominal share of ranks.
+    """Share of truths in the central interval between two draws that holds exactly the nominal share of ranks.
 
     Raises
     ------
@@ -119,13 +119,13 @@ def coverage(ranks: IntArray, draws: int, probability: float) -> Coverage:
 
 
 def ecdf_counts(ranks: IntArray, draws: int) -> IntArray:
-    """(m, draws) how many of (m, n) ranks lie below 1, 2 ... `draws`."""
+    """(m, draws) number of (m, n) ranks below 1, 2 ... `draws`."""
     below = ranks[..., None] < np.arange(1, draws + 1)
     return np.asarray(below.sum(axis=-2))
 
 
 def stray(counts: IntArray, n: int) -> FloatArray:
-    """(m,) smallest two-sided binomial tail of (m, draws) counts of n ranks: small where an ECDF strays somewhere."""
+    """(m,) smallest two-sided binomial tail of (m, draws) counts of n ranks: small where an ECDF departs somewhere."""
     from scipy.stats import binom
 
     at = np.arange(1, counts.shape[-1] + 1) / (counts.shape[-1] + 1)
@@ -135,14 +135,14 @@ def stray(counts: IntArray, n: int) -> FloatArray:
 
 
 def uniform_strays(n: int, draws: int) -> FloatArray:
-    """(BAND_SIMULATIONS,) `stray` of n uniform ranks, from random numbers of their own: the same each time."""
+    """(BAND_SIMULATIONS,) `stray` of n simulated uniform ranks, with a seed of their own."""
     rng = np.random.default_rng([n, draws])
     number = rng.multinomial(n, np.full(draws + 1, 1.0 / (draws + 1)), size=BAND_SIMULATIONS)
     return stray(np.cumsum(number, axis=1)[:, :-1], n)
 
 
 def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
-    """(draws,) lowest and highest share of n ranks below 1, 2 ... that uniform ranks keep to everywhere at once.
+    """(draws,) simultaneous band: lowest and highest share of n uniform ranks below 1, 2 ...
 
     Each point's binomial limits are as wide as makes the whole path stay inside with probability `BAND`.
     """

@@ -1,4 +1,4 @@
-"""Sobol points with random digital shifts: the integrator's low-discrepancy set, without a slow import.
+"""Sobol points with random digital shifts, without the slow import of scipy.
 
 The library's generator lies behind 0.9 s of imports; the points are the same (a test compares them).
 """
@@ -45,7 +45,7 @@ def sobol_integers(start: int, number: int, dimension: int) -> np.ndarray[tuple[
 
 
 def shifted_sobol(start: int, number: int, *, shifts: np.ndarray[tuple[int, ...], np.dtype[np.uint32]]) -> FloatArray:
-    """Uniform points in (0, 1): one digital shift of the sequence for each row of `shifts`.
+    """Uniform points in (0, 1): the sequence under one digital shift for each row of `shifts`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A posterior in seven numbers, its interval's kind and probability always named."""
+"""Summary of a posterior in seven numbers, with its interval's kind and probability."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def summarise(
     effective_draws: float | None = None,
     replicates: Labels | None = None,
 ) -> Quantity:
-    """Summarise draws; NaN draws are left out.
+    """Summarise draws, leaving NaN out.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def summarise(
 
 
 def _tail_error(values: FloatArray, replicates: Labels, ends: tuple[float, float]) -> float:
-    """Standard error of the probability beyond an interval's end, from the replicates' own; that of both ends alike.
+    """Standard error of the probability beyond an interval's end, from the replicates; one value for both ends.
 
     Notes
     -----

@@ -23,7 +23,7 @@ _HOME = {
 
 
 def __getattr__(name: str) -> object:
-    """Import a name's module when it is asked for: an estimate needs the map, not what builds one."""
+    """Import a name's module on first use: an estimate needs the map, not the code that builds one."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

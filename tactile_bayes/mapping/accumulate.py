@@ -16,7 +16,7 @@ GAIN_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accumulated:
-    """Sums over all frames, and how the frames' gains were found.
+    """Sums over all frames, and how the gains were solved.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Accumulated:
 
     @property
     def settled(self) -> bool:
-        """Whether the gains stopped changing."""
+        """Whether the gains converged."""
         return self.last_change <= GAIN_TOLERANCE
 
 

@@ -1,4 +1,4 @@
-"""A map that grows frame by frame: live, in shards or all at once, it ends in the same bits."""
+"""A map that grows frame by frame; live, sharded and one-pass building end in the same bits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PORTION = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapGrid:
-    """Where the cells of a map lie.
+    """Lattice of a map's cells on a plane.
 
     Parameters
     ----------
@@ -50,17 +50,17 @@ class MapGrid:
 
     @classmethod
     def under(cls, head: HeadGeometry, poses: FramePoses, *, cell_mm: float = CELL_MM) -> MapGrid:
-        """On the best plane of the known ones of `poses`: to begin with, before the head has moved."""
+        """Grid on the best-fit plane of the known `poses`, for the start of a recording."""
         return cls(head_moments(head, poses).plane().plane_from_base, cell_mm)
 
     def same(self, other: MapGrid) -> bool:
-        """Whether the cells are the same, to the bit."""
+        """Whether another grid is equal to the bit."""
         return self.cell_mm == other.cell_mm and np.array_equal(self.plane_from_base, other.plane_from_base)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instrument:
-    """What turns counts and poses into pressures on a plane, and which frames count.
+    """Conversion of counts and poses to pressures on a plane, and the rules for frames that count.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Instrument:
         return good
 
     def differs(self, other: Instrument) -> str:
-        """The name of the first thing that differs, or nothing."""
+        """Name of the first setting that differs; empty if none does."""
         arrays = (
             ("head", self.head.surface_mm, other.head.surface_mm),
             ("lever arm", self.head.scanhead_from_tracker, other.head.scanhead_from_tracker),
@@ -110,7 +110,7 @@ class Instrument:
 
 
 class MapAccumulator:
-    """Frames go in, in any portions and any order; a map comes out at any time.
+    """Accumulates frames, in any portions and order, into a map that can be read at any time.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class MapAccumulator:
         if counts.dtype != np.uint16 or counts.shape != (len(poses.known), *self.instrument.head.shape):
             raise BadDataError(
                 f"counts is {counts.dtype} of shape {counts.shape} for {len(poses.known)} poses",
-                way_out="give uint16 (n, rows, columns), one pose a frame",
+                way_out="give uint16 (n, rows, columns), one pose per frame",
             )
         if self._kept is not None:
             self._kept.append((counts, poses))
@@ -182,7 +182,7 @@ class MapAccumulator:
         return sum(self._add(counts[part], poses.part(part)) for part in chunks(len(counts), _PORTION))
 
     def _add(self, counts: CountArray, poses: FramePoses) -> int:
-        """A portion: projected and counted as a whole, read in chunks that suit the engine."""
+        """Add a portion: projected and counted as a whole, read in chunks that suit the engine."""
         readout, projection = self.instrument.readout, self._projector.at(poses)
         size = self._engine.chunk_frames(readout.size)
         if len(counts) <= size:
@@ -196,7 +196,7 @@ class MapAccumulator:
         return int(np.count_nonzero(used))
 
     def _read(self, readings: CountArray, known: BoolArray, projection: Projection) -> BoolArray:
-        """Which frames of a chunk are used, after they were added."""
+        """Add a chunk; return which of its frames are used."""
         instrument, engine = self.instrument, self._engine
         level, share = engine.levels(instrument.readout, readings)
         low, high, used = gate(known, level, share, pressure_window_kpa=instrument.pressure_window_kpa)
@@ -212,7 +212,7 @@ class MapAccumulator:
         return used
 
     def _count(self, known: BoolArray, low: BoolArray, high: BoolArray, used: BoolArray) -> int:
-        """Put each frame under one heading; the number used."""
+        """Count each frame as used or under its reason; return the number used."""
         total, number = len(used), int(np.count_nonzero(used))
         refused = int(np.count_nonzero(low)), int(np.count_nonzero(high))
         unknown = total - int(np.count_nonzero(known))
@@ -222,7 +222,7 @@ class MapAccumulator:
         return number
 
     def merge(self, other: MapAccumulator) -> None:
-        """Add all that another one was given.
+        """Add everything that another accumulator was given.
 
         Raises
         ------
@@ -261,7 +261,7 @@ class MapAccumulator:
         return self._merged + moments if self._merged.count else moments
 
     def rebuild(self) -> MapAccumulator:
-        """A new one with the frames kept so far, on the best-fit plane of them.
+        """Make a new accumulator from the frames kept so far, on their best-fit plane.
 
         Raises
         ------
@@ -277,7 +277,7 @@ class MapAccumulator:
         return anew
 
     def snapshot(self) -> TactileMap:
-        """The map so far; later frames do not change it. Without a frame it has no cell.
+        """The map so far, a copy; it has no cell before the first frame.
 
         What a frame's readings share (`tactile_bayes.mapping.shared_frames`) is not in its quality: the errors of
         frames are not kept, and with the next frame they would be others.

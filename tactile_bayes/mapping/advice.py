@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.strokes import smooth
+from tactile_bayes.mapping.smoothing import smooth
 from tactile_bayes.mapping.tactile_map import TactileMap
 
 _FWHM = 2.3548  # of a Gaussian, in sigmas
@@ -21,7 +21,7 @@ _LEAST_RISE = 4.0
 
 @dataclass(frozen=True, slots=True)
 class CellAdvice:
-    """What is known about the size of the cells.
+    """Advice on the size of the cells.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class CellAdvice:
     readings: float
 
     def text(self) -> str:
-        """One line: which cells measure the bump, and what half of the present ones would cost."""
+        """One line: which cells measure the bump, and what cells of half the present size would cost."""
         half = self.cell_mm / 2
         head = f"bump of sigma {self.sigma_mm:.1f} mm: measured well by cells of up to {self.coarsest_mm:.1f} mm"
         if self.cell_mm > self.coarsest_mm:
@@ -50,7 +50,7 @@ class CellAdvice:
 
 
 def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
-    """Advice from the highest bump of a map; None where nothing stands out.
+    """Advise on the cell from a map's highest bump; None where nothing stands out.
 
     Notes
     -----
@@ -78,7 +78,7 @@ def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
 
 
 def _smoothed(tactile_map: TactileMap) -> FloatArray:
-    """The map, smoothed with its counts; NaN where few readings are."""
+    """The map, smoothed with its counts as weights; NaN where readings are few."""
     count = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
     weight = smooth(count)
     total = smooth(np.where(tactile_map.covered, tactile_map.mean, 0.0) * count)
@@ -88,7 +88,7 @@ def _smoothed(tactile_map: TactileMap) -> FloatArray:
 
 
 def _extent(excess: FloatArray, at: int) -> float:
-    """Full width at half height about an index, in cells, by linear interpolation; NaN where it meets the rim."""
+    """Full width at half height about an index, in cells, by linear interpolation; NaN where it reaches the rim."""
     half = excess[at] / 2
     width = 0.0
     for way in (1, -1):

@@ -1,4 +1,4 @@
-"""One call from scans to a tactile map."""
+"""Building of a tactile map from scans."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from tactile_bayes.mapping.shared_frames import shared_frame_figures
 from tactile_bayes.mapping.source import Progress, no_progress, sources_of
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.thinning import every_nth
 from tactile_bayes.mapping.timing import timing_figures
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import Scan
@@ -47,6 +48,7 @@ def build_map(
     plane_radius_mm: float | str | None = None,
     flat_field: bool = False,
     register_strokes: bool = False,
+    every: int = 1,
     engine: str = "auto",
     progress: Progress = no_progress,
 ) -> TactileMap:
@@ -73,6 +75,8 @@ def build_map(
         Take off the head's own response, found from the frames that saw no lump.
     register_strokes
         Shift the strokes onto each other before they are averaged, for a lump that follows the head.
+    every
+        Use one frame of every so many: quicker, and noisier.
     engine
         ``"numpy"``, ``"fast"`` (compiled; needs the extra ``[fast]``) or ``"auto"``: the same map, bit for bit.
     progress
@@ -89,7 +93,7 @@ def build_map(
     rest by their mean, (iii) project and average. All sums are over whole numbers: the order of frames and scans does
     not change a bit of the map.
     """
-    parts = [scans] if isinstance(scans, Scan) else list(scans)
+    parts = [every_nth(scan, every) for scan in ([scans] if isinstance(scans, Scan) else scans)]
     _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms, plane_radius_mm)
     if latency_ms == "auto" and register_strokes:
         raise UsageError(
@@ -98,7 +102,7 @@ def build_map(
     _check_same_examination(parts)
     loops = choose_engine(engine, readings=sum(scan.frames.counts.size for scan in parts))
     rules = _Rules(_window(pressure_window_kpa), max_pose_gap_ms, loops)
-    figures: dict[str, float] = {}
+    figures: dict[str, float] = {} if every == 1 else {"frames_every": float(every)}
     late_ms = 0.0 if isinstance(latency_ms, str) else float(latency_ms)
     selections = rules.select(parts, late_ms)
     figures |= head_profile_figures(selections)
@@ -115,8 +119,7 @@ def build_map(
         figures.update(near)
     sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
     if register_strokes:
-        levels = [source.selection.level_kpa[source.selection.used] for source in sources]
-        sources, strokes = find_shifts(sources, levels, cell_mm=cell_mm, engine=loops)
+        sources, strokes = find_shifts(sources)
         figures.update(stroke_figures(strokes))
     done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
     figures.update(shared_frame_figures(sources, done.levels, done.sums))
@@ -126,14 +129,14 @@ def build_map(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rules:
-    """Which frames are used, whatever the latency."""
+    """Rules for using frames, independent of the latency."""
 
     window_kpa: tuple[float, float]
     max_pose_gap_ms: float
     engine: Engine
 
     def select(self, scans: list[Scan], late_ms: float) -> list[SelectedFrames]:
-        """Decide about every frame; refuse scans of which none is left."""
+        """Select the used frames of every scan; an error if none is left in any of them."""
         found = [
             select_frames(
                 scan,
@@ -151,7 +154,7 @@ class _Rules:
 def _flattened(
     selections: list[SelectedFrames], rules: _Rules, late_ms: float, figures: dict[str, float]
 ) -> list[SelectedFrames]:
-    """The scans with the head's own response taken off, decided about anew; those without a used frame drop out."""
+    """Divide the head's own response out of the scans and select frames anew; drops scans without a used frame."""
     used = [part for part in selections if part.used.any()]
     flats = [find_flat_field(part) for part in used]
     figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
@@ -162,16 +165,20 @@ def _flattened(
 def _latency(selections: list[SelectedFrames], rules: _Rules, cell_mm: float, figures: dict[str, float]) -> float:
     found = estimate_latency(
         selections,
-        plane_from_base=_plane(selections).plane_from_base,
+        plane=_plane(selections),
         cell_mm=cell_mm,
         max_pose_gap_ms=rules.max_pose_gap_ms,
     )
-    figures |= {"latency_sd_ms": found.sd_ms, "latency_frames": float(found.frames)}
+    figures |= {
+        "latency_sd_ms": found.sd_ms,
+        "latency_bound_ms": found.bound_ms,
+        "latency_frames": float(found.frames),
+    }
     return found.latency_ms
 
 
 def _plane(selections: list[SelectedFrames]) -> Plane:
-    """Best-fit plane of all frames used; a refusal names the rotation convention that would fit."""
+    """Best-fit plane of all frames used; an error names the rotation convention that would fit."""
     moments = HeadMoments.none()
     for part in selections:
         moments = moments + head_moments(part.scan.head, part.used_poses)
@@ -194,7 +201,7 @@ def _check_same_examination(scans: list[Scan]) -> None:
         values = sorted({scan.session[name] for scan in scans if name in scan.session})
         if len(values) > 1:
             raise BadDataError(
-                f"the scans differ in {name} ({', '.join(values)})", way_out="make one map an examination"
+                f"the scans differ in {name} ({', '.join(values)})", way_out="build one map per examination"
             )
 
 
@@ -257,7 +264,7 @@ def _as_map(
 
 
 def _masked(selections: list[SelectedFrames]) -> tuple[str, ...]:
-    """Each taxel that is left out, named with its scan where there are several."""
+    """List the taxels left out, with their scan's name where there are several."""
     several = len(selections) > 1
     return tuple(
         f"scan {number} {fault}" if several else str(fault)
@@ -267,7 +274,7 @@ def _masked(selections: list[SelectedFrames]) -> tuple[str, ...]:
 
 
 def _patient_from_plane(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, dict[str, float]]:
-    """Patient frame from the landmarks, averaged over the scans that have them, and how far repeats lie apart."""
+    """Patient frame from the mean landmarks of the scans that have them, and the distance between repeats."""
     touched = [scan.landmarks for scan in scans if scan.landmarks is not None]
     if not touched:
         return None, {}
@@ -277,7 +284,7 @@ def _patient_from_plane(scans: list[Scan], plane: Plane) -> tuple[FloatArray | N
     if shift > MAX_LANDMARK_SHIFT_MM:
         raise BadDataError(
             f"the scans' landmarks lie up to {shift:.0f} mm from their mean",
-            way_out="the patient or the tracker moved between them: make one map a scan",
+            way_out="the patient or the tracker moved between them: build one map per scan",
         )
     transform = patient_from_plane(mean[0], mean[1], plane.plane_from_base)
     repeats = [marks.spread_mm for marks in touched if marks.spread_mm is not None]

@@ -1,4 +1,4 @@
-"""Sums of readings in square cells that come out the same, bit for bit, in whatever order and parts they are added."""
+"""Sums of readings in square cells that are the same to the bit in any order and any parts."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class CellSums:
         *,
         bounded: bool = False,
     ) -> None:
-        """Add at most `READINGS_PER_CALL` values in whole steps; `steps` is used up.
+        """Add at most `READINGS_PER_CALL` values in whole steps; overwrites `steps`.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class CellSums:
         self._add_inside(first, count, total, square)
 
     def _add_inside(self, first: tuple[int, int], count: IntArray, total: IntArray, square: IntArray) -> None:
-        """The same for a block that has room."""
+        """As `add_block`, for a block inside the arrays."""
         window = self.window(first, _shape(count))
         for sums, block in ((self.count, count), (self.total, total), (self.square, square)):
             part = sums[window]
@@ -182,12 +182,12 @@ class CellSums:
         return ratio
 
     def window(self, first: tuple[int, int], shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Where a block of the lattice lies in the arrays."""
+        """Slices of a block of the lattice in the arrays."""
         top, left = first[0] - self.first[0], first[1] - self.first[1]
         return slice(top, top + shape[0]), slice(left, left + shape[1])
 
     def make_room(self, first: tuple[int, int], shape: tuple[int, int]) -> None:
-        """Grow the arrays, with a margin, so that the given block of the lattice is inside."""
+        """Grow the arrays, with a margin, to contain a block of the lattice."""
         top, left, bottom, right = first[0], first[1], first[0] + shape[0], first[1] + shape[1]
         if self.count.size:
             held_bottom, held_right = self.first[0] + self.count.shape[0], self.first[1] + self.count.shape[1]

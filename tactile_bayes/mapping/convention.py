@@ -1,4 +1,4 @@
-"""In which order and sense a tracker tells its rotations: what the motion of the head says about it."""
+"""Check of a tracker's rotation convention (order and sense) against the motion of the head."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DECLARED = "scalar first"
 AGREEMENT = 0.9
 # Strokes far round a curved breast turn the face by 45 degrees either way, which leaves this much of its mean normal.
 LEAST_AGREEMENT = 0.8
-# Another convention that agrees better by this, and nearly wholly, is told: by chance that is rare.
+# Another convention that agrees better by this, and nearly wholly, is reported: by chance that is rare.
 BETTER_BY = 0.005
 NEARLY_WHOLE = 0.98
 # A motion narrower than this across its longest way (SD, mm) has no normal.
@@ -48,7 +48,7 @@ def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, floa
 
 
 def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
-    """Refuse rotations that cannot be what they are declared to be, and tell which convention agrees best.
+    """Refuse rotations that cannot follow the declared convention; name the one that agrees best.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
 
 
 def hint(selections: Sequence[SelectedFrames]) -> str:
-    """What to say when the head seems not to slide along its face: the convention that would make it."""
+    """Sentence for a head that seems not to slide along its face: the convention under which it would."""
     agreement = convention_agreement(selections) or {DECLARED: 0.0}
     return _way_out(agreement, _best(agreement))
 
@@ -101,7 +101,7 @@ def _way_out(agreement: dict[str, float], best: str) -> str:
 
 
 def _near_used(part: SelectedFrames) -> TrackerPoses:
-    """Distinct poses about the used frames: on the way to the skin a head moves as it likes."""
+    """Distinct poses about the used frames; poses before the head reached the skin say nothing."""
     poses = distinct_poses(part.scan.poses)
     used = part.scan.frames.time_s[part.used]
     if not len(used) or not len(poses):
@@ -113,7 +113,7 @@ def _near_used(part: SelectedFrames) -> TrackerPoses:
 
 
 def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], order: tuple[int, ...], sign: float) -> float:
-    """NaN where the apex hardly moves across its longest way."""
+    """Absolute inner product of both normals; NaN where the apex hardly moves across its longest direction."""
     normals, places = [], []
     for part, poses in parts:
         quaternion = poses.quaternion_wxyz[:, list(order)] * [1.0, sign, sign, sign]

@@ -1,4 +1,4 @@
-"""Which taxels of the array cannot be trusted over a whole scan."""
+"""Detection of faulty taxels over a whole scan."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TaxelFault(NamedTuple):
 
 
 class _Levels(NamedTuple):
-    """What the counts of each taxel say over a scan; (rows, columns) arrays."""
+    """Statistics of each taxel's counts over a scan; (rows, columns) arrays."""
 
     lowest: NDArray[np.uint16]
     highest: NDArray[np.uint16]
@@ -50,7 +50,7 @@ class _Levels(NamedTuple):
 
 
 def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
-    """Taxels to leave out of every frame of `scan`, in row order.
+    """Find the taxels to leave out of every frame of `scan`, in row order.
 
     - dead: gain 0, or never anything but one count while the level is next to nothing, or a level below a tenth of
       both its row's and its column's median;
@@ -97,7 +97,7 @@ def _neighbour_levels(mean_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _levels(scan: Scan) -> _Levels:
-    """Stream over the counts once."""
+    """Compute the statistics in one pass over the counts."""
     counts, calibration = scan.frames.counts, scan.element_calibration
     total = np.zeros(counts.shape[1:])
     steps, still = np.zeros(counts.shape[1:]), np.zeros(counts.shape[1:])

@@ -1,4 +1,4 @@
-"""Two ways through the inner loops, numpy and compiled, which give the same bits; and the choice between them."""
+"""The inner loops' two engines, numpy and compiled, which give the same bits, and the choice of one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping import loops
 from tactile_bayes.mapping.cells import LIMIT_STEPS, READINGS_PER_CALL, VALUE_STEP, CellSums
@@ -25,10 +25,10 @@ _FAST_FRAMES = 4096
 
 
 class Engine(Protocol):
-    """What a way through the loops must do; `chunk_frames` says how many frames a call should bring."""
+    """Interface of an engine."""
 
     def chunk_frames(self, taxels: int) -> int:
-        """Frames a call."""
+        """Number of frames that one call should have."""
         ...
 
     def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
@@ -50,7 +50,7 @@ class NumpyEngine:
         self._last: tuple[CountArray, FloatArray, BoolArray | None] | None = None
 
     def chunk_frames(self, taxels: int) -> int:
-        """Frames whose sums are exact in one call."""
+        """Frames per call whose sums are exact."""
         return max(1, min(128, READINGS_PER_CALL // max(1, taxels)))
 
     def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
@@ -80,7 +80,7 @@ class NumpyEngine:
 
 
 class LoopEngine:
-    """One fused loop a frame.
+    """One fused loop per frame.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class LoopEngine:
         self._levels, self._scatter = levels_loop, scatter_loop
 
     def chunk_frames(self, taxels: int) -> int:
-        """Enough that what a call costs beside its loop does not show, and few enough for the packed sums."""
+        """Frames per call: many against the cost of a call, few enough for the packed sums."""
         return max(1, min(_FAST_FRAMES, 2**21 // max(1, taxels)))
 
     def levels(self, readout: Readout, counts: CountArray) -> tuple[FloatArray, FloatArray]:
@@ -135,7 +135,7 @@ def _calibration(readout: Readout) -> tuple[FloatArray, FloatArray, int, float]:
 
 
 def _bounded(readout: Readout, level: FloatArray) -> bool:
-    """Whether no valid reading over its frame's level can be negative or beyond what cells hold.
+    """Whether no valid reading over its frame's level can be negative or exceed what cells hold.
 
     Valid readings lie below the sensor's range; then nobody has to look at each.
     """
@@ -143,13 +143,13 @@ def _bounded(readout: Readout, level: FloatArray) -> bool:
 
 
 def fast_is_installed() -> bool:
-    """Whether the extra ``[fast]`` is there."""
+    """Whether the extra ``[fast]`` is installed."""
     return find_spec("numba") is not None
 
 
 @cache
 def compiled_engine() -> Engine:
-    """The loops, compiled; the machine code is kept on disk beside them where that can be written."""
+    """The loops compiled by numba; the machine code is cached on disk beside them where possible."""
     import numba
 
     # The sum of a frame may be taken in any order, because it has no rounding; nothing else may.
@@ -159,7 +159,7 @@ def compiled_engine() -> Engine:
 
 
 def choose_engine(name: str, *, readings: int) -> Engine:
-    """The engine called `name`; ``"auto"`` compiles when the job is long enough to repay it.
+    """Choose the engine called `name`; ``"auto"`` compiles when the job is long enough to repay it.
 
     Parameters
     ----------
@@ -171,8 +171,7 @@ def choose_engine(name: str, *, readings: int) -> Engine:
     UsageError
         When ``"fast"`` is asked for and not installed.
     """
-    if name not in ENGINES:
-        raise UsageError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
+    check_choice("engine", name, ENGINES)
     if name == "fast" and not fast_is_installed():
         raise UsageError("the fast engine is not installed; pip install 'tactile-bayes[fast]', or use numpy")
     if name == "fast" or (name == "auto" and readings >= WORTH_COMPILING_READINGS and fast_is_installed()):

@@ -1,4 +1,4 @@
-"""A word beforehand where a map has many more cells than a fit of its window needs."""
+"""Notice for maps with many more cells than a fit needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MANY_CELLS: Final = 20_000
 
 
 def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
-    """One line where a window of this radius holds `MANY_CELLS` or more: what it costs, and which cells would do.
+    """Notice for a window of `MANY_CELLS` or more: what it costs, and which cells would do; else None.
 
     Parameters
     ----------

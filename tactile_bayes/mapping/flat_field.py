@@ -1,4 +1,4 @@
-"""What each taxel reads of an even pressure, from the frames that saw no lump."""
+"""Response of each taxel to an even pressure, from frames without a lump."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEAST_FRAMES = 50
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlatField:
-    """Response of each taxel over that of the array's mean.
+    """Response of each taxel relative to the array's mean.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class FlatField:
         return float(self.response.std())
 
     def applied(self, scan: Scan) -> Scan:
-        """The scan with its calibration divided by the response."""
+        """Copy of the scan with its calibration divided by the response."""
         calibration = scan.element_calibration
         flat = replace(
             calibration,
@@ -52,7 +52,7 @@ class FlatField:
 
 
 def flat_field(selection: SelectedFrames) -> FlatField:
-    """Response of the taxels over the lump-free frames of a scan.
+    """Estimate the taxels' response over the lump-free frames of a scan.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def flat_field(selection: SelectedFrames) -> FlatField:
 
 
 def _calm(ratio: FloatArray) -> BoolArray:
-    """(f,) True for frames that depart from the median profile no more than the calmest tenth, or hardly."""
+    """(f,) True where the departure from the median profile is at most `CALM_FACTOR` times its quantile 0.1."""
     departure = np.sqrt(np.square(ratio - np.median(ratio, axis=0)).mean(axis=1))
     calm: BoolArray = departure <= CALM_FACTOR * float(np.quantile(departure, 0.1))
     return calm

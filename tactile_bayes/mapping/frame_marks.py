@@ -1,4 +1,4 @@
-"""A random choice of frames, the same live, at once, in shards and in any order: by a hash of each frame's level.
+"""Reproducible random choice of frames by a hash of their levels, independent of order and portions.
 
 A statistic that needs no more than some thousand frames is taken from those with the smallest marks. The choice depends
 on the set of frames alone, and shards agree on it without knowing each other.
@@ -17,7 +17,7 @@ _LAST_SHIFT = np.uint64(31)
 
 
 def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
-    """A frame's mark: its level's bits, mixed until they look random.
+    """Hash of each frame's level.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
 
 
 def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
-    """The limit under which at most `most` marks lie: the next one's, so that equal marks are chosen together or not.
+    """Limit that at most `most` marks lie below; equal marks are chosen together or not at all.
 
     The limit of a set can be found from the marks under the limits of its parts and those limits, of which the least
     counts.

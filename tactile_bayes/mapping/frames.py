@@ -1,4 +1,4 @@
-"""Which frames of a scan go into a map, and which are left out for what reason (paper step ii, the gate)."""
+"""Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VALID_SHARE = 0.9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelectedFrames:
-    """A scan with what was found about each of its frames.
+    """A scan with the selection of its frames.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class SelectedFrames:
 
     @property
     def dropped_no_pose(self) -> int:
-        """Frames the tracker says nothing about."""
+        """Frames without a pose from the tracker."""
         return int((~self.poses.known).sum())
 
     @property
@@ -83,7 +83,7 @@ def good_taxels(scan: Scan, faults: tuple[TaxelFault, ...]) -> BoolArray:
 
 
 def chunks(frames: int, size: int) -> Iterator[slice]:
-    """Stretches of `size` frames."""
+    """Split into stretches of `size` frames."""
     for start in range(0, frames, size):
         yield slice(start, min(start + size, frames))
 
@@ -96,7 +96,7 @@ def select_frames(
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
     engine: Engine | None = None,
 ) -> SelectedFrames:
-    """Decide about every frame of a scan.
+    """Decide for every frame of a scan whether it is used.
 
     A frame is used when the tracker knew where it was, nine taxels in ten are valid, and the mean over the valid ones
     lies in the window, its ends included.
@@ -117,7 +117,7 @@ def select_frames(
 def gate(
     known: BoolArray, level_kpa: FloatArray, valid_share: FloatArray, *, pressure_window_kpa: tuple[float, float]
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Which frames lie below the window, which above, and which are used; ends of the window included."""
+    """Frames below the window, above it and within, ends of the window included."""
     candidate = known & (valid_share >= VALID_SHARE)
     low, high = candidate & (level_kpa < pressure_window_kpa[0]), candidate & (level_kpa > pressure_window_kpa[1])
     return low, high, candidate ^ (low | high)
@@ -144,7 +144,7 @@ def _refuse_dead(scan: Scan, faults: tuple[TaxelFault, ...]) -> None:
 
 
 def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_kpa: tuple[float, float]) -> None:
-    """Raise `BadDataError` when no frame of any scan is left, saying which step took them and what would help."""
+    """Raise `BadDataError` when no scan has a frame left, naming the step that took them and a remedy."""
     if any(selection.used.any() for selection in selections):
         return
     total = sum(len(selection.scan.frames) for selection in selections)

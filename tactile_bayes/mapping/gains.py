@@ -1,4 +1,4 @@
-"""One gain a frame, solved jointly with the map: what dividing by the mean takes from a lump stays in the map."""
+"""Gains per frame, solved jointly with the map: dividing by the mean would lower the lump."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Weight = Callable[[FloatArray, "NDArray[np.bool_] | None", slice], "NDArray[np.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedGains:
-    """Gains of the used frames, one array a scan, and how they were reached."""
+    """Gains of the used frames, one array per scan, and the course of the solution."""
 
     gains: list[FloatArray]
     passes: int
@@ -57,7 +57,7 @@ def solve_gains(
 
 
 def _extrapolated(start: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Where the steps from `start` over `first` to `second` lead to."""
+    """Limit of the steps from `start` over `first` to `second`, by extrapolation."""
     step = first - start
     bend = second - first - step
     size = float(np.linalg.norm(bend))
@@ -83,7 +83,7 @@ class _System:
         self._count = self._sum(lambda pressure, valid, _: np.ones_like(pressure) if valid is None else valid)
 
     def improved(self, gains: FloatArray) -> FloatArray:
-        """Each frame's gain against the map that all frames make with `gains`: sum(p m) / sum(m^2)."""
+        """Least-squares gain of each frame against the map of all frames with `gains`: sum(p m) / sum(m^2)."""
         total = self._sum(lambda pressure, _, frames: pressure / gains[frames, None])
         mean = np.divide(total, self._count, out=np.zeros_like(total), where=self._count > 0)
         better = np.empty(len(gains))
@@ -96,7 +96,7 @@ class _System:
         return better
 
     def _sum(self, weight: _Weight) -> FloatArray:
-        """Sum over all readings of a weight, cell by cell."""
+        """Sum of a weight over all readings of each cell."""
         cells = self._shape[0] * self._shape[1]
         total = np.zeros(cells)
         for frames, flat, pressure, valid in self._parts():
@@ -104,7 +104,7 @@ class _System:
         return total
 
     def _parts(self) -> Iterator[tuple[slice, NDArray[np.integer], FloatArray, NDArray[np.bool_] | None]]:
-        """Frames among all used ones, their cells, pressures (0 where not valid) and which are valid."""
+        """Chunks: frames' indices, their cells, pressures (0 where not valid) and which are valid."""
         start, total = 0, sum(len(source.projection) for source in self._sources)
         for number, source in enumerate(self._sources):
             for part, counts in source.parts(_CHUNK):

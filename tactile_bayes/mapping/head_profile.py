@@ -1,4 +1,4 @@
-"""How pressure is spread over the head where there is no lump: it tells how deep the soft layer under the head is.
+"""Pressure profile of the head away from lumps, which depends on the depth of the soft layer below it.
 
 A curved head on a thin soft layer presses hardest in its middle, on a deep one at its rim (Wellman & Howe 1999, Eq 1:
 the width of the homogeneous profile goes with the thickness of the tissue).
@@ -24,7 +24,7 @@ from tactile_bayes.scan import CountArray
 MOST_FRAMES = 2048
 # Chosen frames that wait to be read: many at once cost less each, and most are overtaken by others before.
 _MOST_WAITING = 4096
-# Frames that came a few at a time wait until there are so many before anybody looks at their marks.
+# Frames that came a few at a time wait until there are so many before their marks are compared.
 _FEW = 64
 _CHUNK = 128
 # The figures are means of whole multiples of this.
@@ -52,13 +52,13 @@ def head_profile_figures(selections: Sequence[SelectedFrames]) -> dict[str, floa
 
 
 def _whole(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> BoolArray:
-    """Which frames can be read: all good taxels valid, and a mean above 0."""
+    """Which frames can be read: those with all good taxels valid and a mean above 0."""
     whole: BoolArray = (valid_share == np.count_nonzero(good) / good.size) & (level_kpa > 0)
     return whole
 
 
 def profile_figures(rows: FloatArray) -> dict[str, float]:
-    """The figures from the (f, 4) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
+    """Figures from the (f, 4) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
 
     A lump, or the edge of a rib, is no smooth profile: the residual of a frame shows it, also where most frames feel
     one. Rows of NaN, from an array without a profile, give no figures.
@@ -77,7 +77,7 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
 
 
 def _tenth(values: FloatArray) -> float:
-    """The quantile 0.1 of two values or more, between neighbours linear."""
+    """Quantile 0.1 of two values or more, linear between neighbours."""
     below, share = divmod(0.1 * (len(values) - 1), 1.0)
     parted = np.partition(values, int(below) + 1)
     low, high = parted[: int(below) + 1].max(), parted[int(below) + 1]
@@ -93,7 +93,7 @@ def _read(part: SelectedFrames, frames: NDArray[np.intp]) -> FloatArray:
 
 
 def _rows(reader: ProfileReader, readout: Readout, counts: CountArray, level_kpa: FloatArray) -> FloatArray:
-    """(f, 4) rows of (f, k) counts, in portions that stay in the processor's cache."""
+    """(f, 4) rows from (f, k) counts, in portions that fit the processor's cache."""
     rows = np.empty((len(counts), _COLUMNS))
     for part in chunks(len(counts), _CHUNK):
         rows[part] = reader.read(readout.pressure_kpa(counts[part])[0], level_kpa[part])
@@ -101,7 +101,7 @@ def _rows(reader: ProfileReader, readout: Readout, counts: CountArray, level_kpa
 
 
 class GrowingProfile:
-    """The profiles of at most `MOST_FRAMES` frames of a scan that grows, the same in any portions and any order.
+    """Profiles of at most `MOST_FRAMES` frames of a growing scan, the same in any portions and order.
 
     Parameters
     ----------
@@ -141,14 +141,14 @@ class GrowingProfile:
             self._choose_new()
 
     def _choose_new(self) -> None:
-        """Look at the frames that came a few at a time."""
+        """Choose among frames that came a few at a time."""
         if self._new:
             counts, level, share = (np.concatenate(part) for part in zip(*self._new, strict=True))
             self._new, self._number_new = [], 0
             self._choose(counts, level, share)
 
     def _choose(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
-        """Let those frames wait that are among the chosen ones so far."""
+        """Queue the frames that are among the chosen ones so far."""
         marks = frame_marks(level_kpa)
         if len(marks) >= MOST_FRAMES:  # so many that not all of them need be copied
             whole = marks[_whole(level_kpa, valid_share, self._good)]
@@ -167,7 +167,7 @@ class GrowingProfile:
             self._read_waiting()
 
     def merge(self, other: GrowingProfile) -> None:
-        """Add the frames that another one was given."""
+        """Add the frames that another profile was given."""
         self._read_waiting()
         other._read_waiting()
         limit = marks_limit(np.concatenate([self._marks, other._marks]), MOST_FRAMES)
@@ -176,12 +176,12 @@ class GrowingProfile:
         self._keep(other._marks[chosen], other._rows[chosen])
 
     def figures(self) -> dict[str, float]:
-        """See `profile_figures`."""
+        """As `profile_figures`."""
         self._read_waiting()
         return profile_figures(self._rows)
 
     def _read_waiting(self) -> None:
-        """Read the waiting frames that are still among the chosen ones."""
+        """Read the queued frames that are still among the chosen ones."""
         self._choose_new()
         if not self._waiting:
             return
@@ -192,7 +192,7 @@ class GrowingProfile:
         self._keep(marks[chosen], _rows(self._reader, self._readout, counts[chosen], level[chosen]))
 
     def _keep(self, marks: NDArray[np.uint64], rows: FloatArray) -> None:
-        """Keep these rows, and those from before that are still under the limit."""
+        """Keep these rows, and the earlier ones still below the limit."""
         kept = self._marks < self._limit
         before = (self._marks, self._rows) if kept.all() else (self._marks[kept], self._rows[kept])
         self._marks, self._rows = np.concatenate([before[0], marks]), np.concatenate([before[1], rows])
@@ -200,7 +200,7 @@ class GrowingProfile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProfileReader:
-    """Fits smooth profiles to frames.
+    """Fits smooth pressure profiles to frames.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ class ProfileReader:
 
     @classmethod
     def of(cls, good: BoolArray) -> ProfileReader:
-        """For the good taxels of an array, True in (rows, columns)."""
+        """Prepare for the good taxels of an array, True in (rows, columns)."""
         across, along = (_legendre(n) for n in good.shape)
         terms = np.stack([np.outer(across[:, i], along[:, j])[good] for i, j in _ORDERS], axis=1)
         if min(np.count_nonzero(good.any(axis=1)), np.count_nonzero(good.any(axis=0))) <= _HIGHEST:
@@ -224,7 +224,7 @@ class ProfileReader:
         return cls(np.ascontiguousarray(np.linalg.pinv(terms)), terms.T @ terms)
 
     def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
-        """Coefficients and residuals of frames, each frame's to the same bits whatever is read with it.
+        """Coefficients and residuals of frames; a frame's bits do not depend on the frames read with it.
 
         Parameters
         ----------

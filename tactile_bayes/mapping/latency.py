@@ -1,134 +1,152 @@
-"""How late the tracker is against the array, found from the scan itself: the right delay makes the map sharpest."""
+"""Latency of the tracker against the array: the delay at which opposite strokes show a lump at one place."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import VALUE_STEP
-from tactile_bayes.mapping.frames import SelectedFrames, chunks
+from tactile_bayes.geometry import FloatArray, Plane
+from tactile_bayes.mapping.coarse_frames import CoarseFrames, IndexArray, projector_of, stroke_starts
+from tactile_bayes.mapping.frames import SelectedFrames
+from tactile_bayes.mapping.pose_noise import pose_noise_figures
 from tactile_bayes.mapping.poses import FramePoses, poses_at
-from tactile_bayes.mapping.project import Projection, Projector
-from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.mapping.project import Projector
+from tactile_bayes.mapping.shift_fit import ShiftFit
+from tactile_bayes.presets import POSE_NOISE
 
 RANGE_MS = (-50.0, 100.0)
 # A latency known no better than this is called undetermined (ms).
 MOST_SD_MS = 2.0
-# So is one whose minimum stands out by less than this many of its own standard errors.
-LEAST_SHARPNESS = 2.0
+# Two each way: with fewer the spread between strokes says nothing about the error.
+LEAST_STROKES = 4
 # Frames looked at: more would add minutes and no accuracy that matters.
 MOST_FRAMES = 24_000
-_COARSE_STEP_MS, _FINE_STEP_MS, _FINE_STEPS = 10.0, 4.0, 4
-_COARSE_EVERY = 4
-_BLOCKS = 10
-_CHUNK = 128
+# Readings change cells as the latency does, so whole steps may go round in circles of a tenth of a millisecond.
+_ROUNDS, _WHOLE_STEPS, _SETTLED_MS, _VELOCITY_STEP_MS = 12, 4, 0.02, 5.0
+# A stroke that tells this share of what the best one does crosses a lump.
+_CROSSES = 0.1
+_NEEDED = "scan back and forth over a lump for 20 s, or give the number of the instrument"
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyEstimate:
-    """By how much the stamps of the poses are late.
+    """Estimated latency of the poses' time stamps.
 
     Parameters
     ----------
     latency_ms, sd_ms
-        The delay that makes the variance within cells least, and its standard error.
-    sharpness
-        Curvature of that variance at its minimum, over its own standard error.
+        The delay at which strokes both ways agree, and its standard error.
+    bound_ms
+        Standard error that independent errors of the readings and the tracker's noise alone would leave.
     frames
         Frames it was found from.
+    crossings
+        Strokes that cross a lump, towards +x of the plane (or along +y) and back.
     """
 
     latency_ms: float
     sd_ms: float
-    sharpness: float
+    bound_ms: float
     frames: int
+    crossings: tuple[int, int]
 
 
 def estimate_latency(
-    selections: Sequence[SelectedFrames], *, plane_from_base: FloatArray, cell_mm: float, max_pose_gap_ms: float
+    selections: Sequence[SelectedFrames], *, plane: Plane, cell_mm: float, max_pose_gap_ms: float
 ) -> LatencyEstimate:
-    """Latency at which the readings within a cell agree best.
+    r"""Estimate the latency at which strokes there and back show a lump at one place.
 
     Parameters
     ----------
     selections
         The scans, selected with any latency.
-    plane_from_base, cell_mm
-        The cells; a latency hardly moves the plane.
+    plane
+        A latency hardly moves it.
+    cell_mm
+        Of the lattice that poses are projected on.
     max_pose_gap_ms
         As for the map.
 
     Raises
     ------
     BadDataError
-        When the scan does not determine it: without a lump, or without strokes there and back, every delay fits.
+        When the scan does not determine it, with what it lacks.
 
     Notes
     -----
-    Strokes there and back at speed v show a lump 2 v tau apart, which adds (v tau)^2 times the squared slope to the
-    variance within cells: a parabola in tau. Its standard error comes from leaving out a tenth of the scan at a time
-    (jackknife). A lump that moves with the head by delta looks like a latency of -delta / v: the excess over what a
-    phantom shows on the same instrument is a measure of mobility.
+    Steps of Gauss and Newton on the regression of `tactile_bayes.mapping.shift_fit`, with the head's velocity v as
+    design: the information on the latency is :math:`\sum (v \cdot \nabla m)^2 / s^2` over what the nuisances leave of
+    it. In strokes one way at one speed they leave nothing, since a map shifted by v tau looks the same.
+
+    The standard error is the largest of three: leaving out a stroke at a time (jackknife), the regression's own with
+    errors shared over 0.2 s, and the bound; widened as Student's t of that many strokes is. Noise has slopes too:
+    the information is the product of two gradients, from alternate stretches of the scan. A lump that follows the head
+    by delta looks like a latency of -delta / v.
     """
-    parts = [
-        _Part.of(one, plane_from_base=plane_from_base, cell_mm=cell_mm, gap_ms=max_pose_gap_ms) for one in selections
-    ]
-    coarse = np.arange(RANGE_MS[0], RANGE_MS[1] + 1e-9, _COARSE_STEP_MS)
-    rough = _variances(parts, coarse, every=_COARSE_EVERY).sum(axis=0)
-    middle = float(coarse[int(np.argmin(rough))])
-    if not RANGE_MS[0] < middle < RANGE_MS[1]:
-        raise _undetermined(f"the map grows sharper up to the end of the range, {middle:g} ms")
-    for _ in range(3):
-        fine = np.asarray(middle + _FINE_STEP_MS * np.arange(-_FINE_STEPS, _FINE_STEPS + 1), dtype=np.float64)
-        found = _minimum(fine, _variances(parts, fine, every=1))
-        if abs(found.latency_ms - middle) <= _FINE_STEP_MS * _FINE_STEPS / 2:
-            break
-        middle = float(np.clip(found.latency_ms, middle - 16, middle + 16))
-    frames = sum(len(part.frames) for part in parts)
-    if not (found.sharpness > LEAST_SHARPNESS and found.sd_ms < MOST_SD_MS):
-        raise _undetermined(f"{found.latency_ms:.1f} +- {found.sd_ms:.1f} ms from {frames} frames")
-    return LatencyEstimate(found.latency_ms, found.sd_ms, found.sharpness, frames)
+    parts = [_Part.of(one, plane=plane, cell_mm=cell_mm, gap_ms=max_pose_gap_ms) for one in selections]
+    parts = [part for part in parts if len(part.coarse.frames)]
+    if not parts:
+        raise _undetermined("no frame has a pose at every delay")
+    latency, fit = _solved(parts)
+    strokes = _strokes(parts, latency)
+    found = _Regression.of(fit, parts, latency, strokes)
+    noise = pose_noise_figures(selections, plane, cell_mm=cell_mm)
+    estimate = found.estimate(latency, noise, sum(len(part.coarse.frames) for part in parts))
+    if not estimate.sd_ms < MOST_SD_MS:
+        raise _undetermined(_lack(estimate))
+    return estimate
 
 
 def _undetermined(why: str) -> BadDataError:
-    return BadDataError(
-        f"the scan does not determine the tracker's latency ({why})",
-        way_out="scan a phantom lump there and back for 60 s, or give the number of the instrument",
-    )
+    return BadDataError(f"the scan does not determine the tracker's latency ({why})", way_out=_NEEDED)
+
+
+def _lack(found: LatencyEstimate) -> str:
+    """What the scan lacks, in one line."""
+    forth, back = found.crossings
+    if not np.isfinite(found.sd_ms):
+        lack = "no lump or other slope stands out of the noise"
+    elif min(forth, back) == 0:
+        lack = f"a lump is crossed {max(forth, back)} times in one direction and never in the other"
+    else:
+        lack = f"a lump is crossed {forth} times forth and {back} times back"
+    if forth + back < LEAST_STROKES:
+        return f"{lack}; at least two strokes each way are needed"
+    known = f"; it would be known to +-{found.sd_ms:.0f} ms only" if np.isfinite(found.sd_ms) else ""
+    return f"{lack}{known}, within {MOST_SD_MS:g} ms are needed"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """One scan's frames whose pose is known at every latency looked at."""
+    """Frames of one scan whose pose is known at every latency tried."""
 
     selection: SelectedFrames
-    readout: Readout
+    coarse: CoarseFrames
     projector: Projector
-    frames: np.ndarray[tuple[int], np.dtype[np.intp]]
     gap_ms: float
 
     @classmethod
-    def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float, gap_ms: float) -> _Part:
-        good, scan = selection.good_taxels, selection.scan
-        projector = Projector(scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
+    def of(cls, selection: SelectedFrames, *, plane: Plane, cell_mm: float, gap_ms: float) -> _Part:
         used = selection.used.copy()
         for edge in RANGE_MS:
             used &= _poses(selection, edge, gap_ms).known
-        frames = np.flatnonzero(used)[:MOST_FRAMES]
-        return cls(selection, Readout.of(scan.element_calibration, good), projector, frames, gap_ms)
+        coarse = CoarseFrames.of(selection, np.flatnonzero(used)[:MOST_FRAMES])
+        projector = projector_of(selection, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
+        return cls(selection, coarse, projector, gap_ms)
 
-    def at(self, latency_ms: float, frames: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Projection:
-        return self.projector.at(_poses(self.selection, latency_ms, self.gap_ms).part(frames))
+    def places_mm(self, latency_ms: float) -> FloatArray:
+        """(m, k, 2) places of the averaged readings at a latency."""
+        poses = _poses(self.selection, latency_ms, self.gap_ms).part(self.coarse.frames)
+        return self.coarse.places_mm(self.projector.at(poses))
 
-    def values(self, frames: np.ndarray[tuple[int], np.dtype[np.intp]]) -> FloatArray:
-        """(f, k) pressures over the frame's mean; the few saturated readings count as the mean itself."""
-        pressure, valid = self.readout.pressure_kpa(self.readout.counts(self.selection.scan.frames.counts[frames]))
-        pressure /= self.selection.level_kpa[frames, None]
-        return pressure if valid is None else np.where(valid, pressure, 1.0)
+    def moves_mm(self, latency_ms: float) -> FloatArray:
+        """(m, k, 2) change of these places when the pose is a millisecond later, mm."""
+        late, early = (self.places_mm(latency_ms + way * _VELOCITY_STEP_MS) for way in (1, -1))
+        return np.asarray((late - early) / (2 * _VELOCITY_STEP_MS))
 
 
 def _poses(selection: SelectedFrames, latency_ms: float, gap_ms: float) -> FramePoses:
@@ -136,52 +154,111 @@ def _poses(selection: SelectedFrames, latency_ms: float, gap_ms: float) -> Frame
     return poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=gap_ms)
 
 
-def _variances(parts: Sequence[_Part], latencies_ms: FloatArray, *, every: int) -> FloatArray:
-    """(blocks + 1, latencies) variance within cells: of all frames but one block each, and last of all frames.
+def _solved(parts: Sequence[_Part]) -> tuple[float, ShiftFit]:
+    """Latency at which the regression's step is zero, and the regression there."""
+    latency, coarse = 0.0, [part.coarse for part in parts]
+    for number in range(_ROUNDS):
+        fit = ShiftFit.of(coarse, [part.places_mm(latency) for part in parts])
+        design = fit.design([part.moves_mm(latency) for part in parts])
+        information = float(design @ design)
+        step = float(design @ fit.data) / information if information > 0 else 0.0
+        if abs(step) < _SETTLED_MS:
+            break
+        if not RANGE_MS[0] < latency + step < RANGE_MS[1]:
+            raise _undetermined(f"no delay from {RANGE_MS[0]:g} to {RANGE_MS[1]:g} ms lets its strokes agree")
+        latency += step if number < _WHOLE_STEPS else 0.5 * step
+    return latency, fit
 
-    The sum of all squares does not hang on the latency: only what the cells' means explain has to be found.
+
+def _strokes(parts: Sequence[_Part], latency_ms: float) -> tuple[IndexArray, FloatArray]:
+    """Stroke of each averaged frame, counted through all scans, and each stroke's way: +1 or -1 along the motion."""
+    labels: list[IndexArray] = []
+    ways: list[FloatArray] = []
+    for part in parts:
+        head = part.places_mm(latency_ms).mean(axis=1)
+        axis = np.linalg.svd(part.moves_mm(latency_ms).mean(axis=1), full_matrices=False)[2][0]
+        along = head @ (axis if axis[int(np.argmax(np.abs(axis)))] > 0 else -axis)
+        starts = stroke_starts(along)
+        lengths = np.diff(starts)
+        labels.append(np.repeat(np.arange(len(lengths)), lengths) + sum(len(one) for one in ways))
+        ways.append(np.sign([along[b - 1] - along[a] for a, b in pairwise(starts)]))
+    return np.concatenate(labels), np.concatenate(ways)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Regression:
+    """The regression at the latency found, and the groups that its errors are shared in.
+
+    Parameters
+    ----------
+    fit
+        Of which the readings and their gradient are used.
+    design, halves : (n,), (2, n) arrays
+        Design of the latency with the whole gradient, and with those of two halves of the strokes.
+    raw : (n,) array
+        Design within frames, with the map left in.
+    stroke, block : (frames,) int arrays
+        Of each averaged frame.
+    ways : (strokes,) array
     """
-    chosen = [part.frames[::every] for part in parts]
-    if not sum(len(frames) for frames in chosen):
-        raise _undetermined("no frame has a pose at every delay")
-    layouts = [[part.at(tau, frames) for tau in latencies_ms] for part, frames in zip(parts, chosen, strict=True)]
-    blocks = [one.block() for layout in layouts for one in layout if len(one)]
-    first = (min(f[0] for f, _ in blocks), min(f[1] for f, _ in blocks))
-    shape = (max(f[0] + s[0] for f, s in blocks) - first[0], max(f[1] + s[1] for f, s in blocks) - first[1])
-    cells = shape[0] * shape[1]
-    count, total = np.zeros((2, _BLOCKS, len(latencies_ms), cells))
-    square, readings = np.zeros(_BLOCKS), np.zeros(_BLOCKS)
-    length, start = sum(len(frames) for frames in chosen), 0
-    for part, frames, layout in zip(parts, chosen, layouts, strict=True):
-        for piece in chunks(len(frames), _CHUNK):
-            block = min(_BLOCKS - 1, _BLOCKS * start // length)
-            value = (np.rint(part.values(frames[piece]) / VALUE_STEP) * VALUE_STEP - 1.0).ravel()
-            square[block] += value @ value
-            readings[block] += value.size
-            for index, projection in enumerate(layout):
-                flat = projection.part(piece).flat(first, shape).ravel()
-                count[block, index] += np.bincount(flat, minlength=cells)
-                total[block, index] += np.bincount(flat, value, cells)
-            start += len(frames[piece])
-    return np.array([_within(count, total, square, readings, without=block) for block in (*range(_BLOCKS), None)])
 
+    fit: ShiftFit
+    design: FloatArray
+    halves: FloatArray
+    raw: FloatArray
+    stroke: IndexArray
+    block: IndexArray
+    ways: FloatArray
 
-def _within(
-    count: FloatArray, total: FloatArray, square: FloatArray, readings: FloatArray, *, without: int | None
-) -> FloatArray:
-    """(latencies,) variance about the cells' means over all blocks but one."""
-    kept = np.arange(_BLOCKS) != (-1 if without is None else without)
-    n, t = count[kept].sum(axis=0), total[kept].sum(axis=0)
-    explained = np.divide(t * t, n, out=np.zeros_like(t), where=n > 0).sum(axis=1)
-    variance: FloatArray = (square[kept].sum() - explained) / (readings[kept].sum() - (n > 0).sum(axis=1))
-    return variance
+    @classmethod
+    def of(
+        cls, fit: ShiftFit, parts: Sequence[_Part], latency_ms: float, strokes: tuple[IndexArray, FloatArray]
+    ) -> _Regression:
+        moves = [part.moves_mm(latency_ms) for part in parts]
+        label, ways = strokes
+        blocks, past = [], 0
+        for part in parts:
+            number = part.coarse.blocks(part.selection.scan.frames.time_s)
+            blocks.append(number + past)
+            past += int(number.max()) + 1
+        block = np.concatenate(blocks)
+        even = (block % 2 == 0)[fit.frame_numbers()]
+        halves = np.array([fit.of_some(keep).design(moves) for keep in (even, ~even)])
+        return cls(fit, fit.design(moves), halves, fit.raw_design(moves), label, block, ways)
 
+    def estimate(self, latency_ms: float, noise: dict[str, float], frames: int) -> LatencyEstimate:
+        """Latency with its standard error, bound, and crossings of a lump."""
+        information = float(self.design @ self.design)
+        true_share = min(1.0, float(self.halves[0] @ self.halves[1]) / information) if information > 0 else 0.0
+        told = np.bincount(self.stroke[self.fit.frame_numbers()], self.raw**2, len(self.ways))
+        crosses = told > _CROSSES * told.max()
+        crossings = (int(np.sum(crosses & (self.ways > 0))), int(np.sum(crosses & (self.ways < 0))))
+        if true_share <= 0.0 or len(self.ways) < LEAST_STROKES:
+            return LatencyEstimate(latency_ms, np.inf, np.inf, frames, crossings)
+        bound = self._bound(information, noise)
+        widened = np.sqrt((len(self.ways) - 1) / (len(self.ways) - 3))
+        error = widened * max(bound, self._between_strokes(information), self._between_blocks(information))
+        return LatencyEstimate(latency_ms, error / true_share, bound / true_share, frames, crossings)
 
-def _minimum(latencies_ms: FloatArray, variances: FloatArray) -> LatencyEstimate:
-    """Vertex of the parabola through the variances, its standard error, and how sharp it is."""
-    centre = float(latencies_ms.mean())
-    curvature, slope, _ = np.polyfit(latencies_ms - centre, variances.T, 2)
-    vertex = centre - slope / (2 * np.where(curvature == 0, np.inf, curvature))
-    spread = np.sqrt((_BLOCKS - 1) / _BLOCKS * ((vertex[:-1] - vertex[:-1].mean()) ** 2).sum())
-    about = np.sqrt((_BLOCKS - 1) / _BLOCKS * ((curvature[:-1] - curvature[:-1].mean()) ** 2).sum())
-    return LatencyEstimate(float(vertex[-1]), float(spread), float(curvature[-1] / max(about, 1e-300)), 0)
+    def _between_strokes(self, information: float) -> float:
+        """Jackknife: each stroke left out, the others' information kept."""
+        stroke, count = self.stroke[self.fit.frame_numbers()], len(self.ways)
+        scores = np.bincount(stroke, self.design * self.fit.data, count)
+        told = np.bincount(stroke, self.design**2, count)
+        without = (scores.sum() - scores) / np.maximum(information - told, 1e-300)
+        variance = (count - 1) / count * float(np.sum((without - without.mean()) ** 2))
+        return float(np.sqrt(variance))
+
+    def _between_blocks(self, information: float) -> float:
+        scores = np.bincount(self.block[self.fit.frame_numbers()], self.design * self.fit.data)
+        return float(np.linalg.norm(scores)) / information
+
+    def _bound(self, information: float, noise: dict[str, float]) -> float:
+        """Standard error from independent errors of readings, and of the frames' places as the tracker tells them."""
+        readings = float(self.fit.data.var()) / information
+        if POSE_NOISE[0] not in noise:
+            return float(np.sqrt(readings))
+        frame = self.fit.frame_numbers()
+        leverage = [np.bincount(frame, self.design * slope) for slope in self.fit.gradient.T]
+        places = sum(noise[name] ** 2 * float(one @ one) for name, one in zip(POSE_NOISE[:2], leverage, strict=True))
+        return float(np.sqrt(readings + places / information**2))

@@ -1,4 +1,4 @@
-"""The two inner loops of map building as plain Python that a compiler can take as it is."""
+"""The two inner loops of map building, written so that a compiler can take them as they are."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _Any = Any
 
 
 def levels_loop(counts: _Any, gain: _Any, offset: _Any, full: _Any, top: _Any, total: _Any, number: _Any) -> None:
-    """Sum of the valid pressures of each frame, and how many there are.
+    """Sum and number of the valid pressures of each frame.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def scatter_loop(
     columns: _Any,
     cells: _Any,
 ) -> tuple[int, int]:
-    """Add every valid reading to its cell, and return how many were clipped and how many were below 0.
+    """Add every valid reading to its cell; return how many were clipped and how many were below 0.
 
     Parameters
     ----------

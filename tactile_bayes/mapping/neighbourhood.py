@@ -1,4 +1,4 @@
-"""Which frames lie near the mass: the paper fits its plane to those."""
+"""Frames near the mass, to which the paper fits its plane."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from tactile_bayes.mapping.engine import Engine
 from tactile_bayes.mapping.frames import SelectedFrames
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.poses import FramePoses
+from tactile_bayes.mapping.smoothing import smooth
 from tactile_bayes.mapping.source import sources_of
-from tactile_bayes.mapping.strokes import smooth
 from tactile_bayes.mapping.tactile_map import FEW_READINGS
 
 # The mass is looked for in cells of this side: its place matters to a few mm.

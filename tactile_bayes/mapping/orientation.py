@@ -1,4 +1,4 @@
-"""Which way round a map is shown: the one rule that every picture of a map follows."""
+"""Orientation of a map on the screen: one rule for every picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GRID_WORDS: Final = "as the imported file reads: first row on top, x to the righ
 
 @dataclass(frozen=True, slots=True)
 class Orientation:
-    """Which axes of the plane run to the viewer's right and upwards.
+    """Which axes of the plane point right and up on the screen.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Orientation:
 
     @property
     def edges(self) -> Mapping[str, str]:
-        """What lies beyond each edge of the picture: the patient's R, L, H (head), F (feet), or else an axis."""
+        """Labels of the picture's edges: the patient's R, L, H (head), F (feet), or else an axis."""
         if self.notch is not None:
             return {"left": "R", "right": "L", "top": "H", "bottom": "F"}
         return {"left": _opposite(self.right), "right": self.right, "top": self.up, "bottom": _opposite(self.up)}
@@ -56,7 +56,7 @@ class Orientation:
         return columns[::-1] if self.up[0] == "+" else columns
 
     def place(self, tactile_map: TactileMap, centre_mm: tuple[float, float]) -> tuple[float, float]:
-        """Where a point of the plane lies in the picture, in cells from its left edge and from its top edge."""
+        """Position of a point of the plane in the picture, in cells from its left and top edges."""
         axes = {"x": tactile_map.x_mm, "y": tactile_map.y_mm}
         point = dict(zip("xy", centre_mm, strict=True))
         half, cell = tactile_map.recipe.cell_mm / 2, tactile_map.recipe.cell_mm
@@ -70,7 +70,7 @@ class Orientation:
 
 
 def orientation_of(tactile_map: TactileMap) -> Orientation:
-    """How a map is shown.
+    """Orientation in which a map is shown.
 
     The viewer looks along z, into the tissue, as an examiner does who faces the patient. With landmarks the plane is
     shown by the quarter turn that brings the sternal notch nearest to straight up; the patient's left is then on the
@@ -89,7 +89,7 @@ _RIGHT_OF_UP: Final = {"+y": "-x", "-y": "+x", "+x": "+y", "-x": "-y"}
 
 
 def _towards(notch: FloatArray) -> Orientation:
-    """The quarter turn that shows a direction of the plane nearest to straight up; y up where there is none."""
+    """Quarter turn that brings a direction of the plane nearest to straight up; y up where it has none."""
     length = float(np.hypot(*notch))
     x, y = (float(value) / length for value in notch) if length > 0 else (0.0, 1.0)
     along = {"+y": y, "-y": -y, "+x": x, "-x": -x}

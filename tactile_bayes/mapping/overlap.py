@@ -1,4 +1,4 @@
-"""Whether poses were there while frames came: what a scan's times say against it, in words."""
+"""Overlap in time of a scan's poses and frames, and cautions where it is poor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LONG_INTERVALS: Final = 5.0
 
 @dataclass(slots=True)
 class Span:
-    """When the records of one device were measured, taken one by one.
+    """Range of the times at which a device's records were measured.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Span:
     gap_at_s: float = 0.0
 
     def add(self, time_s: float) -> None:
-        """Take the next record's time, which is not below the one before."""
+        """Add the next record's time, which must not be below the one before."""
         if not self.number:
             self.first_s = time_s
         elif time_s - self.last_s > self.gap_s:
@@ -46,7 +46,7 @@ class Span:
 
     @classmethod
     def of(cls, time_s: FloatArray) -> Span:
-        """The span of (n,) times that never fall."""
+        """Span of (n,) times that never fall."""
         if not len(time_s):
             return cls()
         steps = np.diff(time_s)
@@ -63,7 +63,7 @@ def apart(frames: Span, poses: Span) -> bool:
 
 
 def overlap_cautions(frames: Span, poses: Span) -> list[str]:
-    """What the times say against a map, one line each; empty when every frame has poses around it.
+    """Cautions about the times, one line each; empty when every frame has poses around it.
 
     A scan without frames, or without poses, has no times to compare.
     """
@@ -84,7 +84,7 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 
 
 def scan_cautions(scan: Scan) -> list[str]:
-    """`overlap_cautions` of a scan that was read."""
+    """`overlap_cautions` of a scan."""
     return overlap_cautions(Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
 
 

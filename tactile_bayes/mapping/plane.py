@@ -1,4 +1,4 @@
-"""The best-fit plane of a motion from moments that add exactly, in any order and any parts (paper step i)."""
+"""Best-fit plane of a motion from moments that add exactly, in any order and any parts (paper step i)."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ class HeadMoments:
 
     @classmethod
     def none(cls) -> HeadMoments:
-        """The moments of no frame."""
+        """Moments of no frame."""
         return cls((0,) * 28)
 
     @property
     def count(self) -> int:
-        """Frames."""
+        """Number of frames."""
         return self.sums[0]
 
     def plane(self) -> Plane:
@@ -83,8 +83,8 @@ class HeadMoments:
         resultant = sqrt(sum(value * value for value in axes[:3]))
         if not resultant > _LEAST_RESULTANT:
             raise BadDataError(
-                f"the head was turned all round (resultant of its x axis {resultant:.2f} of 1)",
-                way_out="keep its direction while scanning; map parts with one direction apart",
+                f"the head was turned in all directions (resultant of its x axis {resultant:.2f} of 1)",
+                way_out="keep its direction while scanning, or map the parts of one direction separately",
             )
         return fit_plane(
             np.array([value / n * _POSITION_STEP for value in x]),
@@ -95,7 +95,7 @@ class HeadMoments:
 
 
 class MomentSums:
-    """Moments of one head that grow frame by frame.
+    """Moments of one head, added frame by frame.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class MomentSums:
         self._sums = HeadMoments.none()
 
     def add(self, poses: FramePoses) -> None:
-        """Add the frames of which the pose is known.
+        """Add the frames whose pose is known.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class MomentSums:
             self._sums += self._of(rotation[part], position[part])
 
     def moments(self) -> HeadMoments:
-        """All so far, from the tracker's base."""
+        """Moments so far, about the tracker's base."""
         return self._sums
 
     def _of(self, rotation: FloatArray, position: FloatArray) -> HeadMoments:

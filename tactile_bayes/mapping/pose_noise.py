@@ -1,4 +1,4 @@
-"""By how much the head's place on the plane is wrong from frame to frame: such errors blur the map.
+"""Tracker position error from frame to frame, estimated from the poses; it blurs the map.
 
 A bump of width sigma is mapped with sigma^2 + s^2, s the SD of a frame's place along that axis. Only errors that
 neighbouring poses do not share can be told from the head's motion, and only those are in the figures.
@@ -26,7 +26,7 @@ _INNER_SQUARE = 0.6230155
 
 
 def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, cell_mm: float) -> dict[str, float]:
-    """The figures `POSE_NOISE` of the frames used; none where the tracker told too few poses.
+    """The figures `POSE_NOISE` of the frames used; empty where the tracker gave too few poses.
 
     The noise is what a pose departs by from the cubic through the two poses before and the two after it.
     """
@@ -46,7 +46,7 @@ def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, ce
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Places:
-    """Errors of the places of a scan's used frames.
+    """Position errors of a scan's used frames.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class _Places:
 
     @classmethod
     def of(cls, part: SelectedFrames, plane: Plane) -> _Places | None:
-        """Of one scan; None where there are too few poses."""
+        """Estimate for one scan; None where it has too few poses."""
         frames_s = part.scan.frames.time_s[part.used]
         poses = distinct_poses(part.scan.poses)
         if len(poses) < LEAST_POSES or not len(frames_s):
@@ -79,7 +79,7 @@ class _Places:
 
 
 def _departures(time_s: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n - 4, 2) of places from the cubic through their neighbours, and the variance of each over a place's."""
+    """(n - 4, 2) distances of positions from a cubic through their neighbours, and their variance over a position's."""
     n = len(time_s) - 4
     near = [time_s[k : k + n] - time_s[2 : 2 + n] for k in (0, 1, 3, 4)]
     departure, variance = place_mm[2 : 2 + n].copy(), np.ones(n)
@@ -94,7 +94,7 @@ def _departures(time_s: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, F
 
 
 def _interpolation(frames_s: FloatArray, poses_s: FloatArray) -> tuple[float, float]:
-    """Variance of linear interpolation between independent poses at the frames' times, over a pose's, on average.
+    """Mean variance of linear interpolation between independent poses at the frames' times, over a pose's.
 
     And how many independent frames of that variance have a mean of the same variance as these have.
     """

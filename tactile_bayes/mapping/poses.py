@@ -1,4 +1,4 @@
-"""Where the head was when each frame was read: the tracker's poses brought to the frames' times."""
+"""Poses of the head at the frames' times, interpolated from the tracker's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_POSE_GAP_MS = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FramePoses:
-    """The tracker's pose at each frame.
+    """The pose of the tracker's sensor at each frame.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class FramePoses:
     known: NDArray[np.bool_]
 
     def part(self, frames: slice | NDArray[np.bool_] | NDArray[np.intp]) -> FramePoses:
-        """Some of the frames."""
+        """A subset of the frames."""
         return FramePoses(self.position_mm[frames], self.rotation[frames], self.known[frames])
 
 

@@ -1,4 +1,4 @@
-"""From a frame's pose to the cell that each of its taxels falls in."""
+"""Projection of each frame's taxels onto the cells of a map."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tactile_bayes.scan import HeadGeometry
 
 IntArray = NDArray[np.int64]
 
-# Directions (in cells a mm), taxels (mm about their middle) and shifts (in cells) are rounded to these steps, 2e-5 mm
+# Directions (in cells per mm), taxels (mm about their middle) and shifts (in cells) are rounded to these steps, 2e-5 mm
 # at the most on the plane. Their products and sums then fit float64 exactly up to 2^15 cells, so that a matrix product
 # of any width, a loop and a compiled loop put every reading into the same cell.
 _TURN_STEP = 2.0**-22
@@ -32,7 +32,7 @@ _WHOLE = 2.0**52
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedTaxels:
-    """The taxels of a head that are projected.
+    """The taxels of a head to be projected.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Projection:
 
     @property
     def turn(self) -> FloatArray:
-        """(n, 2, 3) rotations, in cells a mm."""
+        """(n, 2, 3) rotations, in cells per mm."""
         return self.matrix[:, :, :3]
 
     @property
@@ -90,17 +90,17 @@ class Projection:
         return self.matrix[:, :, 3]
 
     def part(self, frames: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Projection:
-        """Some of the frames."""
+        """A subset of the frames."""
         return Projection(self.taxels, self.matrix[frames], self.cell_mm)
 
     def moved(self, cells: FloatArray) -> Projection:
-        """Each frame moved by (n, 2) cells, or all by (2,); whole multiples of the shifts' step."""
+        """Shift each frame by (n, 2) cells, or all by (2,); whole multiples of the shifts' step."""
         matrix = self.matrix.copy()
         matrix[:, :, 3] += cells
         return Projection(self.taxels, matrix, self.cell_mm)
 
     def block(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """First row and column, and shape, of a block of the lattice that holds every reading.
+        """First row and column, and shape, of the block of the lattice that contains every reading.
 
         Raises
         ------
@@ -121,7 +121,7 @@ class Projection:
         return [*first, *np.floor((self.shift + reach).max(axis=0)).tolist()]
 
     def _ends_of_one(self) -> list[float]:
-        """The same of one frame, as plain numbers: sums and products of whole steps are exact either way."""
+        """As `_ends` for one frame, with plain numbers: sums and products of whole steps are exact either way."""
         x, y, z, _ = self.taxels.reach_mm.tolist()
         shifts = [(abs(a) * x + abs(b) * y + abs(c) * z, shift) for a, b, c, shift in self.matrix[0].tolist()]
         return [*(floor(shift - reach) for reach, shift in shifts), *(floor(shift + reach) for reach, shift in shifts)]
@@ -150,7 +150,7 @@ class Projection:
 
 
 class Projector:
-    """What of a projection does not change from frame to frame.
+    """The constants of a projection, the same for all frames.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class Projector:
         self._taxels = ProjectedTaxels(np.ascontiguousarray(steps * _TAXEL_STEP_MM))
 
     def at(self, poses: FramePoses) -> Projection:
-        """Projection of the frames at `poses` onto the cells of the plane."""
+        """Project the frames at `poses` onto the cells of the plane."""
         if len(poses.position_mm) == 1:
             return Projection(self._taxels, self._matrix_of_one(poses), self._cell_mm)
         offset = poses.position_mm - self._origin_mm  # first of all: bases may lie far away
@@ -186,7 +186,7 @@ class Projector:
         return Projection(self._taxels, np.ascontiguousarray(matrix.transpose(2, 0, 1)), self._cell_mm)
 
     def _matrix_of_one(self, poses: FramePoses) -> FloatArray:
-        """(1, 2, 4) matrix of one frame, as plain numbers, which are the quicker for it; to the same bits."""
+        """(1, 2, 4) matrix of one frame with plain numbers, quicker for one and equal to the bit."""
         offset = [p - o for p, o in zip(poses.position_mm[0].tolist(), self._origin, strict=True)]
         found, cell_mm = [], self._cell_mm
         columns = self._columns(poses.rotation[0].tolist(), offset)
@@ -196,7 +196,7 @@ class Projector:
         return np.array(found).reshape(1, 2, 4)
 
     def _columns(self, r: Any, offset: Any) -> list[Any]:
-        """The eight numbers of each frame's matrix, in mm.
+        """The eight numbers of each frame's matrix, mm.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The figures of a map's report: what was used, what was left out, how the head moved, how well cells are filled."""
+"""Figures of a map's report: frames used and left out, motion of the head, coverage of the cells."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
 
 
 def _saturated(part: SelectedFrames) -> int:
-    """Readings of good taxels in used frames that were at full scale."""
+    """Number of full-scale readings of good taxels in used frames."""
     good = int(part.good_taxels.sum())
     return int(np.rint((good - part.valid_share[part.used] * part.good_taxels.size).sum()))
 
 
 def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[str, float]:
-    """How the head moved on the plane: tilt, yaw and the reach of the strokes; and how well the plane is determined.
+    """Motion of the head on the plane (tilt, yaw, reach of the strokes), and how well the plane is determined.
 
     ``plane_condition`` is the longest over the second spread of the taxel centres: large for strokes along a line.
     """
@@ -71,7 +71,7 @@ def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[st
 
 
 def cell_figures(sums: CellSums) -> dict[str, float]:
-    """How well the cells are filled, and what was out of the ordinary in them."""
+    """Coverage of the cells, and unusual readings in them."""
     hit = sums.count > 0
     return {
         "coverage": float((sums.count >= FEW_READINGS).mean()),
@@ -83,7 +83,7 @@ def cell_figures(sums: CellSums) -> dict[str, float]:
 
 
 def stroke_figures(strokes: Sequence[StrokeShift]) -> dict[str, float]:
-    """Each stroke's shift, and the mobility they add up to."""
+    """Shift of each stroke, and the mobility that they add up to."""
     if not strokes:
         return {}
     moved, sd = mobility(strokes)
@@ -95,5 +95,5 @@ def stroke_figures(strokes: Sequence[StrokeShift]) -> dict[str, float]:
     }
     for number, one in enumerate(strokes, start=1):
         if one.known:
-            figures[f"stroke_{number}_shift_x_mm"], figures[f"stroke_{number}_shift_y_mm"] = one.shift_mm
+            figures |= {f"stroke_{number}_shift_x_mm": one.shift_mm, f"stroke_{number}_sd_x_mm": one.sd_mm}
     return {name: value for name, value in figures.items() if np.isfinite(value)}

@@ -1,4 +1,4 @@
-"""From counts to pressures that are whole multiples of one tiny step, so that sums of them have no rounding."""
+"""Conversion of counts to pressures in whole multiples of a tiny step, so that sums have no rounding error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PRESSURE_STEP_KPA = 2.0**-34
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readout:
-    """The taxels that are used, and how their counts become pressures.
+    """The taxels used, and the conversion of their counts to pressures.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Readout:
 
     @classmethod
     def of(cls, calibration: ElementCalibration, good: BoolArray) -> Readout:
-        """The good taxels of an array."""
+        """Prepare for the good taxels of an array."""
         gain, offset = (
             np.rint(values[good] / PRESSURE_STEP_KPA) * PRESSURE_STEP_KPA
             for values in (calibration.gain_kpa_per_count, calibration.offset_kpa)

@@ -1,4 +1,4 @@
-"""How alike the errors of a frame's taxels are: cells share frames, so a map knows less than its readings count.
+"""Correlation of the errors within a frame: readings share frames, so a map holds less than they would alone.
 
 The figures are of the readings about the map, so whatever neighbours share is in them: the frame's level, the pose, the
 slope within a cell, a response that the calibration left.
@@ -32,7 +32,7 @@ _LENGTHS = 400
 
 
 def shared_frame_figures(sources: Sequence[Source], levels: Sequence[FloatArray], sums: CellSums) -> dict[str, float]:
-    """What a reading's error has in common with its neighbours', from at most `RUNS` x `RUN_FRAMES` frames.
+    """Figures of the error correlation within a frame, from at most `RUNS` x `RUN_FRAMES` frames.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def shared_frame_figures(sources: Sequence[Source], levels: Sequence[FloatArray]
 
 
 def _sampled(source: Source, of_frames: int) -> list[slice]:
-    """Runs of successive used frames of a scan, its share of `RUNS`, evenly spread."""
+    """Runs of successive used frames of a scan, its part of `RUNS`, evenly spaced."""
     frames = len(source.projection)
     length = min(RUN_FRAMES, of_frames // LEAST_RUNS, frames)
     if not length:
@@ -94,7 +94,7 @@ def _sampled(source: Source, of_frames: int) -> list[slice]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """Errors of one run of frames; (f, k) arrays, 0 where they are not known.
+    """Errors of one run of frames; (f, k) arrays, 0 where not known.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class _Run:
 def _correlations(
     sources: Sequence[Source], runs: Sequence[_Run], variance: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distance (mm), correlation and pairs of taxels of one frame, in bins one pitch wide; empty bins left out."""
+    """Distance (mm), correlation and pairs of taxels within a frame, in bins of one pitch; empty bins are left out."""
     totals = np.zeros((3, REACH_PITCHES + 1))
     for source in sources:
         mine = [run for run in runs if run.source is source]
@@ -159,7 +159,7 @@ def _correlations(
 
 
 def _distances(source: Source) -> FloatArray:
-    """(k, k) distances between the taxels that are read, mm."""
+    """(k, k) distances between the taxels read, mm."""
     place = source.projection.taxels.place_mm
     square = sum((axis[:, None] - axis[None, :]) ** 2 for axis in place)
     distance: FloatArray = np.sqrt(square)

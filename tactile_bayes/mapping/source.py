@@ -1,4 +1,4 @@
-"""The used frames of a scan on the map's lattice, ready to be read any number of times."""
+"""Used frames of a scan on the map's lattice, which can be read any number of times."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Progress = Callable[[int, int], None]
 
 
 def no_progress(done: int, total: int) -> None:
-    """Tell nobody."""
+    """Report no progress."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """One scan's used frames, ready to be read chunk by chunk any number of times.
+    """Used frames of one scan, which can be read chunk by chunk any number of times.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Source:
         return np.flatnonzero(self.selection.used)
 
     def parts(self, size: int) -> Iterator[tuple[slice, CountArray]]:
-        """Stretches of at most `size` used frames, and their (f, k) counts."""
+        """Iterate over stretches of at most `size` used frames and their (f, k) counts."""
         frames, counts = self.frames, self.selection.scan.frames.counts
         for part in chunks(len(frames), size):
             chosen = frames[part]
@@ -60,5 +60,5 @@ class Source:
 
 
 def sources_of(selections: list[SelectedFrames], *, plane_from_base: FloatArray, cell_mm: float) -> list[Source]:
-    """The scans on one lattice."""
+    """Put the scans on one lattice."""
     return [Source.of(part, plane_from_base=plane_from_base, cell_mm=cell_mm) for part in selections]

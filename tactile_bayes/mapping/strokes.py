@@ -1,9 +1,9 @@
-"""Partial maps of single strokes, shifted onto each other: a lump that moves with the head is seen where it was."""
+"""Registration of single strokes: shifts along x that put a lump that moves with the head back in one place."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,25 +11,25 @@ from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import CellSums
-from tactile_bayes.mapping.engine import Engine
-from tactile_bayes.mapping.frames import chunks
+from tactile_bayes.mapping.coarse_frames import LEAST_REACH_MM, POOL_S, CoarseFrames, IndexArray, stroke_starts
 from tactile_bayes.mapping.project import Projection
+from tactile_bayes.mapping.shift_fit import ShiftFit
 from tactile_bayes.mapping.source import Source
 
-# A stroke is a run in one direction over at least this far.
-LEAST_REACH_MM = 10.0
-# A stroke's shift counts as known when its standard error is below this; none is taken to be longer than that.
+# A stroke's shift counts as known when its standard error is below this.
 KNOWN_SD_MM = 0.5
-LONGEST_SHIFT_MM = 8.0
+# Shifts are taken to scatter by this (SD) before the scan is looked at; none is taken to be longer than twice that.
+EXPECTED_MM = 4.0
+# By this (SD) strokes over still lumps of the solid model differ, beyond noise: the frames are not the map's alone.
+MISFIT_MM = 0.06
 _ROUNDS = 4
-# Squared slopes of the others' map must exceed those of its noise this many times.
-_LEAST_SLOPE = 4.0
+# Frames are thinned out until all strokes' designs together have no more numbers than this.
+_MOST_NUMBERS = 3e7
 
 
 @dataclass(frozen=True, slots=True)
 class StrokeShift:
-    """Where one stroke saw the tissue, against all the others.
+    """Shift of one stroke against all others.
 
     Parameters
     ----------
@@ -40,39 +40,29 @@ class StrokeShift:
     direction
         +1 where the head moved along +x of the plane, else -1.
     shift_mm, sd_mm
-        x and y of the shift and its standard errors.
+        Along x of the plane, and its standard error.
     known
-        Whether the stroke crossed something that fixes a shift; else the shift is 0.
+        Whether the stroke crossed a lump or an edge that fixes a shift; else the shift is 0.
     """
 
     start: int
     stop: int
     scan: int
     direction: int
-    shift_mm: tuple[float, float] = (0.0, 0.0)
-    sd_mm: tuple[float, float] = (np.inf, np.inf)
+    shift_mm: float = 0.0
+    sd_mm: float = np.inf
     known: bool = False
 
 
 def find_strokes(source: Source, number: int) -> list[StrokeShift]:
-    """Runs of a scan's used frames in one direction along x; what lies at the turns is part of the run before."""
+    """Find runs of a scan's used frames in one direction along x; a turn belongs to the run before it."""
     x = source.projection.shift[:, 0] * source.projection.cell_mm
-    ends, start, far = [0], 0, 0
-    for i in range(len(x)):
-        rising = x[far] >= x[start]
-        if (x[i] - x[far]) * (1 if rising else -1) >= 0:
-            far = i
-        elif abs(x[far] - x[i]) >= LEAST_REACH_MM / 2 and abs(x[far] - x[start]) >= LEAST_REACH_MM:
-            ends.append(far)
-            start, far = far, i
-    ends = [*ends, len(x)]
-    return [StrokeShift(a, b, number, 1 if x[min(b, len(x) - 1)] >= x[a] else -1) for a, b in pairwise(ends) if b > a]
+    ends = pairwise(stroke_starts(x))
+    return [StrokeShift(a, b, number, 1 if x[min(b, len(x) - 1)] >= x[a] else -1) for a, b in ends if b > a]
 
 
-def register_strokes(
-    sources: Sequence[Source], levels: Sequence[FloatArray], *, cell_mm: float, engine: Engine
-) -> tuple[list[Source], list[StrokeShift]]:
-    """Find each stroke's shift against the others, and put its frames where they fit.
+def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[StrokeShift]]:
+    """Estimate each stroke's shift along x against the others, and shift its frames back.
 
     Returns
     -------
@@ -84,44 +74,46 @@ def register_strokes(
     Raises
     ------
     BadDataError
-        When there are fewer than two strokes, or no stroke crossed anything.
+        When there are fewer than two strokes, or fewer than two crossed a lump or an edge that fixes a shift.
 
     Notes
     -----
-    To first order a stroke's map is the others' map minus shift times gradient, so the shift is a weighted linear
-    least-squares fit over the cells that both cover, with a level of its own; a few rounds make it exact.
+    The regression of `tactile_bayes.mapping.shift_fit` with one unknown a stroke, a few rounds. Along y nothing is
+    shifted: each line lies at another y, so other columns of the head pass the lump, and what they read differently
+    looks like a shift of half a millimetre (record 0097). Standard errors are those of the regression, widened for
+    errors shared by neighbouring frames and for the part of the slopes that is noise; their floor is 0.06 mm.
     """
     strokes = [stroke for number, source in enumerate(sources) for stroke in find_strokes(source, number)]
     if len(strokes) < 2:
         raise BadDataError(
             f"the scan has {len(strokes)} stroke over {LEAST_REACH_MM:g} mm", way_out="scan back and forth"
         )
-    shifts, errors = np.zeros((len(strokes), 2)), np.full((len(strokes), 2), np.inf)
-    known = np.zeros(len(strokes), dtype=bool)
+    parts = [_Part.of(source, number, strokes) for number, source in enumerate(sources)]
+    shifts = np.zeros(len(strokes))
     for _ in range(_ROUNDS):
-        maps = [
-            _stroke_map(sources[one.scan], levels[one.scan], one, shift, cell_mm=cell_mm, engine=engine)
-            for one, shift in zip(strokes, shifts, strict=True)
-        ]
-        steps, errors = _steps(maps, cell_mm)
-        known = np.asarray((errors < KNOWN_SD_MM).all(axis=1))
-        if not known.any():
-            raise BadDataError(
-                "no stroke crossed anything that fixes a shift", way_out="leave out the registration of strokes"
-            )
-        steps[~known] = 0.0
-        shifts = shifts + steps
-        shifts[known] -= shifts[known].mean(axis=0)
-        shifts = np.clip(shifts, -LONGEST_SHIFT_MM, LONGEST_SHIFT_MM)
+        round_ = _Round.of(parts, shifts)
+        shifts = np.clip(shifts + round_.step(shifts), -2 * EXPECTED_MM, 2 * EXPECTED_MM)
+    known, errors = round_.errors()
+    if known.sum() < 2:
+        raise BadDataError(_lack(known, round_), way_out="scan back and forth over a lump, or leave out the option")
+    shifts = np.where(known, shifts - shifts[known].mean(), 0.0)
     found = [
-        StrokeShift(one.start, one.stop, one.scan, one.direction, _pair(shift), _pair(error), bool(sure))
+        replace(one, shift_mm=float(shift), sd_mm=float(error), known=bool(sure))
         for one, shift, error, sure in zip(strokes, shifts, errors, known, strict=True)
     ]
     return [_moved(source, [one for one in found if one.scan == n]) for n, source in enumerate(sources)], found
 
 
+def _lack(known: NDArray[np.bool_], last: _Round) -> str:
+    """What the scan lacks, in one line."""
+    best = float(last.own_errors().min())
+    told = f"the best is known to +-{best:.1f} mm" if np.isfinite(best) else "no slope stands out of the noise"
+    fixed = f"crossed a lump or an edge that fixes a shift to {KNOWN_SD_MM:g} mm"
+    return f"{int(known.sum())} of {len(known)} strokes {fixed} ({told})"
+
+
 def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
-    """By how much the lump follows the head, mm, and its standard error; NaN without known strokes both ways.
+    """Distance by which the lump follows the head, mm, and its standard error; NaN without strokes both ways.
 
     Half the difference between the mean shifts of strokes towards +x and towards -x. A tracker's latency left in the
     poses gives the same picture: v tau.
@@ -129,12 +121,12 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
     ways = [[one for one in strokes if one.known and one.direction == way] for way in (1, -1)]
     if not all(ways):
         return float("nan"), float("nan")
-    means = [np.mean([one.shift_mm[0] for one in way]) for way in ways]
+    means = [np.mean([one.shift_mm for one in way]) for way in ways]
     # The spread between strokes of one way says more than the errors of single ones, where there are several.
     errors = [
         max(
-            float(np.std([one.shift_mm[0] for one in way], ddof=1)) if len(way) > 1 else 0.0,
-            float(np.mean([one.sd_mm[0] for one in way])),
+            float(np.std([one.shift_mm for one in way], ddof=1)) if len(way) > 1 else 0.0,
+            float(np.mean([one.sd_mm for one in way])),
         )
         / np.sqrt(len(way))
         for way in ways
@@ -142,88 +134,128 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
     return float(means[0] - means[1]) / 2, float(np.hypot(*errors)) / 2
 
 
-def _pair(values: FloatArray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """One scan's averaged frames.
+
+    Parameters
+    ----------
+    coarse
+        Thinned out where there are many strokes.
+    places_mm : (m, k, 2) array
+    stroke, block : (m,) int arrays
+        Among the strokes of all scans, and which frames share errors.
+    """
+
+    coarse: CoarseFrames
+    places_mm: FloatArray
+    stroke: IndexArray
+    block: IndexArray
+
+    @classmethod
+    def of(cls, source: Source, number: int, strokes: Sequence[StrokeShift]) -> _Part:
+        time_s = source.selection.scan.frames.time_s
+        readings = len(source.frames) * 5e-3 / POOL_S * source.readout.size / 4 if len(time_s) else 0.0
+        every = int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))
+        kept = np.flatnonzero(np.floor(time_s[source.frames] / POOL_S) % max(every, 1) == 0)
+        coarse = CoarseFrames.of(source.selection, source.frames[kept])
+        first = next(n for n, one in enumerate(strokes) if one.scan == number)
+        starts = [one.start for one in strokes if one.scan == number]
+        stroke = np.searchsorted(starts, kept[coarse.first], side="right") - 1 + first
+        return cls(coarse, coarse.places_mm(source.projection.part(kept)), stroke, coarse.blocks(time_s))
+
+    def shifted_mm(self, shifts_mm: FloatArray) -> FloatArray:
+        """(m, k, 2) places with each stroke moved back along x by its shift, one for each of all strokes."""
+        moved = self.places_mm.copy()
+        moved[:, :, 0] -= shifts_mm[self.stroke, None]
+        return moved
 
 
-def _stroke_map(
-    source: Source, level: FloatArray, stroke: StrokeShift, shift_mm: FloatArray, *, cell_mm: float, engine: Engine
-) -> CellSums:
-    """The cells of one stroke, moved back by its shift."""
-    sums = CellSums(cell_mm)
-    frames = source.frames[stroke.start : stroke.stop]
-    for part in chunks(len(frames), engine.chunk_frames(source.readout.size)):
-        used = np.arange(stroke.start, stroke.stop)[part]
-        projection = _shifted(source.projection.part(used), -shift_mm)
-        counts = source.readout.counts(source.selection.scan.frames.counts[frames[part]])
-        engine.add(sums, source.readout, counts, projection=projection, level=level[used])
-    return sums
+@dataclass(frozen=True, slots=True, eq=False)
+class _Round:
+    """The regression at some shifts.
+
+    Parameters
+    ----------
+    normal : (K, K) array
+        Product of the strokes' designs over the variance of what is left.
+    score : (K,) array
+        Their product with what is left, over the same.
+    widened : (K,) array
+        By how much standard errors exceed those of independent errors and exact slopes.
+    """
+
+    normal: FloatArray
+    score: FloatArray
+    widened: FloatArray
+
+    @classmethod
+    def of(cls, parts: Sequence[_Part], shifts_mm: FloatArray) -> _Round:
+        fit = ShiftFit.of([part.coarse for part in parts], [part.shifted_mm(shifts_mm) for part in parts])
+        frame = fit.frame_numbers()
+        block = _numbered([part.block for part in parts])
+        even = (block % 2 == 0)[frame]
+        halves = [fit.of_some(keep) for keep in (even, ~even)]
+        columns, told = [], []
+        for unit in np.eye(len(shifts_mm)):
+            moves = [part.shifted_mm(unit) - part.places_mm for part in parts]
+            columns.append(fit.design(moves))
+            raw, one, other = (some.raw_design(moves) for some in (fit, *halves))
+            told.append(float(one @ other) / max(float(raw @ raw), 1e-300))
+        design = np.array(columns)
+        normal, left = design @ design.T, float(fit.data.var())
+        best = np.linalg.lstsq(normal, design @ fit.data, rcond=1e-9)[0]
+        shared = _shared(design, fit.data - best @ design, block[frame])
+        share = np.clip(told, 0.0, 1.0)
+        widened = np.sqrt(max(1.0, shared)) / np.where(share > 0, share, np.nan)
+        return cls(normal / left, design @ fit.data / left, np.nan_to_num(widened, nan=np.inf))
+
+    def step(self, shifts_mm: FloatArray) -> FloatArray:
+        """(K,) by how much further the strokes are shifted; shifts that nothing tells are drawn to 0."""
+        precision = self.normal + np.eye(len(self.normal)) / EXPECTED_MM**2
+        pull = self.score - shifts_mm / EXPECTED_MM**2
+        return np.asarray(np.linalg.solve(precision, pull))
+
+    def own_errors(self) -> FloatArray:
+        """(K,) standard error of each stroke's shift if all the others' were known."""
+        return np.asarray(self.widened / np.sqrt(np.maximum(np.diag(self.normal), 1e-300)))
+
+    def errors(self) -> tuple[NDArray[np.bool_], FloatArray]:
+        """(K,) strokes whose shift about the known strokes' mean is known, and the (K,) standard errors."""
+        covariance = np.linalg.inv(self.normal + np.eye(len(self.normal)) / EXPECTED_MM**2)
+        known, errors = self.own_errors() < KNOWN_SD_MM, np.full(len(self.normal), np.inf)
+        for _ in range(2):
+            if known.sum() < 2:
+                return known, errors
+            about = np.eye(len(known)) - known / known.sum()
+            errors = np.hypot(np.sqrt(np.diag(about @ covariance @ about.T)) * self.widened, MISFIT_MM)
+            known = known & (errors < KNOWN_SD_MM)
+        return known, errors
+
+
+def _numbered(blocks: Sequence[IndexArray]) -> IndexArray:
+    """The scans' blocks counted on from one scan to the next."""
+    starts = np.cumsum([0, *(int(one.max()) + 1 for one in blocks)])
+    return np.concatenate([one + start for one, start in zip(blocks, starts, strict=False)])
+
+
+def _shared(design: FloatArray, left: FloatArray, block: IndexArray) -> float:
+    """By how much errors shared within blocks widen the variance of the designs' coefficients, over all of them."""
+    scores = np.array([np.bincount(block, column * left) for column in design])
+    free = max(1.0, scores.shape[1] - len(design))
+    widening = float(np.sum(scores**2) / (left.var() * np.sum(design**2)))
+    return float(widening * scores.shape[1] / free)
 
 
 def _shifted(projection: Projection, by_mm: FloatArray) -> Projection:
+    """Moved by (n, 2) mm."""
     whole = np.rint(by_mm / projection.cell_mm * 2.0**30) / 2.0**30  # on the grid that keeps cells exact
     return projection.moved(whole)
 
 
 def _moved(source: Source, strokes: list[StrokeShift]) -> Source:
-    """The source with the shifts of its strokes taken off."""
+    """Source with its strokes moved back by their shifts."""
     shift = np.zeros_like(source.projection.shift)
     for one in strokes:
-        shift[one.start : one.stop] = one.shift_mm
+        shift[one.start : one.stop, 0] = one.shift_mm
     return Source(source.selection, source.readout, _shifted(source.projection, -shift))
-
-
-def _steps(maps: list[CellSums], cell_mm: float) -> tuple[FloatArray, FloatArray]:
-    """(strokes, 2) shifts of each stroke's map against the sum of the others', and their standard errors, mm."""
-    whole = CellSums(cell_mm)
-    for one in maps:
-        whole.merge(one)
-    count, total = np.zeros((2, len(maps), *whole.count.shape))
-    for index, one in enumerate(maps):
-        window = whole.window(one.first, (one.count.shape[0], one.count.shape[1]))
-        count[index][window], total[index][window] = one.count, one.total
-    results = [
-        _step(count[i], total[i], whole.count - count[i], whole.total - total[i], cell_mm) for i in range(len(maps))
-    ]
-    return np.array([step for step, _ in results]), np.array([error for _, error in results])
-
-
-def _step(
-    count: FloatArray, total: FloatArray, others: FloatArray, others_total: FloatArray, cell_mm: float
-) -> tuple[FloatArray, FloatArray]:
-    """Shift of one stroke's cells against the others', after both were smoothed alike."""
-    n, m = smooth(count), smooth(others)
-    both = (n > 1) & (m > 1)
-    here = np.divide(smooth(total), n, out=np.zeros_like(n), where=both)
-    there = np.divide(smooth(others_total), m, out=np.full_like(m, np.nan), where=both)
-    gradient_y, gradient_x = np.gradient(there, cell_mm)
-    sound = both & np.isfinite(gradient_x) & np.isfinite(gradient_y)
-    if np.count_nonzero(sound) < 20:
-        return np.zeros(2), np.full(2, np.inf)
-    weight = np.sqrt(n[sound] * m[sound] / (n[sound] + m[sound]))
-    design = np.stack([-gradient_x[sound], -gradient_y[sound], np.ones(np.count_nonzero(sound))], axis=1)
-    design, data = design * weight[:, None], (here - there)[sound] * weight
-    information = design.T @ design
-    if np.linalg.cond(information / np.sqrt(np.outer(*[np.diag(information) + 1e-300] * 2))) > 1e6:
-        return np.zeros(2), np.full(2, np.inf)
-    inverse = np.linalg.inv(information)
-    best = inverse @ (design.T @ data)
-    misfit = np.square(data - design @ best)
-    # The others' map has noise of its own, and so has its gradient: without much more than that there is no slope.
-    noise_slope = (weight**2 / m[sound]).sum() * float(misfit.mean()) / (2 * cell_mm**2)
-    if not np.diag(information)[:2].min() > _LEAST_SLOPE * noise_slope:
-        return np.zeros(2), np.full(2, np.inf)
-    # Neighbours share readings after smoothing, and the misfit is one of shape: a tenth of the cells count.
-    noise = float(misfit.sum()) / max(1.0, 0.1 * len(data) - 3)
-    return best[:2], np.sqrt(noise * np.diag(inverse)[:2])
-
-
-def smooth(values: NDArray[np.generic]) -> FloatArray:
-    """Binomial smoothing along both axes, two cells (SD 1.4) wide."""
-    smooth = np.asarray(values, dtype=np.float64)
-    for axis in (0, 1):
-        for _ in range(4):
-            padded = np.pad(smooth, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
-            low, middle, high = (np.take(padded, range(k, k + smooth.shape[axis]), axis=axis) for k in range(3))
-            smooth = 0.25 * low + 0.5 * middle + 0.25 * high
-    return smooth

@@ -1,4 +1,4 @@
-"""The tactile map: what a scan became, with the recipe that made it."""
+"""The tactile map, with the recipe by which it was built."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FEW_READINGS = 10
 
 @dataclass(frozen=True, slots=True)
 class MapRecipe:
-    """How a map was built: what a size calibration must share with the maps it is used on.
+    """How a map was built; a size calibration fits only maps of its own recipe.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class MapRecipe:
 
     @property
     def flat_field_known(self) -> bool | None:
-        """`flat_field` of a scan's map; None of an imported grid, which does not say."""
+        """`flat_field` of a scan's map; None for an imported grid, where it is unknown."""
         return self.flat_field if self.source == "scan" else None
 
 
@@ -81,7 +81,7 @@ class TactileMap:
         Mean and within-cell variance of the readings; NaN where `count` is 0. Without unit after normalising,
         kPa with ``normalise="none"``.
     count : (ny, nx) int64 array
-        Readings a cell.
+        Readings per cell.
     x_mm, y_mm : (nx,), (ny,) arrays
         Cell centres in `plane`; x runs across the head, y along it.
     recipe
@@ -134,14 +134,14 @@ class TactileMap:
 
     @property
     def fingerprint(self) -> int:
-        """64 bits of a hash of the cells and their values: what seeds random numbers, whatever file the map is in.
+        """First 64 bits of a hash of the cells and their values, which seed random numbers whatever file the map is in.
 
         Where the map came from, where it lies in the patient and what the file says of it are no part of it.
         """
         digest = hashlib.sha256(np.array(self.mean.shape, dtype="<i8").tobytes())
         covered = self.covered
         for values in (self.mean, self.variance, self.count):
-            # a NaN has many bit patterns, and what a file holds where there are no data is nobody's business
+            # NaN has many bit patterns: cells without data count as one value
             held = np.where(covered & np.isfinite(values), values, 0.0)
             digest.update(np.ascontiguousarray(held, dtype="<f8").tobytes())
         for axis in (self.x_mm, self.y_mm):
@@ -156,7 +156,7 @@ class TactileMap:
 
     @property
     def counts_known(self) -> bool:
-        """Whether `count` says how many readings a cell has: an imported grid without counts has 1 everywhere."""
+        """Whether `count` is the number of readings per cell: an imported grid without counts has 1 everywhere."""
         return self.recipe.source == "scan" or bool((self.count > 1).any())
 
     @property

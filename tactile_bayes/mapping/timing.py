@@ -1,4 +1,4 @@
-"""How evenly frames and poses came: rates, jitter, repeats, gaps and what is missing."""
+"""Regularity of frames and poses: rates, jitter, repeats, gaps and missing records."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
 
 
 def _regularity(name: str, times: list[FloatArray]) -> dict[str, float]:
-    """Rate, and standard deviation of the intervals that hold no gap."""
+    """Rate, and standard deviation of the intervals that contain no gap."""
     steps = np.concatenate([np.diff(time) for time in times])
     steps = steps[steps > 0]
     if not len(steps):
@@ -51,7 +51,7 @@ def _regularity(name: str, times: list[FloatArray]) -> dict[str, float]:
 
 
 def _missing(time_s: FloatArray) -> int:
-    """Frames that would have filled the gaps."""
+    """Number of frames missing in the gaps."""
     steps = np.diff(time_s)
     steps = steps[steps > 0]
     if not len(steps):

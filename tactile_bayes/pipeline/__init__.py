@@ -1,1 +1,1 @@
-"""From a map's file to its answer: which calibration, which options, which estimate, in one place for every caller."""
+"""Estimation from map files: choice of calibration and options, estimate and report, shared by all callers."""

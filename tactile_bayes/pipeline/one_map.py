@@ -26,7 +26,7 @@ Notice = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What one map came to: its JSON object and its text, or an error with its exit code.
+    """Answer for one map: its JSON object and its text, or an error with its exit code.
 
     `text` is the report in at most 12 lines, `full_text` all of it. `shape` holds what pooling
     needs of a map on which a lump was found, `normalise` how the map's frames were, `fingerprint` what its values seed
@@ -44,24 +44,46 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class NoSize:
-    """Why there are widths only where no calibration was named, and what would lead to a size."""
+    """Reason for widths without a size where no calibration was named, and a remedy."""
 
     reason: str
     advice: str = ""
 
 
+_LEAST_SQUARES = NoSize(
+    "optimise is the paper's least squares, and the shipped calibrations were learned with correlated errors (its "
+    "widths are up to 30 % wider, docs/decisions/0093); widths only",
+    "--method laplace --size-calibration eq6 gives a size by Eq 6 as quickly; for least squares throughout, learn Eq 6 "
+    "from phantoms fitted by --method optimise (`calibrate size`) and give that file",
+)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """One map, its estimate and what made it."""
+    """One map with its estimate, provenance and settings."""
 
     tactile_map: TactileMap
     estimate: Estimate
     provenance: Provenance
     settings: Settings
+    calibration: Calibration | None = None
+
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write all draws, and what goes with them, as netCDF that arviz opens."""
+        import numpy as np
+
+        from tactile_bayes.files.posterior_nc import write_posterior
+        from tactile_bayes.posterior.inference_groups import inference_groups
+
+        rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
+        groups = inference_groups(
+            self.estimate, calibration=self.calibration, size_priors=size_priors(self.settings), rng=rng
+        )
+        write_posterior(path, self.estimate, provenance=self.provenance, groups=groups, force=force)
 
 
 def answer_file(path: Path, *, settings: Settings) -> Answer:
-    """The answer for one map of several, in whichever process; an error of this map is its answer."""
+    """Answer for a map file, in any process; an error with this map becomes its answer."""
     try:
         return answer_of(estimate_file(path, settings))
     except TactileBayesError as error:
@@ -72,7 +94,7 @@ def answer_file(path: Path, *, settings: Settings) -> Answer:
 def estimate_file(
     path: Path, settings: Settings, *, progress: Progress | None = None, notice: Notice | None = None
 ) -> Outcome:
-    """Read a map and estimate; see `estimate_one`."""
+    """Read a map and estimate it; see `estimate_one`."""
     from tactile_bayes.files.map_nc import read_map
 
     tactile_map = read_map(path)
@@ -118,7 +140,8 @@ def estimate_one(
     from tactile_bayes.posterior.drawn import fitting_calibration
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
     from tactile_bayes.posterior.other_rises import other_rises
-    from tactile_bayes.report.quadratic_text import calibration_line
+    from tactile_bayes.report.population_text import calibration_line
+    from tactile_bayes.size.body_calibration import mean_width_mm
 
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
@@ -141,19 +164,24 @@ def estimate_one(
     estimate = replace(estimate, other_rises=other_rises(tactile_map, estimate, options))
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
-    used = None if estimate.map_posterior is None else fitting_calibration(estimate.map_posterior, calibration)
-    if used is not None and estimate.size is not None:
+    posterior = estimate.map_posterior
+    used = None if posterior is None else fitting_calibration(posterior, calibration)
+    if posterior is not None and used is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
-        words = calibration_line(name, used, shipped=name in SHIPPED)
+        by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"
+        widths = posterior.medians[1:]
+        words = calibration_line(by, used, sigma_mm=mean_width_mm(*widths))
         assert estimate.diagnostics is not None
-        estimate = replace(estimate, diagnostics=replace(estimate.diagnostics, size_calibration=words))
+        diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words)
+        estimate = replace(estimate, diagnostics=diagnostics)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     recorded = _recorded(settings, options, calibration=named)
-    return Outcome(tactile_map, estimate, Provenance("estimate", recorded, digests, seed=settings.seed), settings)
+    provenance = Provenance("estimate", recorded, digests, seed=settings.seed)
+    return Outcome(tactile_map, estimate, provenance, settings, used)
 
 
 def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str) -> dict[str, Any]:
-    """The settings that the provenance of an answer has."""
+    """Settings for an answer's provenance."""
     return {
         "size_calibration": calibration,
         "method": settings.method,
@@ -175,7 +203,7 @@ def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str)
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Path | None, Calibration | None, NoSize | None]:
-    """The calibration that was named, or the shipped one where nothing was said and it fits the map and the options.
+    """The calibration that was named, or the shipped one if none was and it fits map and options.
 
     Returns
     -------
@@ -204,14 +232,15 @@ def choose_calibration(
         return path, calibration, None
     fit = _options(settings, calibration, tactile_map).fit
     differs = recipe_differences(tactile_map, calibration, fit)
-    if differs or settings.method == "optimise":
-        what = "; ".join(differs) or "method optimise knows no noise field"
-        return None, None, NoSize(f"the shipped calibration does not fit: {what}; widths only")
+    if settings.method == "optimise":
+        return None, None, _LEAST_SQUARES
+    if differs:
+        return None, None, NoSize(f"the shipped calibration does not fit: {'; '.join(differs)}; widths only")
     return path, calibration, None
 
 
 def _level_unknown(tactile_map: TactileMap, fit: FitOptions) -> NoSize:
-    """Why a map whose level is not known has widths only, and the commands that lead to a size."""
+    """Reason for widths only where a map's level is unknown, with the commands that lead to a size."""
     made = f"--normalise {tactile_map.recipe.normalise} --background {fit.background} --noise {fit.noise}"
     learn = (
         "estimate maps of at least 8 lumps of known size made the same way, list their d_mm, amplitude, sigma_x_mm and "
@@ -227,7 +256,7 @@ def _level_unknown(tactile_map: TactileMap, fit: FitOptions) -> NoSize:
 
 
 def _options(settings: Settings, calibration: Calibration | None, tactile_map: TactileMap) -> EstimateOptions:
-    """What is not given is as the calibration's maps were fitted, else as the paper printed it.
+    """Options of an estimate: unset ones from the calibration's recipe, else from the paper.
 
     Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
     """
@@ -265,9 +294,24 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
     )
 
 
+def estimate_inputs(
+    settings: Settings, tactile_map: TactileMap
+) -> tuple[Calibration | None, EstimateOptions, NoSize | None]:
+    """What `estimate_one` takes for a map: calibration and options, and why there is no calibration if nobody said so.
+
+    Raises
+    ------
+    BadDataError
+        When the calibration that was named does not fit the map.
+    """
+    _, calibration, why_none = choose_calibration(settings, tactile_map)
+    return calibration, _options(settings, calibration, tactile_map), why_none
+
+
 def size_priors(settings: Settings) -> SizePriors:
-    """The spread between maps, known or to be learned."""
-    from tactile_bayes.size.pooling import BetweenMaps, SizePriors
+    """Priors of a size; a spread between maps that is given holds for both of its intervals."""
+    from tactile_bayes.size.between_maps import BetweenMaps
+    from tactile_bayes.size.pooling import SizePriors
 
     for name, value in settings.known:
         if value < 0 or (value == 0 and name != "seat"):
@@ -275,12 +319,13 @@ def size_priors(settings: Settings) -> SizePriors:
                 f"--known {name} is {value:g}; it must {'not be below' if name == 'seat' else 'be above'} 0"
             )
     fixed = settings.between_map_sd
-    between = BetweenMaps() if fixed is None else BetweenMaps(fixed, 0.0)
-    return SizePriors(between_maps=between, known=dict(settings.known))
+    if fixed is None:
+        return SizePriors(known=dict(settings.known))
+    return SizePriors(between_maps=BetweenMaps(fixed, 0.0), another_exam=None, known=dict(settings.known))
 
 
 def answer_of(outcome: Outcome) -> Answer:
-    """The report of one map."""
+    """Report of an outcome as JSON and text."""
     from tactile_bayes.posterior.lump.bump import BumpPrior
     from tactile_bayes.report.estimate_document import estimate_document, estimate_quantities
     from tactile_bayes.report.estimate_summary import estimate_summary
@@ -305,7 +350,7 @@ def answer_of(outcome: Outcome) -> Answer:
 
 
 def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
-    """What pooling needs of a map, with the direction of its axes in the patient where landmarks tell."""
+    """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
     import math
 
     from tactile_bayes.size.fat_depth import head_profile

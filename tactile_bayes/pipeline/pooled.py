@@ -1,4 +1,4 @@
-"""Several maps of one mass: one size from the answers of all of them."""
+"""One size from several maps of one mass."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.pooling import PooledEstimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PooledOutcome:
-    """The size of one mass, its JSON object and what made it."""
+    """Size of one mass, with its JSON object and provenance."""
 
     pooled: PooledEstimate
     document: dict[str, Any]
@@ -73,7 +73,7 @@ def pool_answers(
 
 
 def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
-    """No size where a map shows a lump too far outside the calibration's range; None where none does."""
+    """Reason for no size where a map is too far outside the calibration's range; else None."""
     from tactile_bayes.size.pooling import PooledEstimate
 
     for i, answer in enumerate(answers):
@@ -83,7 +83,7 @@ def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
 
 
 def _shipped_for(answers: Sequence[Answer]) -> str:
-    """The shipped calibration for maps that were all normalised one way."""
+    """Shipped calibration for maps that are all normalised alike."""
     from tactile_bayes.files.shipped import default_for
 
     ways = sorted({answer.normalise for answer in answers})
@@ -95,11 +95,11 @@ def _shipped_for(answers: Sequence[Answer]) -> str:
     return default_for(ways[0])
 
 
-def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | None, LogQuadratic]:
+def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | None, BodyCalibration]:
     """The calibration that pools, and its file if it is in one."""
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.body_calibration import BodyCalibration
 
     path, calibration = None, settings.calibration
     if calibration is None or isinstance(calibration, str):
@@ -107,14 +107,16 @@ def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | 
         if path is None:
             raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
         calibration = read_size_calibration(path)
-    if not isinstance(calibration, LogQuadratic):
+    if not isinstance(calibration, BodyCalibration):
         what = path or settings.calibration_name
-        raise UsageError(f"--pool needs a calibration of the log-quadratic form; {what} is of Eq 6: use solid")
+        raise UsageError(
+            f"--pool needs a calibration learned over bodies; {what} is of a study or phantoms: use solid or eq6"
+        )
     return path, calibration
 
 
 def _plain(settings: Settings) -> dict[str, Any]:
-    """The settings as JSON holds them."""
+    """Settings as JSON values."""
     plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
     plain = {name: list(v) if isinstance(v, tuple) else v for name, v in plain.items()}
     del plain["seed"], plain["settings_file"]

@@ -1,4 +1,4 @@
-"""Scan files to scans, with what speaks against them."""
+"""Loading of scan files, with cautions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def load_scans(paths: Sequence[Path]) -> tuple[list[Scan], list[str]]:
-    """The scans, and what unfinished files had lost or what else speaks against them."""
+    """Load scans, and the cautions about them: losses of unfinished files and other doubts."""
     from tactile_bayes.files.scan_mcap import read_scan_report
 
     scans, lost = [], []

@@ -1,4 +1,4 @@
-"""The settings of one `estimate`, whoever calls it: command line, Python, several maps at once."""
+"""Settings of `estimate`, shared by the command line, Python and batches."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, get_args
 
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.presets import INTERVAL, METHODS, NOISE, SCENES, Background, Method, Noise, Rotation, SceneAsked
 from tactile_bayes.records import dataclass
 
@@ -39,7 +39,7 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The settings of one `estimate`; picklable, so that a worker process can have them.
+    """Settings of `estimate`; picklable, so that worker processes can receive them.
 
     Parameters
     ----------
@@ -95,8 +95,8 @@ class Settings:
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
             value = getattr(self, name)
-            if value not in choices and not (value is None and name in ("background", "noise")):
-                raise UsageError(f"{name} is {value!r}; give one of {', '.join(choices)}")
+            if value is not None or name not in ("background", "noise"):
+                check_choice(name, value, choices)
         if not 0.0 < self.interval < 1.0:
             raise UsageError(f"interval is {self.interval:g}; give a probability between 0 and 1")
         if self.seed < 0:

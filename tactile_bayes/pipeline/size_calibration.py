@@ -1,25 +1,31 @@
-"""A table of lumps to a size calibration of either form."""
+"""Size calibrations of either form from a table of lumps."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.presets import FIT_RADIUS_MM, Background, Noise
+from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
+
+_SOURCE = "balls in a population of bodies, scanned by the solid model"
 
 if TYPE_CHECKING:
-    from tactile_bayes.files.tables import Table
+    from tactile_bayes.files.tables import Sheet, Table
     from tactile_bayes.pipeline.one_map import Progress
+    from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.eq6 import LeftOutErrors, Recipe, SizeCalibration
     from tactile_bayes.size.learn.eq6 import SizeTable, StudyCases
-    from tactile_bayes.size.log_quadratic import LogQuadratic
+    from tactile_bayes.size.learn.eq6_two_stage import OtherFit
+
+EqSixFit = Literal["joint", "two-stage"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learned:
-    """A size calibration, what it was learned from and the settings for its provenance.
+    """A learned size calibration, with its table and the settings for its provenance.
 
     Parameters
     ----------
@@ -27,18 +33,22 @@ class Learned:
         Rows of the table as Eq 6 takes them.
     not_left_out
         Why no geometry could be left out; empty where they were, or the table is no study.
+    other_fit
+        What the other of the two fits makes of the table; None where it has none.
     """
 
     calibration: SizeCalibration
     lumps: SizeTable
     not_left_out: str
     settings: dict[str, Any]
+    other_fit: OtherFit | None = None
 
 
 def learn_eq6(
     rows: Table,
     declared: Mapping[str, Any],
     *,
+    fit: EqSixFit = "joint",
     least_stiffness_ratio: float = 0.0,
     seed: int = 1,
     progress: Progress | None = None,
@@ -49,6 +59,8 @@ def learn_eq6(
     ----------
     declared
         As for `table_recipe`.
+    fit
+        ``"joint"``: the posterior of all coefficients from all rows; ``"two-stage"``: as printed, with a bootstrap.
     least_stiffness_ratio
         Softer lumps take no part.
 
@@ -64,13 +76,18 @@ def learn_eq6(
     import numpy as np
 
     from tactile_bayes.size.learn.eq6 import learn_size_calibration
+    from tactile_bayes.size.learn.eq6_two_stage import learn_two_stage, other_fit
 
     recipe = table_recipe(rows, declared)
     try:
         lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
         rng = np.random.default_rng(seed)
-        calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
-        left_out, silent = _left_out(lumps, least_stiffness_ratio=least_stiffness_ratio)
+        if fit == "two-stage":
+            calibration = learn_two_stage(lumps, recipe=recipe, rng=rng)
+        else:
+            calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
+        other = other_fit(calibration, lumps)
+        left_out, silent = _left_out(lumps, fit, least_stiffness_ratio=least_stiffness_ratio)
     except BadDataError as error:
         raise error.at(rows.path) from None
     settings = {
@@ -79,14 +96,47 @@ def learn_eq6(
         "fit_radius_mm": recipe.radius_mm,
         "noise": recipe.noise,
         "least_stiffness_ratio": least_stiffness_ratio,
+        "fit": fit,
     }
-    return Learned(replace(calibration, left_out=left_out), lumps, silent, settings)
+    cautions = table_cautions(rows.columns, least_stiffness_ratio=least_stiffness_ratio)
+    learned = replace(calibration, left_out=left_out, cautions=cautions)
+    return Learned(learned, lumps, silent, settings, other)
 
 
-def learn_quadratic(rows: Table) -> tuple[LogQuadratic, dict[str, Any]]:
-    """Learn the log-quadratic form from a table of `population`; the calibration, and settings for its provenance."""
+def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
+    """What makes sizes by Eq 6 of a table of lumps doubtful, in words; see docs/decisions/0093 for the figures."""
+    found, seats = [], set(columns["seat"])
+    if set(columns["sigma_y_mm"]) == {None}:
+        found.append(
+            "its lumps have one width; if they were cylinders, as in a study in two dimensions, "
+            "balls come out 40 to 110 % too large"
+        )
+    if len(seats) == 1 and None not in seats:
+        found.append(f"its lumps have one seat ({seats.pop()}); one of another seat may come out half too large")
+    softest = min((ratio for ratio in columns["stiffness_ratio"] if ratio is not None), default=LEAST_HARD_RATIO)
+    if max(softest, least_stiffness_ratio) < LEAST_HARD_RATIO:
+        found.append("it holds soft lumps, beside which hard ones come out too large (--least-stiffness-ratio 8)")
+    return tuple(found)
+
+
+def learn_population(rows: Table, form: str) -> tuple[BodyCalibration, dict[str, Any]]:
+    """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
+
+    Parameters
+    ----------
+    form
+        ``"log-quadratic"`` or ``"eq6"``.
+
+    Raises
+    ------
+    BadDataError
+        When bodies are too few or do not vary.
+    NotConvergedError
+        When the posterior has no mode.
+    """
     from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
     from tactile_bayes.size.eq6 import Recipe
+    from tactile_bayes.size.learn.eq6_population import learn_population_eq6
     from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
     from tactile_bayes.studies.population import measuring_options, population_table
 
@@ -94,16 +144,29 @@ def learn_quadratic(rows: Table) -> tuple[LogQuadratic, dict[str, Any]]:
     recipe = Recipe(
         _normalise_of(rows), fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False
     )
-    source = "balls in a population of bodies, scanned by the solid model"
+    learn = learn_log_quadratic if form == "log-quadratic" else learn_population_eq6
     try:
-        calibration = learn_log_quadratic(population_table(rows.columns), recipe=recipe, source=source)
+        calibration = learn(population_table(rows.columns), recipe=recipe, source=_SOURCE)
     except BadDataError as error:
         raise error.at(rows.path) from None
-    return calibration, {"form": "log-quadratic", **as_settings(BodyPrior(), ExamPrior())}
+    masses = len(set(rows.columns["body"]))
+    return calibration, {"form": form, "masses": masses, **as_settings(BodyPrior(), ExamPrior())}
+
+
+def is_population(source: Path | Sheet) -> bool:
+    """Whether a table is one of `population`: exams of bodies, by its header."""
+    if isinstance(source, Path):
+        from tactile_bayes.files.reading import open_input
+
+        with open_input(source) as file:
+            header = file.readline(4096).decode("utf-8-sig", errors="replace")
+    else:
+        header = source.text.partition("\n")[0]
+    return {"body", "exam"} <= {name.strip() for name in header.split(",")}
 
 
 def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
-    """How the maps of a size table were made and fitted: what its columns say, else what is declared, else the default.
+    """Recipe of a size table's maps: from its columns, else as declared, else the default.
 
     Parameters
     ----------
@@ -136,7 +199,7 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
 
 
 def _alike(table: Table, name: str) -> Any:
-    """The value of a column that must be alike in all rows."""
+    """Value of a column that must be the same in all rows."""
     values = table.columns[name]
     if len(set(values)) > 1:
         what = f"{name} differs between rows"
@@ -149,24 +212,26 @@ def _contradiction(table: Table, name: str, said: object, declared: object) -> B
     way_out = f"leave out {option}"
     if name == "normalise":
         way_out += f", and size maps made with `map --normalise {said}`"
-        way_out += "; `population` and --form log-quadratic give a calibration for --normalise gain"
+        way_out += "; `population` gives a table for --normalise gain"
     what = f"its {name} is {said}, not {declared} as {option} says"
     return BadDataError(what, way_out=way_out, path=str(table.path))
 
 
-def _left_out(lumps: SizeTable, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
-    """Errors on geometries left out, or why Eq 6 has none."""
+def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
+    """Cross-validated errors, or the reason why Eq 6 has none."""
     from tactile_bayes.errors import NotConvergedError
     from tactile_bayes.size.learn.cross_validation import left_out_of_study
+    from tactile_bayes.size.learn.eq6_two_stage import axis_in_two_stages
 
+    one_axis = axis_in_two_stages if fit == "two-stage" else None
     try:
-        return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio), ""
-    except NotConvergedError as error:
+        return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio, fit=one_axis), ""
+    except (NotConvergedError, BadDataError) as error:
         return None, str(error)
 
 
 def _normalise_of(rows: Table) -> str:
-    """How the maps of a table of `population` were normalised; by the mean in tables that do not say."""
+    """Way a `population` table's maps were normalised; by the mean in tables without the column."""
     found = {str(value or "mean") for value in rows.columns.get("normalise", ["mean"])}
     if len(found) > 1:
         raise BadDataError(
@@ -178,13 +243,13 @@ def _normalise_of(rows: Table) -> str:
 
 
 def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:
-    """The columns of a table as arrays, with Delta sigma where the table has depths; softer lumps are left out."""
+    """Columns of a table as arrays, with Delta sigma where depths are given; without softer lumps."""
     import numpy as np
 
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.size.learn.eq6 import SizeTable, width_changes
 
-    # a study says which of its lumps show; the others' fits are fits to a trough
+    # only lumps marked as detectable: fits to the others describe a trough
     shown = [
         flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
         for flag, ratio in zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
@@ -212,11 +277,11 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable
     group = list(zip(*same, strict=True))
     change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
     change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)
-    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns))
+    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns), depth)
 
 
 def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
-    """Which case each row is; None where a row does not say how stiff its lump is."""
+    """Study case of each row; None where a row lacks the lump's stiffness."""
     import numpy as np
 
     from tactile_bayes.size.learn.eq6 import StudyCases
@@ -231,7 +296,7 @@ def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
 
 
 def _seat_numbers(seats: list[str | None]) -> list[float | None]:
-    """0 for centred, 1 for resting; None for names that are the table's own."""
+    """Seats as numbers, 0 for centred and 1 for resting; None for other names."""
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.forward.body import parse_seat
 

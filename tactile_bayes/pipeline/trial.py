@@ -1,4 +1,4 @@
-"""A trial's tables to its report: errors, lines, agreement and calibration of each modality."""
+"""Analysis of a trial from its tables: errors, lines, agreement and calibration of each modality."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCHEMA = "tactile-bayes/validate/1"
 
 @dataclass(frozen=True, slots=True)
 class TrialSettings:
-    """How the analysis is made; each enters the provenance."""
+    """Settings of the analysis; each is part of the provenance."""
 
     intervals: Literal["corrected", "jackknife", "percentile", "bca"] = "corrected"
     resamples: int = 2000
@@ -30,7 +30,7 @@ class TrialSettings:
 
 @dataclass(frozen=True, slots=True)
 class TrialOutcome:
-    """Everything a run found."""
+    """Results of an analysis."""
 
     report: TrialReport
     document: dict[str, Any]
@@ -39,7 +39,7 @@ class TrialOutcome:
 
 
 def intervals_of(settings: TrialSettings) -> Intervals:
-    """How the intervals of a report are made."""
+    """Intervals of a report: probability and method."""
     from tactile_bayes.presets import INTERVAL
     from tactile_bayes.trial.bootstrap import Intervals
 
@@ -49,7 +49,7 @@ def intervals_of(settings: TrialSettings) -> Intervals:
 def analyse(
     inputs: TrialInputs, settings: TrialSettings, *, protocol: Path | None = None, title: str | None = None
 ) -> TrialOutcome:
-    """The report of a trial.
+    """Analyse a trial.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def analyse(
 
 
 def _next_mass(inputs: TrialInputs, settings: TrialSettings) -> NextMass:
-    """The Bayesian model; the sampler is handed in, because the trial's package imports none."""
+    """Fit the Bayesian model of the next mass, with the sampler passed in (the trial package imports none)."""
     import numpy as np
 
     from tactile_bayes.pipeline.trial_sampler import draw

@@ -1,4 +1,4 @@
-"""What `validate` and `plan` read: the tables of a trial, tidy or wide, and the estimates that they name."""
+"""Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TrialInputs:
-    """A trial ready to be summarised, and every file that went into it by role."""
+    """Input of a trial's analysis, with every file read, by role."""
 
     readings: list[Reading]
     ex_vivo_mm: Mapping[MassKey, float]
@@ -23,7 +23,7 @@ class TrialInputs:
 
 
 def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None) -> TrialInputs:
-    """Read and check both tables; `columns` maps a wide one, which is a file."""
+    """Read and check both tables; `columns` is the mapping file of a wide table."""
     from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
     from tactile_bayes.files.size_posterior import fill_from_posteriors
     from tactile_bayes.files.tables import Sheet, check_references, read_table

@@ -1,4 +1,4 @@
-"""Draws for the model of the next mass: importance sampling about the mode, or MCMC where that cannot be trusted."""
+"""Sampler for the next mass's model: importance sampling about the mode, or MCMC where it cannot be trusted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ACCURACY_SD = 0.03
 def draw(
     log_density: LogDensity, centre: FloatArray, covariance: FloatArray, *, rng: np.random.Generator
 ) -> ParameterDraws:
-    """Draws of a log density.
+    """Draw from a log density.
 
     Parameters
     ----------

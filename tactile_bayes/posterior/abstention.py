@@ -11,7 +11,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.lump.cells import covered_share, trusted
+from tactile_bayes.posterior.lump.cells import covered_share, trusted, window_cells
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import (
     LEAST_COVERED_SHARE,
@@ -32,6 +32,11 @@ Of 800 simulated exams 46 showed a lump wider than 8 mm, all of them enclosed so
 """
 LEAST_SEEN = 0.25
 """Share of a side's breadth that must be covered for the side to reach as far."""
+LEAST_READ = 0.25
+"""Least share of the map's typical number of readings in a cell, for a bump's cells: 134 lumps had 1.8 and more.
+
+One empty scan of 45 had a spot of 0.16 at its corner, in cells of 3 readings for 29.
+"""
 HOPELESS = 2.0
 """Widths at the mode so many times beyond a limit decide without draws: chains for a stripe of readings took 30 s."""
 MOST_PRIOR_SHARE = 0.5
@@ -45,7 +50,7 @@ SIDES = {
 
 
 def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
-    """Where a lump is looked for, in words: the place that was given, or the area that the map covers.
+    """Where a lump was searched, in words: the place given, or the area that the map covers.
 
     Raises
     ------
@@ -67,7 +72,7 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
 
 
 def chance_text(probability: float) -> str:
-    """A probability as far as it means anything."""
+    """Format a probability with no more digits than it is worth."""
     return "below 0.001" if probability < 0.001 else f"{probability:.2g}"
 
 
@@ -78,7 +83,7 @@ def no_bump(
     *,
     where: str,
 ) -> Abstention:
-    """None of the candidates can be measured: no lump, or one that the map does not show well enough.
+    """Reason when no candidate can be measured: no lump, or one that the map covers too poorly.
 
     Parameters
     ----------
@@ -103,7 +108,7 @@ def no_bump(
 
 
 def _unmeasured(tactile_map: TactileMap, candidate: Candidate, detection: Detection) -> Abstention:
-    """What is a lump by the evidence, and why it has no size."""
+    """Reason for a candidate that is a lump by the evidence and yet has no size."""
     chance = f"probability of a lump {detection.probability:.2g}"
     code, advice = fault_code(tactile_map, candidate)
     reason = f"the rise {_place(candidate)} ({chance}) cannot be measured: {candidate.fault}"
@@ -115,7 +120,7 @@ def _place(candidate: Candidate) -> str:
 
 
 def fault_code(tactile_map: TactileMap, candidate: Candidate) -> tuple[str, str]:
-    """The word for a candidate's fault, and what would fix it."""
+    """Code of a candidate's fault, and a remedy."""
     fit = candidate.fit
     if fit is None:
         short = missing_strokes(tactile_map, candidate.centre_mm, reach_mm=10.0)
@@ -136,7 +141,7 @@ def fault_code(tactile_map: TactileMap, candidate: Candidate) -> tuple[str, str]
 
 
 def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:
-    """By how many mm the map falls short of `reach_mm` from a centre, on each side where it does by a cell or more.
+    """Distance in mm by which coverage falls short of `reach_mm` from a centre, per side, where at least a cell.
 
     A side is a quarter turn about its direction. It ends where less than `LEAST_SEEN` of its breadth is covered: a
     flank of which a corner is missing is still seen.
@@ -156,7 +161,7 @@ def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, 
 
 
 def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float) -> float:
-    """How far a sector of a quarter turn is covered, mm; its innermost two cells have hardly a breadth."""
+    """Distance that a quarter-turn sector is covered, mm; next to its corner one covered cell is enough."""
     for step in range(1, int(np.ceil(reach / cell))):
         here = (along >= (step - 0.5) * cell) & (along < (step + 0.5) * cell)
         if covered[here].sum() < (LEAST_SEEN * 2 * step if step > 1 else 1):
@@ -167,7 +172,7 @@ def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float) -
 def rim_fault(
     tactile_map: TactileMap, centre_mm: tuple[float, float], widths_mm: tuple[float, float], *, radius_mm: float
 ) -> str:
-    """Why a bump cannot be a lump that the map holds: mostly beyond its rim, or within a single cell; empty if neither.
+    """Fault of a bump mostly beyond the map's rim, or within a single cell; empty if neither.
 
     Parameters
     ----------
@@ -187,17 +192,27 @@ def rim_fault(
         )
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
-    return ""
+    return _few_readings_fault(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
+
+
+def _few_readings_fault(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> str:
+    """Fault of a bump that a few frames at the map's edge made; empty if its cells are as well read as others."""
+    typical = float(np.median(tactile_map.count[tactile_map.covered]))
+    cells = window_cells(tactile_map, centre_mm, radius_mm=radius_mm)
+    here = float(np.median(cells.count)) if len(cells) else 0.0
+    if here >= LEAST_READ * typical:
+        return ""
+    return f"at the rim of the map (its cells hold {here:g} readings, where {typical:g} are typical)"
 
 
 def extend_advice(short: dict[str, float]) -> str:
-    """The sides on which the strokes end too early, the worst first; empty when none does."""
+    """Advice on the sides where the strokes end too early, the worst first; empty when none does."""
     parts = [f"{mm:.0f} mm to {side}" for side, mm in sorted(short.items(), key=lambda one: -one[1]) if mm >= 0.5]
     return f"extend the strokes {' and '.join(parts[:2])}" if parts else ""
 
 
 def undetected(detection: Detection, least: float, *, where: str) -> Abstention:
-    """No lump that the noise, or a ridge as a rib makes, would not explain as well."""
+    """Reason when noise, or a rib-like ridge, explains the map as well as a lump."""
     figures = f"(probability of one {chance_text(detection.probability)}, needed {least:g})"
     if detection.ridge:
         reason = f"no lump found {where} {figures}: {detection.ridge}, explains what rises"
@@ -206,7 +221,7 @@ def undetected(detection: Detection, least: float, *, where: str) -> Abstention:
 
 
 def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, prior: BumpPrior) -> Abstention | None:
-    """What draws of the widths say against a size: too narrow for the cells, a ridge, or the prior's own width."""
+    """Reason against a size from draws of the widths: below the cells, a ridge, or as wide as the prior; else None."""
     fault = _width_fault(float(np.median(sigma_x)), float(np.median(sigma_y)), cell_mm=cell_mm, margin=1.0)
     if fault is not None:
         return fault
@@ -221,12 +236,12 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
 
 
 def hopeless_shape(sigma_x_mm: float, sigma_y_mm: float, *, cell_mm: float) -> Abstention | None:
-    """What the widths at the mode say against a size, if they are so far beyond the limits that no draw is needed."""
+    """Reason against a size from the widths at the mode, if far beyond the limits, so that no draws are needed."""
     return _width_fault(sigma_x_mm, sigma_y_mm, cell_mm=cell_mm, margin=HOPELESS)
 
 
 def _width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Abstention | None:
-    """Too narrow for the cells, or a ridge, by a factor of `margin` beyond the limit."""
+    """Reason for widths below the cells' or a ridge's limit by a factor of `margin`; else None."""
     wide, narrow = max(x, y), min(x, y)
     if narrow * margin < LEAST_WIDTH_IN_CELLS * cell_mm:
         reason = f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved"
@@ -238,6 +253,6 @@ def _width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Absten
 
 
 def prior_share(sigma_x: FloatArray, sigma_y: FloatArray, prior: BumpPrior) -> float:
-    """Posterior over prior SD of the less certain log width."""
+    """Posterior SD over prior SD of the less certain log width."""
     sd = max(float(np.std(np.log(sigma_x))), float(np.std(np.log(sigma_y))))
     return sd / float(np.hypot(prior.log_width_sd, prior.log_ratio_sd))

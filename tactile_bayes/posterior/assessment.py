@@ -1,4 +1,4 @@
-"""Noise models behind one interface: assess a place on a map, then draw from its posterior."""
+"""Common interface of both noise models: assess a place on a map, then draw from its posterior."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
-from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, scene_asked
+from tactile_bayes.posterior.options import DETECTED, EstimateOptions, scene_asked
 from tactile_bayes.posterior.white.detection import Detection, detect
 from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.white.fit import BumpFit
@@ -28,7 +28,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapDraws:
-    """Draws of one lump under a noise model.
+    """Posterior draws of one lump under a noise model.
 
     Parameters
     ----------
@@ -78,17 +78,20 @@ class Assessment(Protocol):
 
     @property
     def fault(self) -> str:
-        """Why it can be no lump whatever the odds; empty where nothing speaks against it."""
+        """Reason why the bump cannot be a lump, whatever the odds; empty without one."""
 
     @property
     def scene(self) -> SceneChoice | None:
-        """What the window holds; None under independent errors, and where the density has no mode."""
+        """Structures in the window; None under independent errors, and where the density has no mode."""
 
     def bump(self) -> ModalBump:
-        """The bump at the mode."""
+        """Amplitude, centre and widths of the bump at the mode."""
+
+    def widths_mm(self) -> tuple[float, float]:
+        """Widths of the bump at the mode, along the ellipse's axes; cheaper than `bump`."""
 
     def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
-        """Draws from the posterior of this place.
+        """Draw from the posterior of this place.
 
         Raises
         ------
@@ -98,7 +101,7 @@ class Assessment(Protocol):
 
 
 def assess(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Assessment:
-    """Whether there is a lump at a fitted place, under the noise model of the options."""
+    """Assess whether there is a lump at a fitted place, under the noise model of the options."""
     if not options.fit.correlated:
         detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
         return _White(tactile_map, fit, detection)
@@ -116,9 +119,11 @@ class _White:
     scene: None = None
 
     def bump(self) -> ModalBump:
-        sigma_x, sigma_y, _ = self.fit.widths()
         amplitude, x, y = (float(value) for value in self.fit.theta[:3])
-        return ModalBump(amplitude, x, y, sigma_x, sigma_y)
+        return ModalBump(amplitude, x, y, *self.widths_mm())
+
+    def widths_mm(self) -> tuple[float, float]:
+        return self.fit.widths()[:2]
 
     def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         fit, odds = chosen_rotation(self.tactile_map, self.fit, options=options.fit, prior=options.prior)
@@ -141,55 +146,49 @@ class _Correlated:
         return None if self.answer is None else self.answer.choice
 
     def bump(self) -> ModalBump:
-        from tactile_bayes.posterior.correlated.fit import shape_draws
-
         fit = self._answer.choice.fit
-        sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(fit, fit.mode[None]))
         x, y = (float(fit.scene.column(fit.mode, name)) for name in "xy")
-        return ModalBump(fit.target.amplitude_at(fit.mode), x, y, sigma_x, sigma_y)
+        return ModalBump(fit.target.amplitude_at(fit.mode), x, y, *self.widths_mm())
+
+    def widths_mm(self) -> tuple[float, float]:
+        from tactile_bayes.posterior.correlated.fit import modal_widths
+
+        return modal_widths(self._answer.choice.fit)
 
     def draw(self, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         from tactile_bayes.posterior.correlated.estimate import draw
 
         found = draw(self._answer, self.tactile_map, options, rng=rng, progress=progress)
-        return MapDraws(found.detection, self.fit, found.draws, found.posterior, found.figures, found.choice)
+        return MapDraws(found.detection, self.fit, found.draws, found.posterior, found.figures, self.scene)
 
     @property
     def _answer(self) -> FieldAnswer:
         if self.answer is None:
-            raise NotConvergedError("under correlated errors nothing stands out at this place that could be drawn")
+            raise NotConvergedError(
+                "no bump at this place stands out from the correlated noise, so nothing can be drawn"
+            )
         return self.answer
 
 
 def _correlated(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> _Correlated:
-    """The fit under correlated errors, with what lies beside it where it is a lump by the evidence."""
+    """Assess under correlated errors, with neighbouring structures where there is a lump by the evidence."""
     from tactile_bayes.posterior.correlated.estimate import look, with_neighbours
 
-    scene = scene_asked(options)
     try:
-        seen = look(
-            tactile_map,
-            fit,
-            prior=options.prior,
-            radius_mm=options.fit.radius_mm,
-            scene=scene,
-            least_odds=ROTATION_ODDS,
-            cosines=options.fit.field_cosines,
-        )
+        seen = look(tactile_map, fit, options)
     except NotConvergedError:
-        # no mode: under these errors nothing stands out that could be weighed
+        # no mode: no bump stands out from the correlated noise
         return _Correlated(tactile_map, fit, Detection(0.0, -np.inf), None)
     fault = _field_fault(tactile_map, seen)
     if not fault and seen.detection.probability >= DETECTED:
-        seen = with_neighbours(seen, tactile_map, scene=scene)
+        seen = with_neighbours(seen, tactile_map, scene=scene_asked(options))
     return _Correlated(tactile_map, fit, seen.detection, seen, fault)
 
 
 def _field_fault(tactile_map: TactileMap, seen: FieldAnswer) -> str:
-    """Under correlated errors a rise at the map's edge can grow to lie mostly beyond it, or shrink to a single cell."""
-    from tactile_bayes.posterior.correlated.fit import shape_draws
+    """Fault of a fit under correlated errors: beyond the map's rim, or shrunk to a single cell; empty if none."""
+    from tactile_bayes.posterior.correlated.fit import modal_widths
 
     plain = seen.choice.plain
-    sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
     x, y = (float(plain.scene.column(plain.mode[None], name)[0]) for name in ("x", "y"))
-    return rim_fault(tactile_map, (x, y), (sigma_x, sigma_y), radius_mm=plain.target.problem.radius_mm)
+    return rim_fault(tactile_map, (x, y), modal_widths(plain), radius_mm=plain.target.problem.radius_mm)

@@ -20,7 +20,7 @@ from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.calibration import Calibration, draw_sizes
 from tactile_bayes.size.pooling import SizePriors
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.posterior import EXTREMES, SizePosterior
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 """Of interval ends of sizes, where none is given; the methods have the same for the widths."""
@@ -47,7 +47,7 @@ def draw_sized(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] | None,
 ) -> Drawn:
-    """Draws whose size intervals are as exact as asked for: drawn again, finer, where they are not.
+    """Draw until the size interval is as accurate as requested.
 
     The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
     more finely the last draws stand, with their error.
@@ -67,11 +67,11 @@ def draw_sized(
 
 
 def _finer(found: Drawn, options: EstimateOptions) -> float | None:
-    """The accuracy in SDs to draw with for a size as exact as asked for; None where it is, or none is asked for."""
+    """Accuracy in SDs for the next draws; None where the size is accurate enough, or no accuracy is requested."""
     wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(found.made.draws.method)
     if found.size is None or wanted is None:
         return None
-    ends = [found.size.summarise(name, probability=INTERVAL) for name in ("max_size_mm", "min_size_mm")]
+    ends = [found.size.summarise(name, probability=INTERVAL) for name in EXTREMES]
     short = min(wanted * one.sd / one.mc_error for one in ends)
     if options.accuracy_mm is not None:
         short = min(short, *(options.accuracy_mm / one.mc_error for one in ends))
@@ -121,5 +121,5 @@ def _size(
 
 
 def fitting_calibration(posterior: MapPosterior, calibration: Calibration | None) -> Calibration | None:
-    """The calibration without the depth of fat where no body of its table looks like the map at that depth."""
+    """The calibration, without its fat depth where no body of its table resembles the map at that depth."""
     return None if calibration is None else calibration.fitting(*posterior.medians)

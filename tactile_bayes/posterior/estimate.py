@@ -1,4 +1,4 @@
-"""From a tactile map to a size posterior, or to a reason why there is none."""
+"""Estimation of a lump's size from a tactile map, or the reason for giving none."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.size import omissions
 from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.calibration_range import extrapolated
+from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import head_profile
 from tactile_bayes.size.posterior import SizePosterior
 
@@ -65,8 +66,7 @@ def estimate_map(
     candidates, seen = search(tactile_map, options)
     if not candidates:
         return _none(Abstention("empty", f"no lump found {where}: nothing rises above the background"))
-    fit = candidates[-1].fit
-    if seen is None or fit is None:
+    if seen is None:
         likeliest = best_chance(tactile_map, candidates, options)
         why = no_bump(tactile_map, candidates, likeliest, where=where)
         return _none(why, candidates, None if likeliest is None else likeliest[1])
@@ -76,8 +76,7 @@ def estimate_map(
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)
-    bump = seen.bump()
-    hopeless = hopeless_shape(bump.sigma_x_mm, bump.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm)
+    hopeless = hopeless_shape(*seen.widths_mm(), cell_mm=tactile_map.recipe.cell_mm)
     if hopeless is not None:
         return _none(hopeless, candidates, detection)
     try:
@@ -88,11 +87,11 @@ def estimate_map(
         advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
         return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection)
     made, size = found.made, found.size
-    detection, fit, draws, posterior = made.detection, made.fit, made.draws, made.posterior
+    detection, draws, posterior = made.detection, made.draws, made.posterior
     if found.fault is not None:
         return _none(found.fault, candidates, detection)
     calibration = found.calibration
-    diagnostics = _diagnostics(tactile_map, made, calibration)
+    diagnostics = _diagnostics(tactile_map, made, calibration, size)
     if found.too_far:
         return _none(extrapolated(list(found.too_far)), candidates, detection, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
@@ -104,7 +103,7 @@ def estimate_map(
         "estimate",
         reason,
         detection=detection,
-        fit=fit,
+        fit=made.fit,
         draws=draws,
         map_posterior=posterior,
         size=size,
@@ -141,12 +140,12 @@ def _sensitivity(posterior: MapPosterior, size: SizePosterior | None, options: E
 
 
 def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibration:
-    """The calibration for the depth of fat that the map tells, where both know of it."""
+    """The calibration at the map's depth of fat, where both have one."""
     return calibration.at_fat([head_profile(tactile_map.quality)])
 
 
 def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: FitOptions) -> list[str]:
-    """What differs between a map with its fit and the calibration's recipe, in words; empty when nothing does."""
+    """Differences of a map and its fit options from the calibration's recipe, in words; empty without any."""
     return calibration.recipe.differences(
         normalise=tactile_map.recipe.normalise,
         background=fit.background,
@@ -162,14 +161,26 @@ def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: FitOpti
     if differs:
         raise BadDataError(
             f"the size calibration was learned by another recipe: {'; '.join(differs)}",
-            way_out="build and fit the map as the calibration's maps were, or learn a calibration for this recipe",
+            way_out=_way_to(calibration.recipe, tactile_map),
         )
+
+
+def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
+    """What makes a map fit a calibration: its map command where the map differs, else the fit's options."""
+    made = (tactile_map.recipe.normalise, tactile_map.recipe.flat_field_known)
+    wanted = (recipe.normalise, made[1] if recipe.flat_field is None else recipe.flat_field)
+    if made[0] != wanted[0] or (made[1] is not None and made[1] != wanted[1]):
+        return (
+            f"make the map again with {recipe.map_command}, or give --size-calibration solid or eq6 for a default map"
+        )
+    return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
 def _diagnostics(
     tactile_map: TactileMap,
     made: MapDraws,
     calibration: Calibration | None,
+    size: SizePosterior | None,
 ) -> Diagnostics:
     medians = made.posterior.medians
     return Diagnostics(
@@ -181,7 +192,19 @@ def _diagnostics(
         method=made.draws.method,
         sampler=made.draws.diagnostics,
         noise=made.figures,
+        convergence=_convergence(made, size) if made.draws.method == "ensemble" else {},
     )
+
+
+def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[str, float]]:
+    """How far the chains of each size and width agree."""
+    from tactile_bayes.inference.arviz_data import convergence
+
+    sizes = () if size is None else ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
+    found = {name: convergence(getattr(size, name)) for name in sizes}
+    return found | {
+        name: convergence(getattr(made.posterior, name)) for name in ("amplitude", "sigma_x_mm", "sigma_y_mm")
+    }
 
 
 def _left_out(
@@ -200,4 +223,6 @@ def _left_out(
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")
     if calibration is None:
         return (*notes, omissions.SPREAD)
-    return (*notes, *calibration.omissions(options.size_priors.between_maps.median))
+    stated = options.size_priors.another_exam or options.size_priors.between_maps
+    notes += [] if stated is None or stated.sd > 0 else [omissions.SPREAD]
+    return (*notes, *calibration.omissions())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import field
 from typing import TYPE_CHECKING
 
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.presets import METHODS, Background, Method, Noise, Rotation, SceneAsked
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 DETECTED = 0.95
 """Below this probability of a lump there is no estimate."""
 ROTATION_ODDS = 3.0
-"""A turned ellipse is used when the map favours it by this factor over one along the head's axes."""
+"""Odds above which a rotated ellipse is used instead of one along the head's axes."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitOptions:
-    """How a map is fitted; a size calibration records the same and must agree.
+    """How a map is fitted; must agree with the size calibration's recipe.
 
     Parameters
     ----------
@@ -33,7 +33,8 @@ class FitOptions:
     radius_mm
         Cells within this distance of the lump's centre are fitted.
     rotation
-        ``"auto"`` spends a rotation only where the map asks for it; ``"off"`` and ``"on"`` decide beforehand.
+        ``"auto"`` rotates the ellipse only where the odds exceed `ROTATION_ODDS`; ``"off"`` and ``"on"`` decide
+        beforehand.
     centre_mm
         Where to look, in `plane`; None takes the highest bump that can be a lump.
     noise
@@ -56,7 +57,7 @@ class FitOptions:
 
     @property
     def correlated(self) -> bool:
-        """Whether errors are correlated in the model; least squares then only finds the place."""
+        """Whether the model has correlated errors; least squares then only finds the place."""
         return self.noise == "field"
 
 
@@ -87,6 +88,8 @@ class EstimateOptions:
         Where an ensemble keeps its state between runs, under a noise field.
     draws
         Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD.
+    step_up
+        Under a noise field: whether the next method is tried where the one asked for fails.
     """
 
     method: Method = "importance"
@@ -99,29 +102,32 @@ class EstimateOptions:
     accuracy_mm: float | None = None
     store: ChainStore | None = None
     draws: int = INDEPENDENT_DRAWS
+    step_up: bool = True
 
 
 def check_options(options: EstimateOptions) -> None:
-    """Refuse options that contradict each other, or that do not exist."""
-    if options.method not in METHODS:
-        raise UsageError(f"method is {options.method!r}; give one of {', '.join(METHODS)}")
+    """Refuse options that contradict each other or do not exist."""
+    check_choice("method", options.method, METHODS)
     if not options.fit.correlated:
         asked = {"scene": options.scene not in ("auto", "none"), "accuracy in mm": options.accuracy_mm is not None}
         asked |= {"checkpoint": options.store is not None}
         for name, given in asked.items():
             if given:
-                raise UsageError(f'a {name} goes with correlated errors; give noise = "field" in --settings FILE.toml')
+                raise UsageError(f'a {name} needs correlated errors; give noise = "field" in --settings FILE.toml')
         return
     if options.store is not None and options.method != "ensemble":
         raise UsageError("only the ensemble has checkpoints; give --method ensemble")
     if options.method == "optimise":
-        raise UsageError("optimise is the paper's least squares and has no noise field; choose another --method")
+        raise UsageError(
+            "optimise is the paper's least squares and has no noise field, with which this calibration was learned; "
+            "give --method laplace, or a calibration learned by least squares"
+        )
     if options.fit.background != "free":
-        raise UsageError('a noise field takes level and tilt with it; give background = "free" in --settings FILE.toml')
+        raise UsageError('noise = "field" needs a free background; give background = "free" in --settings FILE.toml')
 
 
 def scene_asked(options: EstimateOptions) -> SceneAsked:
-    """The scene asked for; the option that turns the ellipse decides where none was named."""
+    """The requested scene; where none is named, the rotation option decides."""
     by_rotation: dict[Rotation, SceneAsked] = {"on": "rotated", "off": "ellipse", "auto": "auto"}
     turned = by_rotation[options.fit.rotation]
     return turned if options.scene == "auto" else options.scene

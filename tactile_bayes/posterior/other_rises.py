@@ -1,4 +1,4 @@
-"""Other lumps on the map: where they are, and how probable each is."""
+"""Other lumps on the map: their places and probabilities."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEAST_PROBABILITY = 0.95
 
 
 def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOptions) -> tuple[Rise, ...]:
-    """Rises that are lumps by the evidence once the measured lump is taken off the map, the highest first.
+    """Find rises that are lumps by the evidence once the measured lump is subtracted, the highest first.
 
     A structure that the lump's own scene holds (a second lump, a rib) is named there. Without an estimate the whole map
     has been searched, unless a place was given: then the rest of the map is searched here.
@@ -37,9 +37,9 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOp
     misses = 0
     for centre in _places(rest, estimate):
         given = replace(options, fit=replace(options.fit, centre_mm=centre, start_width_mm=None), scene="auto")
-        candidates, seen = search(rest, given)
-        found = None if seen is None or not candidates else _rise(seen, estimate)
-        if found is None or found.probability < LEAST_PROBABILITY or _is_known(found, rises, estimate):
+        _, seen = search(rest, given)
+        found = _rise(seen, estimate) if seen is not None and seen.detection.probability >= LEAST_PROBABILITY else None
+        if found is None or _is_known(found, rises, estimate):
             misses += 1
         else:
             rises.append(found)
@@ -53,7 +53,7 @@ def _median(posterior: MapPosterior, name: str) -> float:
 
 
 def _without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
-    """The map less the bump of the posterior's medians."""
+    """The map less the bump at the posterior medians."""
     x, y, angle = (_median(posterior, name) for name in ("x_mm", "y_mm", "angle_rad"))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     squares = [_median(posterior, name) ** 2 for name in ("sigma_x_mm", "sigma_y_mm")]
@@ -65,7 +65,7 @@ def _without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
 
 
 def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float]]:
-    """Local maxima that stand out by a share of the lump's amplitude and lie clear of it, highest first."""
+    """Local maxima above a share of the lump's amplitude and clear of it, highest first."""
     found_on, posterior = levelled(rest), estimate.map_posterior
     least = 0.0 if posterior is None else LEAST_RISE * _median(posterior, "amplitude")
     height = smoothed_excess(found_on)
@@ -76,7 +76,7 @@ def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float
 
 
 def _beside(x: float, y: float, estimate: Estimate) -> bool:
-    """Whether a place is clear of the measured lump and of what its scene holds beside it."""
+    """Whether a place is clear of the measured lump and of its scene's second structure."""
     posterior = estimate.map_posterior
     if posterior is None:
         return True
@@ -100,7 +100,7 @@ def _in_scene(x: float, y: float, estimate: Estimate) -> bool:
 
 
 def _rise(seen: Assessment, estimate: Estimate) -> Rise:
-    """What was seen at a place, as a rise."""
+    """The assessed place as a `Rise`."""
     bump, lump = seen.bump(), estimate.map_posterior
     away = None if lump is None else (bump.x_mm - _median(lump, "x_mm"), bump.y_mm - _median(lump, "y_mm"))
     return Rise(
@@ -115,6 +115,6 @@ def _rise(seen: Assessment, estimate: Estimate) -> Rise:
 
 
 def _is_known(rise: Rise, rises: list[Rise], estimate: Estimate) -> bool:
-    """Whether a fit has run to a place that is named already, or back to the measured lump."""
+    """Whether a fit moved to a place already found, or back to the measured lump."""
     again = any(np.hypot(rise.x_mm - one.x_mm, rise.y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
     return again or not _beside(rise.x_mm, rise.y_mm, estimate)

@@ -22,7 +22,7 @@ Status = Literal["estimate", "no_estimate"]
 
 @dataclass(frozen=True, slots=True)
 class Rise:
-    """Another rise.
+    """Another rise on the map.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Rise:
     probability: float
 
     def as_dict(self) -> dict[str, float | None]:
-        """As JSON holds it."""
+        """Plain data, as in the JSON."""
         return {name: None if value is None else float(f"{value:.6g}") for name, value in asdict(self).items()}
 
 

@@ -24,7 +24,7 @@ MOST_LOOKS = 3
 
 
 def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Candidate, ...], Assessment | None]:
-    """The highest bump that can be a lump, still can once correlated errors are weighed, and is one by the evidence.
+    """Find the highest bump that can be a lump, also under correlated errors, and is one by the evidence.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Can
 
 
 def _places(tactile_map: TactileMap, options: EstimateOptions) -> Iterator[Candidate]:
-    """The places a map offers, highest first, fitted as they are asked for."""
+    """Candidate places, highest first, fitted on demand."""
     settings = _search_options(tactile_map, options.fit)
     if not options.fit.correlated:
         yield from fitted_candidates(tactile_map, settings)
@@ -77,7 +77,7 @@ def _places(tactile_map: TactileMap, options: EstimateOptions) -> Iterator[Candi
 
 
 def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: FitOptions) -> BumpFit:
-    """A fit to the levelled map, or in a smaller window, with the map's cells of the whole window.
+    """Replace a fit's cells by the map's cells in the whole window.
 
     Under a noise field least squares is only a start.
     """
@@ -88,9 +88,9 @@ def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: FitOptions) 
 def _close_search(
     tactile_map: TactileMap, tried: list[Candidate], options: EstimateOptions
 ) -> tuple[tuple[Candidate, ...], Assessment] | None:
-    """A second look, from close by, at the highest places from which the fit ran away; None where none is a lump.
+    """Search again close to the highest places from which the fit moved away; None where none is a lump.
 
-    Beside a rib least squares grows over both. The posterior has errors that can be a rib, and asks for one after.
+    Beside a rib, least squares grows over both. Correlated errors can represent the rib, and it is tested for later.
     """
     looks, settings, found_on = 0, _search_options(tactile_map, options.fit), levelled(tactile_map)
     for i, candidate in enumerate(tried):
@@ -115,7 +115,7 @@ def _close_search(
 def best_chance(
     tactile_map: TactileMap, candidates: Sequence[Candidate], options: EstimateOptions
 ) -> tuple[Candidate, Detection] | None:
-    """The likeliest lump among rises none of which can be measured; None where none can be weighed.
+    """The most probable lump among rises that cannot be measured; None where none can be assessed.
 
     Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too,
     from a smaller window where the fit ran away or outgrew its own. A fit to a single cell says nothing of a lump and
@@ -132,7 +132,7 @@ def best_chance(
 
 
 def _weighed(tactile_map: TactileMap, candidate: Candidate, options: EstimateOptions) -> Detection | None:
-    """Odds of a lump at a place that has a fault, from close by where its fit ran away or outgrew the window."""
+    """Odds of a lump at a faulty place, fitted from close by where the first fit moved away or grew too large."""
     fit, settings = candidate.fit, _search_options(tactile_map, options.fit)
     if fit is None or candidate.fault.startswith(OUTGROWN):
         fit, _ = fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
@@ -142,7 +142,7 @@ def _weighed(tactile_map: TactileMap, candidate: Candidate, options: EstimateOpt
 
 
 def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:
-    """Options of the least squares that looks for a lump.
+    """Options of the least-squares search for a lump.
 
     Under a noise field it only has to find the place: there the known level holds it better than a free one, which a
     rib at the window's rim can lift.

@@ -18,7 +18,7 @@ TAIL = 0.025
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
-    """What doubling the SD of the width prior would change, in posterior SDs.
+    """Effect of doubling the width prior's SD, in posterior SDs.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Sensitivity:
 def prior_sensitivity(
     sigma_x: FloatArray, sigma_y: FloatArray, quantities: Mapping[str, FloatArray], prior: BumpPrior
 ) -> Sensitivity:
-    """Shifts of quantities when the prior of the geometric mean width is twice as wide, at no further fit.
+    """Shifts of quantities under a width prior twice as wide, by reweighting without another fit.
 
     Parameters
     ----------

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
 from tactile_bayes.size.learn.body_effects import SizeTerms
+from tactile_bayes.size.learn.eq6_two_stage import OtherFit, is_two_stage
 
 LABELS = {
     "m": "m",
@@ -27,16 +28,23 @@ TERM_NAMES = {
 
 
 def calibration_text(
-    calibration: SizeCalibration, *, terms: Mapping[str, SizeTerms] | None = None, not_left_out: str = ""
+    calibration: SizeCalibration,
+    *,
+    terms: Mapping[str, SizeTerms] | None = None,
+    not_left_out: str = "",
+    other_fit: OtherFit | None = None,
 ) -> str:
-    """Fit, domain and r2 of each axis, the recipe it holds for, and what else `terms` say of the size.
+    """Text of a size calibration: fit, domain and r2 of each axis, recipe, and the effects in `terms`.
 
     Parameters
     ----------
     not_left_out
         Why the table's geometries could not be left out in turn, where that is so.
+    other_fit
+        What the other of the two fits makes of the same rows.
     """
-    lines = ["Eq 6: d = m sigma / (e a^f) + b, posterior mean +- SD"]
+    how = "two-stage fit as printed +- SD of a bootstrap" if is_two_stage(calibration) else "posterior mean +- SD"
+    lines = [f"Eq 6: d = m sigma / (e a^f) + b, {how}"]
     both = calibration.axes == ("both",)
     axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]
     lines.append(f"{'':24}" + "".join(f"{name:>22}" for name, _ in axes))
@@ -49,6 +57,8 @@ def calibration_text(
         lines.append(f"correlation of the two residuals {calibration.residual_correlation:.2f}")
     if not calibration.x.fit.get("e_identified"):
         lines.append("the table has no depths: only m/e is determined, e is 1 by convention")
+    if other_fit is not None:
+        lines.append(_other_fit(other_fit))
     if calibration.left_out is not None:
         lines += _left_out(calibration.left_out)
     elif not_left_out:
@@ -58,11 +68,21 @@ def calibration_text(
     recipe = calibration.recipe
     how = "declared" if recipe.declared else "as the maps were made here"
     lines.append(f"recipe ({how}): {recipe}")
+    lines.append(f"for maps made with {recipe.map_command}, on which `estimate` fits by this recipe itself")
+    lines += [f"CAUTION: {text}" for text in calibration.cautions]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
+def _other_fit(other: OtherFit) -> str:
+    """How far the other fit lies, in one line."""
+    words = {"two-stage": "two-stage fit as printed", "joint": "joint fit of all rows"}[other.name]
+    fits = [f"m {m:.2f}, b {b:.2f} mm, e {e:.3f}, f {f:.3f}" for m, b, e, f in other.coefficients]
+    differences = " and ".join(f"{100 * share:.0f} %" for share in other.difference)
+    return f"{words}: {'; along '.join(fits)}; sizes differ by {differences} of d on average"
+
+
 def _left_out(errors: LeftOutErrors) -> list[str]:
-    """Mean absolute error of both forms, by both widths and by each."""
+    """Cross-validated mean absolute error of both forms, by both widths and by each."""
     names = {"both": "", "x": "by the width across alone, ", "y": "by the width along alone, "}
     said = [
         f"{words}Eq 6 {100 * errors.eq6[widths]:.1f} %, log-quadratic {100 * errors.log_quadratic[widths]:.1f} %"
@@ -74,7 +94,7 @@ def _left_out(errors: LeftOutErrors) -> list[str]:
 
 
 def _terms(terms: Mapping[str, SizeTerms], *, both: bool) -> list[str]:
-    """What each property changes for the same map, and what knowing it would take away."""
+    """Effect of each property on the size of the same map, and the error that knowing it would remove."""
     lines = ["for the same amplitude and width (no part of the calibration, `estimate` does not use it):"]
     for axis, found in terms.items():
         words = "" if both else {"x": ", by the width across", "y": ", by the width along"}[axis]

@@ -16,14 +16,16 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.scene_text import scene_document
+from tactile_bayes.size.posterior import EXTREMES, SIZES, SizePosterior
 
 SCHEMA = "tactile-bayes/estimate/1"
-SIZES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
+ANOTHER_EXAM = "another_exam"
+"""Prefix of the sizes' quantities if another exam of the mass may come out apart, see `SizePosterior.another_exam`."""
 WIDTHS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd")
 
 
 def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probability: float) -> dict[str, Quantity]:
-    """Summaries of everything an estimate has draws of, by name; empty without an estimate."""
+    """Summaries of all quantities that an estimate has draws of, by name; empty without an estimate."""
     if estimate.map_posterior is None or estimate.draws is None:
         return {}
     posterior = estimate.map_posterior
@@ -42,6 +44,10 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
     }
     if estimate.size is not None:
         found |= {name: estimate.size.summarise(name, probability=probability) for name in SIZES}
+        another = estimate.size.another_exam
+        if another is not None:
+            of_another = {name: another.summarise(name, probability=probability) for name in EXTREMES}
+            found |= {f"{ANOTHER_EXAM}.{name}": quantity for name, quantity in of_another.items()}
     return found
 
 
@@ -54,7 +60,7 @@ def estimate_document(
     provenance: Provenance,
     quantities: Mapping[str, Quantity] | None = None,
 ) -> dict[str, Any]:
-    """The JSON object of one map, see data_schema/estimate.schema.json; `quantities` where they are at hand."""
+    """JSON object of one map, see data_schema/estimate.schema.json; `quantities` if already summarised."""
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
 
@@ -73,6 +79,7 @@ def estimate_document(
         "reason_code": estimate.code,
         "advice": estimate.advice,
         **{name: one(name) for name in (*SIZES, *WIDTHS)},
+        ANOTHER_EXAM: another_exam(estimate.size, quantities),
         "centre_mm": point("centre_mm"),
         "centre_patient_mm": point("centre_patient_mm"),
         "angle_deg": one("angle_deg"),
@@ -93,6 +100,14 @@ def estimate_document(
     }
 
 
+def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity]) -> dict[str, Any] | None:
+    """The spread between exams of a mass as a share of its size, and both sizes with it; None where it is not told."""
+    if size is None or size.another_exam is None:
+        return None
+    sizes = {name: quantities[f"{ANOTHER_EXAM}.{name}"].as_dict() for name in EXTREMES}
+    return {"between_map_sd": _round(size.another_exam.figures["between_map_sd"]), **sizes}
+
+
 def _round(value: float) -> float:
     return float(f"{value:.9g}")
 
@@ -104,7 +119,7 @@ def _rounded(value: Any) -> Any:
 
 
 def _diagnostics(estimate: Estimate) -> dict[str, Any]:
-    """Figures of the method and the fit; a figure that is not finite is null."""
+    """Diagnostics for the JSON; a figure that is not finite is null."""
     found: dict[str, Any] = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
     if estimate.detection is not None:
         found["log_bayes_factor"] = estimate.detection.log_bayes_factor

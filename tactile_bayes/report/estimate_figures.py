@@ -1,4 +1,4 @@
-"""The figures of `estimate`: the size posterior, and the map with what was found or looked at."""
+"""The figures of `estimate`: the size posterior, and the map with the lump or the places looked at."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def draw_figures(
     probability: float,
     force: bool,
 ) -> None:
-    """Draw what was asked for. Without a size both are the map, with the places looked at and why there is no number.
+    """Draw the requested figures. Without a size both show the map, the places looked at and the reason.
 
     Parameters
     ----------
@@ -45,11 +45,16 @@ def draw_figures(
 
 
 def draw_size(size: SizePosterior, path: Path | None, *, name: str, probability: float, force: bool) -> Figure:
-    """The posterior of the largest and the smallest size with their intervals of this probability."""
+    """Draw the posterior of the largest and smallest size with their intervals."""
     from tactile_bayes.report.size_figure import SizeInterval, size_figure
+    from tactile_bayes.report.size_text import exams_label
 
     quantities = {which: size.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
     intervals = {which: SizeInterval(q.low, q.high, q.probability, q.kind) for which, q in quantities.items()}
+    if size.another_exam is not None:
+        q = size.another_exam.summarise("max_size_mm", probability=probability)
+        supposes = exams_label(size.another_exam.figures["between_map_sd"])
+        intervals["another"] = SizeInterval(q.low, q.high, q.probability, q.kind, supposes)
     return size_figure(
         size.max_size_mm.ravel(),
         size.min_size_mm.ravel(),
@@ -61,7 +66,7 @@ def draw_size(size: SizePosterior, path: Path | None, *, name: str, probability:
 
 
 def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
-    """The map with the lump's ellipse and size, or with the places looked at and why there is no number."""
+    """Draw the map with the lump's ellipse and size, or with the places looked at and the reason for no number."""
     from tactile_bayes.report.estimate_text import no_estimate_line
     from tactile_bayes.report.map_figure import Place, map_figure
 
@@ -82,7 +87,7 @@ def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
 
 
 def _contour(estimate: Estimate) -> FitContour | None:
-    """Medians of the posterior's ellipse and of the size."""
+    """Ellipse and size at the posterior medians."""
     import numpy as np
 
     from tactile_bayes.report.map_figure import FitContour

@@ -7,19 +7,29 @@ from collections.abc import Mapping
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.posterior.result import Estimate, Rise
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_text import no_estimate_line, size_table, tracker_share, warnings
+from tactile_bayes.report.estimate_text import (
+    ANOTHER_LARGEST,
+    advice_lines,
+    convergence_text,
+    exam_spread,
+    no_estimate_line,
+    size_table,
+    tracker_share,
+    warnings,
+)
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
+from tactile_bayes.report.rise_text import away_text
 from tactile_bayes.report.scene_text import scene_line
+from tactile_bayes.size.posterior import EXTREMES
 
 MOST_LINES = 12
-SIZES = ("max_size_mm", "min_size_mm")
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 MOST_CAUTIONS = 3
 MOST_RISES = 3
 
 
 def estimate_summary(estimate: Estimate, quantities: Mapping[str, Quantity], *, probability: float) -> str:
-    """The report of one map in at most `MOST_LINES` lines; `estimate_text` has the rest.
+    """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
     Parameters
     ----------
@@ -33,18 +43,19 @@ def estimate_summary(estimate: Estimate, quantities: Mapping[str, Quantity], *, 
 
 
 def _nothing(estimate: Estimate) -> list[str]:
-    return [no_estimate_line(estimate.reason), *_advice(estimate), *_rises(estimate.other_rises)]
+    return [no_estimate_line(estimate.reason), *advice_lines(estimate), *_rises(estimate.other_rises)]
 
 
 def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probability: float) -> list[str]:
     outside = () if estimate.diagnostics is None else estimate.diagnostics.outside_calibration
     lines = joined(outside, most=MOST_CAUTIONS, lead="CAUTION: outside the calibration's range: ")
-    shown = [name for name in SIZES if name in quantities] or [name for name in WIDTHS if name in quantities]
-    lines += size_table({name: quantities[name] for name in shown}, probability)
+    shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
+    table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
+    lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
     lines += _lump(estimate, quantities)
     lines += _rises(estimate.other_rises)
     if estimate.reason:
-        lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
+        lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
     if estimate.size is not None:
         lines += width_lines(estimate.size.variance_share)
     lines += _quality(estimate, {name: quantities[name] for name in shown})
@@ -52,12 +63,8 @@ def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probabili
     return [*lines, *joined(doubts, most=2, lead="Check: ")]
 
 
-def _advice(estimate: Estimate) -> list[str]:
-    return [f"What would help: {estimate.advice}."] if estimate.advice else []
-
-
 def _lump(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
-    """How likely there is a lump, and where it is."""
+    """Probability of a lump, and its place."""
     parts = [] if estimate.detection is None else [f"Probability of a lump {estimate.detection.probability:.3f}"]
     if "amplitude" in quantities:
         parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
@@ -74,9 +81,7 @@ def _lump(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
 
 def _rises(rises: tuple[Rise, ...]) -> list[str]:
     places = [
-        f"({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm"
-        + ("" if rise.distance_mm is None else f", {rise.distance_mm:.0f} mm from this lump")
-        + f" (probability of a lump {rise.probability:.3f})"
+        f"({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm{away_text(rise)} (probability of a lump {rise.probability:.3f})"
         for rise in rises
     ]
     lead = "Another rise (measure it by estimate --centre-mm X Y): "
@@ -86,26 +91,23 @@ def _rises(rises: tuple[Rise, ...]) -> list[str]:
 
 
 def _model(estimate: Estimate) -> str:
-    """What the model holds and what was left out, as the beginning of a line."""
+    """Model and omissions, as the beginning of a line."""
     if estimate.scene is not None:
         return f"{scene_line(estimate.scene)} "
     return "".join(f"{line} " for line in joined(estimate.left_out, most=2, lead="Left out: "))
 
 
 def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:
-    """Monte-Carlo error of the printed ends, the method's own measure, the tracker's share, draws without a size."""
+    """Monte-Carlo error of the interval ends, convergence measure, tracker's share, draws without a size."""
     if estimate.draws is None or not shown:
         return []
     worst = max(shown.values(), key=lambda one: one.mc_error / one.sd if one.sd > 0 else 0.0)
     ends = f"interval ends to {worst.mc_error / worst.sd:.3f} SD" if worst.sd > 0 else "interval ends exact"
-    found = estimate.draws.diagnostics
     parts = [f"method {estimate.draws.method}, {ends}"]
-    if estimate.diagnostics is not None and (words := estimate.diagnostics.size_calibration):
-        parts.insert(0, words.split(" (", 1)[0].replace("Sizes by", "sizes by", 1))  # what it is made of is in the text
-    if estimate.draws.method == "ensemble":
-        parts.append(f"R-hat {found['rhat']:.3f}")
-    elif estimate.draws.method == "importance":
-        parts.append(f"Pareto shape {found['pareto_k']:.2f}")
+    if estimate.diagnostics is not None and estimate.diagnostics.calibration:
+        parts.insert(0, f"sizes by the {estimate.diagnostics.calibration}")
+    if measure := convergence_text(estimate.draws):
+        parts.append(measure)
     if share := tracker_share(estimate):
         parts.append(share)
     if estimate.size is not None and estimate.size.invalid:

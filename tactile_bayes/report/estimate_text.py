@@ -8,16 +8,30 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import SIZES, estimate_quantities
+from tactile_bayes.report.estimate_document import ANOTHER_EXAM, estimate_quantities
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.rise_text import rise_lines
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
-from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text
+from tactile_bayes.report.size_text import (
+    SIZE_DECIMALS,
+    decimals,
+    ends_text,
+    exams_label,
+    range_cautions,
+    shape_text,
+    table_head,
+    table_row,
+    two_intervals_text,
+)
+from tactile_bayes.size.posterior import EXTREMES, SIZES
 
+ANOTHER_LARGEST = f"{ANOTHER_EXAM}.max_size_mm"
 ROWS = (
     ("max_size_mm", "largest size", "mm"),
+    (ANOTHER_LARGEST, "if another exam may differ", "mm"),
     ("min_size_mm", "smallest size", "mm"),
     ("d_x_mm", "size across the head, d_x", "mm"),
     ("d_y_mm", "size along the head, d_y", "mm"),
@@ -38,7 +52,7 @@ LEAST_SHARE = 0.005
 
 
 def size_decimals(sizes: Iterable[Quantity]) -> int:
-    """Decimal places of all sizes of a report, as the least certain one supports."""
+    """Decimal places for all sizes of a report, from the least certain one."""
     return min((decimals(one.mc_error, most=SIZE_DECIMALS) for one in sizes), default=SIZE_DECIMALS)
 
 
@@ -50,18 +64,19 @@ def estimate_text(
     prior: BumpPrior | None = None,
     quantities: Mapping[str, Quantity] | None = None,
 ) -> str:
-    """The report of one map: what was found with its interval, where the uncertainty comes from, what was left out.
+    """Full report of one map: findings with intervals, sources of uncertainty, omissions.
 
     `quantities` where they are at hand.
     """
     if estimate.status == "no_estimate":
-        first = [no_estimate_line(estimate.reason), *_advice(estimate)]
+        first = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
         return "\n".join([*first, *rise_lines(estimate.other_rises), *passed_over(estimate), RESEARCH_USE]) + "\n"
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
-    lines = [*_cautions(estimate), *size_table(quantities, probability), ""]
+    table = size_table(quantities, probability, exam_spread=exam_spread(estimate))
+    lines = [*_cautions(estimate), *table, ""]
     if estimate.reason:
-        lines += [f"No size: {estimate.reason}.", *_advice(estimate)]
+        lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
     lines += [
         *_findings(estimate, quantities),
         *_scene(estimate),
@@ -74,26 +89,38 @@ def estimate_text(
 
 
 def no_estimate_line(reason: str) -> str:
-    """What a report without an estimate begins with; that there is no lump is said first."""
+    """First line of a report without an estimate."""
     return f"{reason[0].upper()}{reason[1:]}." if reason.startswith("no lump found") else f"No estimate: {reason}."
 
 
-def _advice(estimate: Estimate) -> list[str]:
+def advice_lines(estimate: Estimate) -> list[str]:
+    """Advice towards an estimate or a size, as one line; empty without advice."""
     return [f"What would help: {estimate.advice}."] if estimate.advice else []
 
 
-def size_table(quantities: Mapping[str, Quantity], probability: float) -> list[str]:
-    """A head and a row for each quantity; all sizes with the digits that the least certain one supports."""
-    head = f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
-    rows = [head]
+def size_table(
+    quantities: Mapping[str, Quantity], probability: float, *, exam_spread: float | None = None
+) -> list[str]:
+    """Table with a row per quantity; all sizes have the digits that the least certain one supports.
+
+    `exam_spread` is that of `SizePosterior.another_exam`, a share of the size: its interval gets a row.
+    """
+    rows = [table_head(probability)]
     of_sizes = size_decimals([quantities[name] for name in SIZES if name in quantities])
     for name, label, unit in ROWS:
+        if name == ANOTHER_LARGEST and exam_spread is not None:
+            label = exams_label(exam_spread)
         if name in quantities:
             q = quantities[name]
-            places = of_sizes if name in SIZES else decimals(q.mc_error)
-            interval = f"{q.low:.{places}f} to {q.high:.{places}f} {unit}".rstrip()
-            rows.append(f"{label:28}{q.median:>9.{places}f}   {interval}")
+            places = of_sizes if name in (*SIZES, ANOTHER_LARGEST) else decimals(q.mc_error)
+            rows.append(table_row(label, q.median, (q.low, q.high), unit=unit, places=places))
     return rows
+
+
+def exam_spread(estimate: Estimate) -> float | None:
+    """The spread between exams of the second interval, a share of the size; None where there is none."""
+    another = None if estimate.size is None else estimate.size.another_exam
+    return None if another is None else another.figures["between_map_sd"]
 
 
 def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
@@ -102,6 +129,8 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
         lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
     lines += rise_lines(estimate.other_rises)
     if estimate.size is not None:
+        spread = exam_spread(estimate)
+        lines += [] if spread is None else [two_intervals_text(estimate.size.figures.get("between_map_sd"), spread)]
         lines += width_lines(estimate.size.variance_share)
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
@@ -112,29 +141,49 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
     if share := tracker_share(estimate):
         lines.append(f"{share}.")
     lines += [f"Passed over: {text}." for text in (() if found is None else found.noise.passed_over)]
-    return [*lines, method_line(estimate.draws, quantities)] if estimate.draws is not None else lines
+    if estimate.draws is None:
+        return lines
+    return [*lines, method_line(estimate.draws, quantities), *_chains_of_sizes(found)]
 
 
 def tracker_share(estimate: Estimate) -> str:
-    """How much of the width variance is tracker position error, in words; empty where it is too little for a word."""
+    """Share of the width variance from tracker position error, in words; empty where negligible."""
     share = None if estimate.diagnostics is None else estimate.diagnostics.noise.places_share
     if share is None or share < LEAST_SHARE:
         return ""
     return f"{100 * share:.0f} % of the width variance is tracker position error"
 
 
+def _chains_of_sizes(found: Diagnostics | None) -> list[str]:
+    """Of chains: R-hat, effective draws and Monte-Carlo error of each size's median."""
+    lines = []
+    for name, label in (("max_size_mm", "largest size"), ("min_size_mm", "smallest size")):
+        one = {} if found is None else found.convergence.get(name, {})
+        if one:
+            ess = min(one["ess_bulk"], one["ess_tail"])
+            lines.append(
+                f"Chains of the {label}: R-hat {one['rhat']:.3f}, {ess:.0f} effective draws, "
+                f"Monte-Carlo error of the median {one['mcse_median']:.2g} mm."
+            )
+    return lines
+
+
 def method_line(draws: ParameterDraws, quantities: Mapping[str, Quantity]) -> str:
-    """The method, the Monte-Carlo error of the intervals' ends as they are printed, and the method's diagnostics."""
-    parts = [_ends("sizes", ("max_size_mm", "min_size_mm"), quantities)] if "max_size_mm" in quantities else []
+    """Method, Monte-Carlo error of the printed interval ends, and the method's diagnostics."""
+    parts = [_ends("sizes", EXTREMES, quantities)] if "max_size_mm" in quantities else []
     parts.append(_ends("widths", ("sigma_x_mm", "sigma_y_mm"), quantities))
     ends = "Monte-Carlo error of the interval ends: " + ", ".join(parts)
-    found = draws.diagnostics
+    measure = convergence_text(draws) or f"{len(draws.flat)} independent draws"
     if draws.method == "ensemble":
-        ess = min(found["ess_bulk"], found["ess_tail"])
-        return f"Method ensemble: {ends}; R-hat {found['rhat']:.3f}, {ess:.0f} effective draws."
-    if draws.method == "importance":
-        return f"Method importance: {ends}; Pareto shape {found['pareto_k']:.2f}."
-    return f"Method {draws.method}: {ends}; {len(draws.flat)} independent draws."
+        measure += f", {min(draws.diagnostics['ess_bulk'], draws.diagnostics['ess_tail']):.0f} effective draws"
+    return f"Method {draws.method}: {ends}; {measure}."
+
+
+def convergence_text(draws: ParameterDraws) -> str:
+    """The method's convergence measure; empty for independent draws."""
+    if draws.method == "ensemble":
+        return f"R-hat {draws.diagnostics['rhat']:.3f}"
+    return f"Pareto shape {draws.diagnostics['pareto_k']:.2f}" if draws.method == "importance" else ""
 
 
 def _ends(what: str, names: tuple[str, ...], quantities: Mapping[str, Quantity]) -> str:
@@ -143,19 +192,19 @@ def _ends(what: str, names: tuple[str, ...], quantities: Mapping[str, Quantity])
 
 
 def _scene(estimate: Estimate) -> list[str]:
-    """What the window holds, and how far the prior matters."""
+    """Lines on the structures in the window, and on the influence of the prior."""
     lines = [] if estimate.scene is None else scene_lines(estimate.scene)
     prior = "" if estimate.sensitivity is None else sensitivity_line(estimate.sensitivity)
     return [*lines, prior] if prior else lines
 
 
 def _cautions(estimate: Estimate) -> list[str]:
-    """What must be read before any number: that the map lies outside the calibration's range."""
+    """Lines that must be read before any number: the map lies outside the calibration's range."""
     return [] if estimate.diagnostics is None else range_cautions(estimate.diagnostics.outside_calibration)
 
 
 def warnings(estimate: Estimate) -> list[str]:
-    """What makes the size less certain than its interval says: coarse cells, a level about the lump that is off."""
+    """Reasons why the size is less certain than its interval says: coarse cells, an unexpected level."""
     found, lines = estimate.diagnostics, []
     if found is not None and found.coarse_cells:
         lines.append("The cells are coarse for this width: map again with a smaller --cell-mm.")
@@ -169,7 +218,7 @@ def warnings(estimate: Estimate) -> list[str]:
 
 
 def passed_over(estimate: Estimate) -> list[str]:
-    """The places passed over and why; the many of an empty map are counted."""
+    """Places passed over, with reasons; long lists are shortened."""
     faulty = [candidate for candidate in estimate.candidates if candidate.fault]
     lines = [f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}." for c in faulty]
     more = len(lines) - MOST_PASSED_OVER

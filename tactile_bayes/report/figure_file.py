@@ -1,4 +1,4 @@
-"""Figures as files: PNG, PDF or SVG by the name's suffix; with the same libraries equal input gives equal bytes."""
+"""Figure files: PNG, PDF or SVG by suffix; with the same libraries, equal input gives equal bytes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FORMATS: Final[dict[str, dict[str, None]]] = {
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a name that says neither PNG, PDF nor SVG.
+    """Refuse a file name without a known suffix: PNG, PDF or SVG.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def check_suffix(path: Path) -> None:
 
 @contextmanager
 def figure_file(path: Path | None, *, size_in: tuple[float, float], force: bool) -> Iterator[Figure]:
-    """A figure that is written when the block ends; the user's own matplotlib settings do not reach it.
+    """Give a figure that is written when the block ends, independent of the user's matplotlib settings.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The live view as text: a heat map in half blocks, a pressure bar, and the figures that matter while scanning."""
+"""The live view as text: a heat map in half blocks, a pressure bar, and figures for the examiner."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _STEPS: Final = 256
 
 
 def colours_wanted(environment: Mapping[str, str]) -> bool:
-    """Whether a terminal should get colours: not when NO_COLOR is set, nor on a dumb one."""
+    """Whether to use colours: not when NO_COLOR is set, nor on a dumb terminal."""
     return not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
 
 
@@ -55,7 +55,7 @@ def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys:
 
 
 def live_line(state: LiveState) -> str:
-    """The same in one line, for a terminal that cannot be drawn on."""
+    """The live view in one line, for terminals that cannot be redrawn."""
     pressure = f"{state.pressure_words} {_SAID[state.tone]}".strip()
     behind = f"view {state.latency_ms:.0f} ms behind"
     return f"{pressure}; {_figures(state)}; {state.size_words}; {behind}"
@@ -81,7 +81,7 @@ def _figures(state: LiveState) -> str:
 
 
 def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> list[str]:
-    """The map between the names of its edges, as `orientation_of` says it is seen; below it what its colours mean."""
+    """The map between labels of its edges, oriented by `orientation_of`, with a legend below."""
     if state.tactile_map is None:
         return ["no map yet: move the head over the lump within the pressure window"[:columns]]
     view, values = orientation_of(state.tactile_map), grey_levels(state.tactile_map.mean)
@@ -100,13 +100,13 @@ def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> lis
 
 
 def _mark(rows: list[list[str]], row: int, column: int, *, colour: bool) -> None:
-    """Put the lump's mark where its centre is."""
+    """Mark the lump's centre."""
     if 0 <= row < len(rows) and 0 <= column < len(rows[row]):
         rows[row][column] = f"\x1b[0;1;97m{_MARK}" if colour else _MARK
 
 
 def _framed(rows: list[list[str]], view: Orientation, columns: int, *, colour: bool) -> list[str]:
-    """The picture with what lies beyond each of its edges."""
+    """The picture with labels at its edges."""
     edges, width = view.edges, len(rows[0])
     top, bottom = (_EDGE_WORDS.get(edges[side], edges[side]).center(width).rstrip() for side in ("top", "bottom"))
     end = "\x1b[0m" if colour else ""
@@ -117,7 +117,7 @@ def _framed(rows: list[list[str]], view: Orientation, columns: int, *, colour: b
 
 
 def _legend(tactile_map: TactileMap, view: Orientation, step: int, *, marked: bool) -> list[str]:
-    """Which way round the picture is, what its colours stand for, how long a character is."""
+    """Legend: orientation, meaning of the colours, length of a character."""
     limits = colour_limits(tactile_map.mean)
     low, high = limits if limits is not None else (np.nan, np.nan)
     scale = f"a character is {step * tactile_map.recipe.cell_mm:g} mm wide" + (f"; {_MARK} the lump" if marked else "")
@@ -125,7 +125,7 @@ def _legend(tactile_map: TactileMap, view: Orientation, step: int, *, marked: bo
 
 
 def _shrunk(values: FloatArray, step: int) -> FloatArray:
-    """Means over squares of `step` cells; NaN where all are."""
+    """Means over squares of `step` cells; NaN where all cells are NaN."""
     rows, columns = (-(-n // step) for n in values.shape)
     padded = np.full((rows * step, columns * step), np.nan)
     padded[: values.shape[0], : values.shape[1]] = values
@@ -138,7 +138,7 @@ def _shrunk(values: FloatArray, step: int) -> FloatArray:
 
 
 def _blocks(values: FloatArray) -> list[list[str]]:
-    """Half blocks: the upper cell is the ink, the lower one the paper. A string a character."""
+    """Half blocks, one string per character: the upper cell is the foreground, the lower the background."""
     if len(values) % 2:
         values = np.vstack([values, np.full((1, values.shape[1]), np.nan)])
     colours, shown = _colours(values), np.isfinite(values)
@@ -155,7 +155,7 @@ def _cell(top: str, bottom: str, shown_top: bool, shown_bottom: bool) -> str:
 
 
 def _colours(values: FloatArray) -> NDArray[np.object_]:
-    """Of values from 0 to 1, in the terminal's words."""
+    """Terminal colours of values from 0 to 1."""
     return np.asarray(_palette()[np.rint(np.nan_to_num(values) * (_STEPS - 1)).astype(int)])
 
 
@@ -167,7 +167,7 @@ def _palette() -> NDArray[np.object_]:
 
 
 def _shades(values: FloatArray) -> list[list[str]]:
-    """Plain characters, every second row left out because characters are high."""
+    """Shades in plain characters, without every second row because characters are tall."""
     index = np.nan_to_num(np.rint(values[::2] * (len(_SHADES) - 2)) + 1).astype(int)
     index[~np.isfinite(values[::2])] = 0
     return [[_SHADES[i] for i in row] for row in index]

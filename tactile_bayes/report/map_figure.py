@@ -1,4 +1,4 @@
-"""The picture of a tactile map: its values beside its coverage, and what a fit saw on it."""
+"""Picture of a tactile map: its values beside its coverage, with the fitted lump."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _EXPLAINED_PLACES: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class FitContour:
-    """Where a fit saw the lump on the map.
+    """Place and size of a fitted lump on the map.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class FitContour:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A place of the map that was looked at, and why no lump was measured there."""
+    """A place looked at on the map, and why no lump was measured there."""
 
     centre_mm: tuple[float, float]
     reason: str
@@ -134,26 +134,26 @@ def map_figure(
 
 
 def _pair(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:
-    """What belongs to the axis across the picture, and what to the axis up it."""
+    """Order two values by the picture's horizontal and vertical axes."""
     return (y, x) if view.swapped else (x, y)
 
 
 def _extent(tactile_map: TactileMap, view: Orientation) -> tuple[float, float, float, float]:
-    """Ends of the axis across the picture and of the one up it, with the outer halves of the cells."""
+    """Ends of the horizontal and vertical axes, including the outer halves of the cells."""
     half = tactile_map.recipe.cell_mm / 2
     across, up = _pair(view, tactile_map.x_mm, tactile_map.y_mm)
     return (float(across[0]) - half, float(across[-1]) + half, float(up[0]) - half, float(up[-1]) + half)
 
 
 def _draw_cells(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientation, **how: Any) -> Any:
-    """The cells' values as an image; those that are masked stay grey."""
+    """Draw cell values as an image; masked cells stay grey."""
     axes.set_facecolor("0.85")
     across = values.T if view.swapped else values
     return axes.imshow(across, origin="lower", extent=_extent(tactile_map, view), interpolation="nearest", **how)
 
 
 def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, fit: FitContour | None) -> None:
-    """The heat map."""
+    """Draw the heat map."""
     lowest, highest = _colour_range(tactile_map)
     top = highest
     if fit is not None and fit.amplitude is not None:
@@ -164,7 +164,7 @@ def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, fit: Fi
 
 
 def _colour_range(tactile_map: TactileMap) -> tuple[float, float]:
-    """Cells with few readings do not set the range: one noisy edge cell would wash out the lump."""
+    """Colour range, ignoring cells with few readings: one noisy edge cell would hide the lump."""
     well = tactile_map.covered & (~tactile_map.few)
     values = tactile_map.mean[well if well.any() else tactile_map.covered]
     level = float(np.median(values))
@@ -172,7 +172,7 @@ def _colour_range(tactile_map: TactileMap) -> tuple[float, float]:
 
 
 def _draw_coverage(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
-    """Readings per cell: where the map can be trusted."""
+    """Draw the number of readings per cell."""
     counts = np.ma.masked_equal(tactile_map.count, 0)
     image = _draw_cells(axes, counts, tactile_map, view, cmap="cividis", vmin=0)
     if tactile_map.counts_known:
@@ -183,7 +183,7 @@ def _draw_coverage(axes: Axes, tactile_map: TactileMap, view: Orientation) -> No
 
 
 def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
-    """White lines with black edges over the cells with few readings: to be seen on every colour, and without any."""
+    """Hatch the cells with few readings in white with black edges, visible on every colour."""
     if not tactile_map.few.any():
         return
     from matplotlib.collections import LineCollection
@@ -209,7 +209,7 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
 
 
 def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[Place]) -> None:
-    """Below the coverage, where it hides no cell: what the hatching means, and what was found at each place."""
+    """Explain hatching and places below the coverage panel, where no cell is hidden."""
     lines = [f"{number}  {_at(place)}: {place.reason}" for number, place in enumerate(places, start=1)]
     wrapped = [textwrap.wrap(line, 66, subsequent_indent="    ", max_lines=2) for line in lines[:_EXPLAINED_PLACES]]
     shown = ["\n".join(line) for line in wrapped]
@@ -239,14 +239,14 @@ def _at(place: Place) -> str:
 
 
 def _colour_bar(axes: Axes, image: Any, label: str, *, extend: Any = "neither") -> None:
-    """As high as the panel, whatever its shape."""
+    """Draw a colour bar as high as the panel."""
     bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.02, 0.0, 0.035, 1.0)), extend=extend)
     bar.set_label(label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
 
 
 def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
-    """Name the plane's axes and turn them as the view has them."""
+    """Label the plane's axes and orient them."""
     axes.set_anchor("N")
     words = _AXIS_WORDS if tactile_map.recipe.source == "scan" else {"x": "x (mm)", "y": "y (mm)"}
     axes.set_xlabel(words[view.right[1]], fontsize=9)
@@ -259,14 +259,14 @@ def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
 
 
 def _outlined(width: float) -> list[Any]:
-    """A black edge, so that white shows on every colour."""
+    """Black outline, so that white is visible on every colour."""
     from matplotlib import patheffects
 
     return [patheffects.withStroke(linewidth=width, foreground="black")]
 
 
 def _draw_edges(axes: Axes, view: Orientation) -> None:
-    """What lies beyond each edge."""
+    """Label the edges."""
     places = {"left": (0.015, 0.5), "right": (0.985, 0.5), "top": (0.5, 0.975), "bottom": (0.5, 0.025)}
     aligned = {"left": ("left", "center"), "right": ("right", "center"), "top": ("center", "top")}
     for side, name in view.edges.items():
@@ -284,7 +284,7 @@ def _draw_edges(axes: Axes, view: Orientation) -> None:
 
 
 def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
-    """The lump's size where there is one, and dashed how wide the fitted bump is, which is not the lump's edge."""
+    """Draw the lump's size where there is one, and the fitted bump, which is wider than the lump, dashed."""
     from matplotlib.patches import Ellipse
 
     bump = (2 * fit.sigma_x_mm, 2 * fit.sigma_y_mm)
@@ -311,7 +311,7 @@ def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
 
 
 def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None:
-    """A numbered cross wherever a lump was looked for in vain."""
+    """Draw a numbered cross at each place where no lump was measured."""
     for number, place in enumerate(places, start=1):
         at = _pair(view, *place.centre_mm)
         axes.plot(*at, "x", color="white", markersize=6, markeredgewidth=1.4, path_effects=_outlined(3.0))
@@ -329,7 +329,7 @@ def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None
 
 
 def _draw_scale_bar(axes: Axes) -> None:
-    """10 mm, whatever way the axes run."""
+    """Draw a scale bar of 10 mm."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     sign = 1.0 if right > left else -1.0
     start = left + 0.05 * (right - left)
@@ -346,7 +346,7 @@ def _draw_scale_bar(axes: Axes) -> None:
 
 
 def _draw_notch(axes: Axes, view: Orientation) -> None:
-    """An arrow towards the sternal notch."""
+    """Draw an arrow towards the sternal notch."""
     if view.notch is None:
         return
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()

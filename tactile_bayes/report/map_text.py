@@ -1,4 +1,4 @@
-"""A tactile map as text for people: one table with units, then what was left out."""
+"""Text report of a tactile map: a table with units, then what was left out."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DROPPED = (
 
 
 def map_text(tactile_map: TactileMap, *, lost: Sequence[str] = ()) -> str:
-    """The whole report; the research-use line comes last.
+    """Full report of a map, ending with the research-use line.
 
     Parameters
     ----------
@@ -67,7 +67,8 @@ def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     if "frames_total" not in quality:
         return
     scans = f", {quality['scans']:.0f} scans" if quality.get("scans", 1) > 1 else ""
-    yield "frames used", f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f}{scans}"
+    every = f", one of every {quality['frames_every']:.0f} of the scan" if "frames_every" in quality else ""
+    yield "frames used", f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f}{scans}{every}"
     window = tactile_map.recipe.pressure_window_kpa
     for name, reason in _DROPPED:
         if quality.get(name):
@@ -77,7 +78,7 @@ def _frames(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
 
 
 def _timing(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """How evenly frames and poses came, and the delay between them."""
+    """Regularity of frames and poses, and the latency."""
     quality = tactile_map.quality
     if "frame_rate_hz" in quality:
         jitter, missing = quality["frame_jitter_ms"], quality["frames_missing"]
@@ -88,20 +89,22 @@ def _timing(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     if "latency_sd_ms" in quality:
         found = f"{tactile_map.recipe.latency_ms:.2f} +- {quality['latency_sd_ms']:.2f} ms"
         yield "latency", f"{found}, from {quality['latency_frames']:.0f} frames (a mobile lump mimics one)"
+        if "latency_bound_ms" in quality:
+            yield "", f"noise of readings and tracker alone would leave +-{quality['latency_bound_ms']:.2f} ms"
 
 
 def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """What shifting the strokes onto each other found, the head's own pressure profile and response."""
+    """Registration of strokes, the head's pressure profile and taxel response."""
     quality = tactile_map.quality
     if "strokes" in quality:
         known = f"{quality['strokes_known']:.0f} of {quality['strokes']:.0f} shifted onto each other"
         yield "strokes", known
         shifts = [
-            f"{number}: {quality[f'stroke_{number}_shift_x_mm']:+.1f} {quality[f'stroke_{number}_shift_y_mm']:+.1f}"
+            f"{number}: {quality[f'stroke_{number}_shift_x_mm']:+.2f} +- {quality[f'stroke_{number}_sd_x_mm']:.2f}"
             for number in range(1, int(quality["strokes"]) + 1)
             if f"stroke_{number}_shift_x_mm" in quality
         ]
-        yield "  shifts", f"x and y in mm; {', '.join(shifts)}"
+        yield "  shifts", f"along x, mm; {', '.join(shifts)}"
     if "mobility_mm" in quality:
         moved = f"{quality['mobility_mm']:.2f} +- {quality['mobility_sd_mm']:.2f} mm with the head"
         yield "mobility", f"{moved} (a latency left in the poses looks alike)"
@@ -121,7 +124,7 @@ def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
 
 
 def _plane(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """How well the motion lies on a plane, and how the head was held."""
+    """Fit of the plane, and the head's tilt and yaw."""
     quality = tactile_map.quality
     if "plane_rms_mm" not in quality:
         return
@@ -160,7 +163,7 @@ def _cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
 
 
 def _shared(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """What a frame's readings have in common, and what a cell's readings are worth."""
+    """Error correlation within a frame, and the effective number of readings per cell."""
     quality = tactile_map.quality
     if "median_count" not in quality:
         return
@@ -178,7 +181,7 @@ def _shared(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
 
 
 def _notes(tactile_map: TactileMap) -> Iterator[str]:
-    """What the reader of the map should know, one line each."""
+    """Notes for the reader of the map, one line each."""
     quality = tactile_map.quality
     if tactile_map.masked_taxels:
         shown = "; ".join(tactile_map.masked_taxels[:_LISTED_TAXELS])

@@ -20,7 +20,7 @@ WORTH_NARROWING = 10.0
 
 
 def width_lines(variance_share: Mapping[str, float]) -> list[str]:
-    """The sources of a size's variance, largest first, and what would narrow the interval.
+    """Sources of a size's variance, largest first, and ways to narrow the interval.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def width_lines(variance_share: Mapping[str, float]) -> list[str]:
 
 
 def joined(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
-    """The first texts as one line that begins with `lead`, the others counted; no line for no text."""
+    """Join the first texts in one line after `lead`, and count the others; empty for no text."""
     if not texts:
         return []
     more = f" (and {len(texts) - most} more)" if len(texts) > most else ""

@@ -1,4 +1,4 @@
-"""A trial plan as text: one line per design, then the benefit of further maps."""
+"""Text of a trial plan: one line per design, then the benefit of more maps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def plan_text(document: Mapping[str, Any]) -> str:
-    """The whole plan; the research-use line comes last."""
+    """Full text of a plan, ending with the research-use line."""
     lines = [
         f"Assumed errors of ln size: {_errors(document, document['errors'])}",
         *_origins(document),
@@ -28,7 +28,7 @@ def _errors(document: Mapping[str, Any], names: Iterable[str]) -> str:
 
 
 def _origins(document: Mapping[str, Any]) -> Iterator[str]:
-    """Beside a pilot, which of the errors are its own and which the options gave."""
+    """Source of each assumed error when there is a pilot: the pilot or an option."""
     sources: Mapping[str, str] = document["errors_from"]
     given = [name for name, source in sources.items() if source == "option"]
     if "pilot" in sources.values() and given:

@@ -1,4 +1,4 @@
-"""The size of a mass from several maps, as plain data and as text."""
+"""Reports of one size from several maps, as plain data and as text."""
 
 from __future__ import annotations
 
@@ -9,15 +9,25 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_document import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
-from tactile_bayes.report.quadratic_text import fat_text, unknowns_text
-from tactile_bayes.report.size_text import SIZE_DECIMALS, decimals, ends_text, range_cautions, shape_text
+from tactile_bayes.report.population_text import fat_text, unknowns_text
+from tactile_bayes.report.size_text import (
+    SIZE_DECIMALS,
+    decimals,
+    ends_text,
+    exams_label,
+    range_cautions,
+    shape_text,
+    table_head,
+    table_row,
+)
 from tactile_bayes.size import omissions
-from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.pooling import PooledEstimate
+from tactile_bayes.size.posterior import EXTREMES, SizePosterior
 
 SCHEMA = "tactile-bayes/pooled/1"
-SIZES = ("max_size_mm", "min_size_mm")
 MOST_NAMED = 4
 
 
@@ -25,12 +35,12 @@ def pooled_document(
     pooled: PooledEstimate,
     names: Sequence[str],
     documents: Sequence[Mapping[str, Any]],
-    calibration: LogQuadratic,
+    calibration: BodyCalibration,
     *,
     probability: float,
     provenance: Provenance,
 ) -> dict[str, Any]:
-    """The JSON object of a mass, see data_schema/pooled.schema.json.
+    """JSON object of a mass, see data_schema/pooled.schema.json.
 
     Parameters
     ----------
@@ -38,14 +48,15 @@ def pooled_document(
         Of the maps, with what `estimate` says of each.
     """
     size, used = pooled.size, pooled.calibration or calibration
-    sizes: dict[str, Any] = dict.fromkeys(SIZES)
+    sizes: dict[str, Any] = dict.fromkeys(EXTREMES)
     if size is not None:
-        sizes = {name: size.summarise(name, probability=probability).as_dict() for name in SIZES}
+        sizes = {name: size.summarise(name, probability=probability).as_dict() for name in EXTREMES}
     return {
         "schema": SCHEMA,
         "status": pooled.status,
         "reason": pooled.reason,
         **sizes,
+        ANOTHER_EXAM: _another_exam(size, probability),
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
@@ -57,6 +68,14 @@ def pooled_document(
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
     }
+
+
+def _another_exam(size: SizePosterior | None, probability: float) -> dict[str, Any] | None:
+    another = None if size is None else size.another_exam
+    if another is None:
+        return None
+    names = {f"{ANOTHER_EXAM}.{name}": another.summarise(name, probability=probability) for name in EXTREMES}
+    return another_exam(size, names)
 
 
 def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstimate) -> dict[str, Any]:
@@ -72,7 +91,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
 
 
 def pooled_summary(document: Mapping[str, Any]) -> str:
-    """The report of a mass in at most 12 lines; `pooled_text` has the rest."""
+    """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
     outside = document["outside_calibration"]
     lines = [*_bodies(document), *joined(outside, most=2, lead="CAUTION: outside the calibration's range: ")]
     lines += _maps_lines(document["maps"])
@@ -82,12 +101,12 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         largest, spread = document["max_size_mm"], document["figures"]["between_map_sd"]
         lines += _table(document) + width_lines(document["variance_share"])
         ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
-        lines.append(f"Quality: {ends}the maps of this mass differ by {100 * spread:.0f} % (median).")
+        lines.append(f"Quality: {ends}the maps of this mass differ by {100 * spread:.0f} %.")
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
 def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The maps' sizes in a line, the doubtful ones by name, the other rises."""
+    """Sizes of the maps in one line, doubtful maps by name, other rises."""
     found = [one for one in maps if one["log_size"] is not None]
     sizes = ", ".join(f"{np.exp(one['log_size']):.1f}" for one in found[:MOST_NAMED])
     more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
@@ -99,7 +118,7 @@ def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def pooled_text(document: Mapping[str, Any]) -> str:
-    """The whole report of a mass for people."""
+    """Full report of a mass."""
     lines = [*_bodies(document), *range_cautions(document["outside_calibration"]), *map(_map_line, document["maps"])]
     lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
     if document["status"] == "no_estimate":
@@ -107,7 +126,7 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines += ["", *_table(document)]
     worst, figures = _worst(document), document["figures"]
     lines += ["", *width_lines(document["variance_share"])]
-    lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} % (median).")
+    lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
     lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
@@ -119,25 +138,30 @@ def pooled_text(document: Mapping[str, Any]) -> str:
 
 
 def _worst(document: Mapping[str, Any]) -> Mapping[str, float]:
-    """The summary of the size whose interval's ends are the less certain."""
-    return max((document[name] for name in SIZES), key=lambda q: q["mc_error"])
+    """Summary of the size with the larger Monte-Carlo error."""
+    return max((document[name] for name in EXTREMES), key=lambda q: q["mc_error"])
 
 
 def _table(document: Mapping[str, Any]) -> list[str]:
-    """Both sizes with their intervals under a head."""
-    probability, places = (
-        document["max_size_mm"]["probability"],
-        decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS),
-    )
-    lines = [f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"]
-    for name, label in zip(SIZES, ("largest size", "smallest size"), strict=True):
+    """Table of both sizes with their intervals."""
+    probability = document["max_size_mm"]["probability"]
+    places = decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS)
+    lines = [table_head(probability)]
+    for name, label in zip(EXTREMES, ("largest size", "smallest size"), strict=True):
         q = document[name]
-        lines.append(f"{label:28}{q['median']:>9.{places}f}   {q['low']:.{places}f} to {q['high']:.{places}f} mm")
+        lines.append(_row(label, q, places))
+    another = document[ANOTHER_EXAM]
+    if another is not None:
+        lines.insert(2, _row(exams_label(another["between_map_sd"]), another["max_size_mm"], places))
     return lines
 
 
+def _row(label: str, q: Mapping[str, float], places: int) -> str:
+    return table_row(label, q["median"], (q["low"], q["high"]), unit="mm", places=places)
+
+
 def _bodies(document: Mapping[str, Any]) -> list[str]:
-    """A first line where the maps can hardly be of one body."""
+    """Caution where the maps differ too much to be of one body; else empty."""
     if not document["fat_apart_mm"]:
         return []
     least, largest = document["fat_apart_mm"]

@@ -1,4 +1,4 @@
-"""The account of a recording in words."""
+"""Text of a recording's account."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def record_text(report: Report, *, output: str) -> str:
-    """A few lines on what was recorded and what is missing."""
+    """Summary of a recording and its losses in a few lines."""
     rate = (report.frames - 1) / report.duration_s if report.frames > 1 and report.duration_s > 0 else 0.0
     dropped = f" (the head dropped {report.head_dropped})" if report.head_dropped else ""
     lines = [

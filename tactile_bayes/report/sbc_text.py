@@ -1,4 +1,4 @@
-"""Simulation-based calibration as text, as data, as a table and as a picture."""
+"""Reports of simulation-based calibration: text, data, table and figure."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHIFT = 3.0
 def sbc_document(
     maps: Sequence[MapRanks], *, method: str, seed: int, maps_per_s: float | None, cosines: int | None = None
 ) -> dict[str, Any]:
-    """Everything found, as data.
+    """All results as plain data.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def _as_dict(test: RankTest) -> dict[str, Any]:
 
 
 def verdict(test: RankTest) -> str:
-    """``"ok"``, or how the posterior of a parameter fails."""
+    """``"ok"``, or the way in which a parameter's posterior fails."""
     if test.inside:
         return "ok"
     off = (test.mean_rank - 0.5) * np.sqrt(12.0 * test.n)
@@ -70,7 +70,7 @@ def verdict(test: RankTest) -> str:
 
 
 def sbc_text(document: dict[str, Any]) -> str:
-    """The whole report; the research-use line comes last."""
+    """Full text report, ending with the research-use line."""
     return "\n".join(_lines(document)) + "\n"
 
 
@@ -126,7 +126,7 @@ def _conclusion(parameters: list[dict[str, Any]], together: float) -> Iterator[s
 
 
 def table_text(maps: Sequence[MapRanks]) -> str:
-    """One row a map: truth, ranks (empty without an estimate) and outcome."""
+    """CSV with one row per map: truth, ranks (empty without an estimate) and outcome."""
     header = [
         "map",
         *(one.name for one in fields(Truth)),

@@ -26,8 +26,8 @@ LEAST_CHANGE_SD = 0.05
 
 
 def scene_lines(choice: SceneChoice) -> list[str]:
-    """The fit window's scene with its odds, what was kept in it all the same, and what was left out."""
-    used = [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
+    """Scene of the fit window with odds: structures supported, other structures kept, and those left out."""
+    used = _named(choice)
     names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}".rstrip() for one in used)]
     window = f"the fit window of {choice.fit.target.problem.radius_mm:g} mm about the lump"
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
@@ -42,11 +42,16 @@ def scene_lines(choice: SceneChoice) -> list[str]:
 
 
 def scene_line(choice: SceneChoice) -> str:
-    """The fit window's scene in one line: what the model holds and what the map does not call for."""
-    used = [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
+    """Scene of the fit window in one line: structures supported, and those not needed."""
+    used = _named(choice)
     names = [BUMP[choice.supported], *(ASKED[one.name] for one in used)]
     out = [ASKED[one.name].removesuffix(" in this window") for one in choice.structures if not one.used]
     return f"The map supports {' and '.join(names)}" + (f"; not needed: {', '.join(out)}." if out else ".")
+
+
+def _named(choice: SceneChoice) -> list[Structure]:
+    """Structures to name beside the bump: in the model because the map supports them."""
+    return [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
 
 
 def _sentence(text: str) -> str:
@@ -54,7 +59,7 @@ def _sentence(text: str) -> str:
 
 
 def odds_text(one: Structure) -> str:
-    """A Bayes factor as far as it means anything."""
+    """Format a Bayes factor with no more digits than it is worth."""
     if one.odds < 0.01:
         return "below 0.01 to 1"
     if one.odds > 1000:
@@ -71,7 +76,7 @@ def _change(one: Structure, word: str) -> str:
 
 
 def sensitivity_line(found: Sensitivity) -> str:
-    """How far the prior of the widths matters."""
+    """Sensitivity of the result to the prior of the widths."""
     names = {"max_size_mm": "the largest size", "sigma_x_mm": "sigma_x", "sigma_y_mm": "sigma_y"}
     name = next((name for name in names if name in found.median), None)
     if name is None:
@@ -86,7 +91,7 @@ def sensitivity_line(found: Sensitivity) -> str:
 
 
 def prior_line(prior: BumpPrior, *, field: bool) -> str:
-    """Every prior of the map's posterior."""
+    """All priors of the map's posterior."""
     parts = [
         f"amplitude normal about 0 with SD {prior.amplitude_sd:g} of the map's scale",
         f"mean width log-normal about {prior.width_median_mm:g} mm with SD {prior.log_width_sd:g} of its log",
@@ -105,7 +110,7 @@ def prior_line(prior: BumpPrior, *, field: bool) -> str:
 
 
 def scene_document(choice: SceneChoice) -> dict[str, Any]:
-    """The scene as JSON holds it."""
+    """Scene as plain data for the JSON."""
     scene = choice.fit.scene
     return {
         "supported": choice.supported,

@@ -1,4 +1,4 @@
-"""The picture of a size posterior: densities, medians and intervals of the largest and the smallest size."""
+"""Picture of a size posterior: densities, medians and intervals of the largest and smallest size."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAX_COLOUR, _MIN_COLOUR = "#1f3b73", "#c8641e"  # tell apart in greyscale too
+_ANOTHER_COLOUR = "0.4"
 # The axis ends at these quantiles of the draws, or at an interval's end where that lies farther out.
 _SHOWN: Final = (0.005, 0.985)
 _KINDS: Final = {"eti": "equal-tailed", "hdi": "highest-density"}
@@ -26,12 +27,13 @@ _KINDS: Final = {"eti": "equal-tailed", "hdi": "highest-density"}
 
 @dataclass(frozen=True, slots=True)
 class SizeInterval:
-    """A credible interval as it is labelled: ``SizeInterval(12.1, 15.9, 0.95, "equal-tailed")``."""
+    """A labelled credible interval: ``SizeInterval(12.1, 15.9, 0.95, "equal-tailed")``, with what it `supposes`."""
 
     low_mm: float
     high_mm: float
     probability: float
     kind: str
+    supposes: str = ""
 
 
 def size_figure(
@@ -43,14 +45,15 @@ def size_figure(
     title: str = "",
     force: bool = False,
 ) -> Figure:
-    """Draw the posterior of a lump's largest and smallest size; with a path write it, by its suffix as PNG, PDF or SVG.
+    """Draw the posterior of a lump's largest and smallest size; with a path, also write it (PNG, PDF or SVG).
 
     Parameters
     ----------
     draws_max_mm, draws_min_mm : (n,) arrays
         Posterior draws; those that are not finite are left out.
     intervals
-        For ``"max"`` and ``"min"``, drawn as bars labelled with probability and kind.
+        For ``"max"``, ``"min"`` and ``"another"``, drawn as bars labelled with probability and kind; the last is of the
+        largest size if another exam may differ more.
     title
         Above the figure; nothing that identifies a person.
 
@@ -61,13 +64,16 @@ def size_figure(
     UsageError
         When `path` exists and `force` is false, or its suffix is unknown.
     """
-    with figure_file(path, size_in=(7.0, 4.0), force=force) as figure:
+    with figure_file(path, size_in=(7.0, 4.0 + 0.4 * ("another" in intervals)), force=force) as figure:
         axes = figure.subplots()
         rows = (("max", draws_max_mm, _MAX_COLOUR, "-"), ("min", draws_min_mm, _MIN_COLOUR, "--"))
         for row, (name, draws, colour, dash) in enumerate(rows):
             _draw_density(axes, name, draws, colour=colour, dash=dash)
             if name in intervals:
                 _draw_interval(axes, intervals[name], row=row, colour=colour)
+        if "another" in intervals:
+            _draw_interval(axes, intervals["another"], row=len(rows), colour=_ANOTHER_COLOUR)
+            figure.get_layout_engine().set(rect=(0.0, 0.1, 1.0, 0.9))  # type: ignore[union-attr,call-arg]
         axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
         _finish_size(axes)
@@ -76,7 +82,7 @@ def size_figure(
 
 
 def _span(draws_mm: Sequence[FloatArray], intervals: Mapping[str, SizeInterval]) -> tuple[float, float]:
-    """Ends of the axis: nearly all draws and all intervals, not a heavy tail's last draw."""
+    """Ends of the axis: nearly all draws and all intervals, without a heavy tail's outermost draws."""
     ends = [float(end) for one in draws_mm for end in np.quantile(one[np.isfinite(one)], _SHOWN)]
     ends += [end for one in intervals.values() for end in (one.low_mm, one.high_mm)]
     margin = 0.05 * (max(ends) - min(ends)) or 1.0
@@ -84,7 +90,7 @@ def _span(draws_mm: Sequence[FloatArray], intervals: Mapping[str, SizeInterval])
 
 
 def _density(draws_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Smoothed density of positive draws on 400 points: a histogram under a Gaussian, mirrored at 0.
+    """Smoothed density of positive draws on 400 points: a histogram convolved with a Gaussian, mirrored at 0.
 
     Returns
     -------
@@ -122,7 +128,7 @@ def _draw_density(axes: Axes, name: str, draws_mm: FloatArray, *, colour: str, d
 
 
 def _draw_interval(axes: Axes, interval: SizeInterval, *, row: int, colour: str) -> None:
-    """A bar below the densities, labelled with its ends, probability and kind."""
+    """Draw a bar below the densities, labelled with its ends, probability and kind."""
     from matplotlib.transforms import blended_transform_factory
 
     across = blended_transform_factory(axes.transData, axes.transAxes)
@@ -140,6 +146,7 @@ def _draw_interval(axes: Axes, interval: SizeInterval, *, row: int, colour: str)
     )
     kind = _KINDS.get(interval.kind, interval.kind)
     text = f"{interval.low_mm:.1f} to {interval.high_mm:.1f} mm: {100 * interval.probability:g} % interval ({kind})"
+    text = f"{text} {interval.supposes}".rstrip()
     axes.text(
         (interval.low_mm + interval.high_mm) / 2,
         height - 0.02,

@@ -17,8 +17,22 @@ SOURCES = {
 }
 
 
+def exams_label(spread: float) -> str:
+    """What the second interval supposes: how far exams of one mass are apart, as a share of its size."""
+    return f"if exams differ by {100 * spread:.0f} %"
+
+
+def two_intervals_text(this: float | None, another: float) -> str:
+    """What the two intervals of a size suppose; `this` is None where a calibration knows no spread between exams."""
+    alike = "no spread between exams" if this is None else f"exams of one mass that differ by {100 * this:.0f} %"
+    return (
+        f"The first interval supposes {alike}, as its calibration was learned; the second {100 * another:.0f} %, "
+        "as maps of one mass differed in the paper. Settings: between_map_sd."
+    )
+
+
 def range_cautions(outside: Sequence[str]) -> list[str]:
-    """The first lines of a report of a size outside its calibration's range."""
+    """First lines of a report of a size outside its calibration's range."""
     return [f"CAUTION: outside the calibration's range: {text}." for text in outside]
 
 
@@ -29,13 +43,24 @@ def decimals(mc_error: float, *, most: int = 3) -> int:
     return min(most, max(0, -math.floor(math.log10(2.0 * mc_error))))
 
 
+def table_head(probability: float) -> str:
+    """The first line of a table of medians and intervals."""
+    return f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
+
+
+def table_row(label: str, median: float, ends: tuple[float, float], *, unit: str, places: int) -> str:
+    """Row of that table: label, median and interval with a number of decimal places."""
+    interval = f"{ends[0]:.{places}f} to {ends[1]:.{places}f} {unit}".rstrip()
+    return f"{label:28}{median:>9.{places}f}   {interval}"
+
+
 def ends_text(name: str, mc_error: float, sd: float) -> str:
     """Monte-Carlo error of the ends of intervals, in SDs and mm."""
     return f"{name} {mc_error / sd:.3f} SD ({mc_error:.2g} mm)" if sd > 0 else f"{name} {mc_error:.2g} mm"
 
 
 def shape_text(figures: Mapping[str, float]) -> str:
-    """Whether an oval lump was called for, and what it would make of the largest size."""
+    """Whether the lump is sized as round or oval, and the difference that makes to the largest size."""
     probability = figures["oval_probability"]
     longer = 100 * math.expm1(figures["oval_half_log_ratio"])
     if probability < 0.5:

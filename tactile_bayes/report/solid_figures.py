@@ -32,17 +32,13 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.report.study_figures import _COLOURS, _MARKS, _finish
+from tactile_bayes.report.study_figures import COLOURS, FAT_MM, MARKS, PHANTOM, RATIOS, SIZE_IN, finish
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_FAT_MM = (5.0, 10.0, 15.0, 25.0, 50.0)
 _CENTRED = ((10.0, 0.8), (15.0, 1.0), (20.0, 1.2))
-_PHANTOM = "phantom 12.5 mm"
 _SMALL = (10.0, 1.0)
-_RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
-_SIZE_IN = (10.0, 4.3)
 _AXES = {"x": "across the head", "y": "along it"}
 _SHARE = "pressure / mean of its frame"
 
@@ -88,23 +84,23 @@ def solid_figures(
 def figure_5(settings: SolidSettings, path: Path, *, seat: float, force: bool = False) -> None:
     """Frames through the middle of the head: far from the lump on fat of several thicknesses, and over three lumps."""
     s = settings.head.surface_mm()[:, 0, 0]
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
-        for colour, fat in zip(_COLOURS, _FAT_MM, strict=False):
+        for colour, fat in zip(COLOURS, FAT_MM, strict=False):
             left.plot(s, _across(_plain_frame(settings, fat)), color=colour, label=f"fat {fat:g} mm")
-        for colour, (d, h) in zip(_COLOURS, _CENTRED, strict=False):
+        for colour, (d, h) in zip(COLOURS, _CENTRED, strict=False):
             right.plot(s, _across(_centred_frame(settings, d, h, seat)), color=colour, label=f"d {d:g} mm, h/d {h:g}")
         where = "position across the head (mm)"
-        _finish(left, "(a) far from the lump, middle of the head", where, "pressure (kPa)")
-        _finish(right, "(b) over the ball, middle of the head", where, "pressure (kPa)", headroom=0.15)
+        finish(left, "(a) far from the lump, middle of the head", where, "pressure (kPa)")
+        finish(right, "(b) over the ball, middle of the head", where, "pressure (kPa)", headroom=0.15)
         figure.text(0.01, 0.01, _caption("Figure 5", settings, seat), fontsize=7.5, color="0.3")
 
 
 def figure_6(settings: SolidSettings, path: Path, *, seat: float, build: Build, force: bool = False) -> None:
     """The map of the first phantom, and its sections along both axes of the head."""
-    d, h = PHANTOMS[_PHANTOM]
+    d, h = PHANTOMS[PHANTOM]
     made = build(_raster(settings, d, h, seat, HARD_RATIO))
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         read_x, read_y = made.covered.any(axis=0), made.covered.any(axis=1)
         x, y, mean = made.x_mm[read_x], made.y_mm[read_y], made.mean[np.ix_(read_y, read_x)]
@@ -112,8 +108,8 @@ def figure_6(settings: SolidSettings, path: Path, *, seat: float, build: Build, 
         figure.colorbar(picture, ax=left, label=_SHARE)
         left.set_aspect("equal")
         _draw_sections(right, made, 25.0, "")
-        _finish(left, f"(a) map, d {d:g} mm, h/d {h:g}", "across the head (mm)", "along the head (mm)")
-        _finish(right, "(b) sections", "distance from the ball's axis (mm)", _SHARE)
+        finish(left, f"(a) map, d {d:g} mm, h/d {h:g}", "across the head (mm)", "along the head (mm)")
+        finish(right, "(b) sections", "distance from the ball's axis (mm)", _SHARE)
         figure.text(0.01, 0.01, _caption("Figure 6", settings, seat), fontsize=7.5, color="0.3")
 
 
@@ -131,9 +127,9 @@ def figure_7(
     d, h = _SMALL
     body = settings.body(d, h, seat=seat)
     head, condensed = settings.on(body), settings.condensed(body)
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
-        for colour, ratio in zip(_COLOURS, _RATIOS, strict=False):
+        for colour, ratio in zip(COLOURS, RATIOS, strict=False):
             frames = raster_frames(head, settings.placed(condensed, ratio), settings)
             found, (x, value) = fit(frames, settings), _section(build(frames), "x")
             near = np.abs(x) <= 20.0
@@ -146,24 +142,24 @@ def figure_7(
                 _draw_stiffness(right, of_size, axis, line, i)
         right.axhspan(0.95, 1.05, color="0.9", zorder=0)
         right.set_xscale("log")
-        _finish(left, f"(a) across the head, d {d:g} mm, h/d {h:g}", "place on the skin (mm)", _SHARE, headroom=0.4)
+        finish(left, f"(a) across the head, d {d:g} mm, h/d {h:g}", "place on the skin (mm)", _SHARE, headroom=0.4)
         title = "(b) width, h/d 1; full across, dashed along; grey: 5 %"
-        _finish(right, title, "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
+        finish(right, title, "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
         figure.text(0.01, 0.01, _caption("Figure 7", settings, seat), fontsize=7.5, color="0.3")
 
 
 def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> None:
     """Width change against amplitude and width against diameter, each with its line, for both axes of the head."""
     hard = hard_cases(rows)
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         for i, (axis, words) in enumerate(_AXES.items()):
             _draw_eq_6(left, right, hard, axis, words, i)
         left.set_xscale("log")
         right.set_ylim(bottom=0)
         right.set_xlim(left=0)
-        _finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
-        _finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
+        finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
+        finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
         seat = rows[0].seat if rows else "no cases"
         text = f"Figure 8, balls: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}.  {RESEARCH_USE}"
         figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
@@ -175,15 +171,15 @@ def _draw_eq_6(left: Axes, right: Axes, hard: Sequence[StudyRow], axis: str, wor
     amplitude = np.array([row.amplitude for row in hard])
     level = np.array([abs(row.depth_ratio - 1.0) < 1e-9 for row in hard], dtype=bool)
     d = np.array([row.d_mm for row in hard])
-    left.plot(amplitude, change, _MARKS[i], color=_COLOURS[i], label=words)
-    right.plot(sigma[level], d[level], _MARKS[i], color=_COLOURS[i], label=words)
+    left.plot(amplitude, change, MARKS[i], color=COLOURS[i], label=words)
+    right.plot(sigma[level], d[level], MARKS[i], color=COLOURS[i], label=words)
     if learned is None:
         return
     a = np.geomspace(amplitude.min(), amplitude.max(), 100)
-    left.plot(a, learned.e * a**learned.f, color=_COLOURS[i], label=f"{learned.e:.2f} a^{learned.f:.2f}")
+    left.plot(a, learned.e * a**learned.f, color=COLOURS[i], label=f"{learned.e:.2f} a^{learned.f:.2f}")
     line = np.linspace(0.0, float(np.nanmax(sigma[level])) * 1.1, 2)
     text = f"d = {learned.m:.2f} sigma {learned.b_mm:+.2f} mm"
-    right.plot(line, learned.m * line + learned.b_mm, color=_COLOURS[i], label=text)
+    right.plot(line, learned.m * line + learned.b_mm, color=COLOURS[i], label=text)
 
 
 def _draw_stiffness(axes: Axes, rows: Sequence[StudyRow], axis: str, line: str, i: int) -> None:
@@ -194,14 +190,14 @@ def _draw_stiffness(axes: Axes, rows: Sequence[StudyRow], axis: str, line: str, 
         return
     label = f"d {rows[0].d_mm:g} mm" if axis == "x" else None
     points = sorted(zip((row.stiffness_ratio for row in rows), sigma / hardest[0], strict=True))
-    axes.plot(*zip(*points, strict=True), line, marker=_MARKS[i % 6], color=_COLOURS[i % 6], label=label)
+    axes.plot(*zip(*points, strict=True), line, marker=MARKS[i % 6], color=COLOURS[i % 6], label=label)
 
 
 def _draw_sections(axes: Axes, made: TactileMap, reach_mm: float, words: str) -> None:
     for i, (axis, name) in enumerate(_AXES.items()):
         place, value = _section(made, axis)
         near = np.abs(place) <= reach_mm
-        axes.plot(place[near], value[near], color=_COLOURS[i], label=f"{name}{words}")
+        axes.plot(place[near], value[near], color=COLOURS[i], label=f"{name}{words}")
 
 
 def _section(made: TactileMap, axis: str) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,9 @@ import numpy as np
 
 from tactile_bayes.forward.body import THICKNESS_MM, Layers
 from tactile_bayes.forward.plane.empirical import fit_empirical
-from tactile_bayes.forward.plane.line import build_line, press_layers
+from tactile_bayes.forward.plane.line import LineFrames, build_line, press, press_layers
+from tactile_bayes.forward.plane.lookalikes import ALIKE, Lookalikes, find_lookalikes
+from tactile_bayes.forward.plane.measured import FrameAgreement
 from tactile_bayes.forward.plane.study import (
     DETECTABLE,
     HARD_RATIO,
@@ -33,16 +35,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Tell apart in greyscale and by colour-blind eyes.
-_COLOURS = ("#1f3b73", "#c8641e", "#2a8c6e", "#8a4fa3", "#7a7a7a", "#b8a100")
-_MARKS = ("o", "s", "^", "D", "v", "P")
-_FAT_MM = (5.0, 10.0, 15.0, 25.0, 50.0)
+COLOURS = ("#1f3b73", "#c8641e", "#2a8c6e", "#8a4fa3", "#7a7a7a", "#b8a100")
+MARKS = ("o", "s", "^", "D", "v", "P")
+FAT_MM = (5.0, 10.0, 15.0, 20.0, 30.0, 50.0)
 _FITTED_FAT_MM = 15.0
-_CENTRED = ((10.0, 0.8), (15.0, 1.0), (20.0, 1.2))
-_PHANTOM = "phantom 12.5 mm"
+_OTHER = (15.0, 1.0)
+PHANTOM = "phantom 12.5 mm"
 _FRAME_PLACES_MM = (0.0, 6.0, 12.0, 20.0)
+_FOUR_SIZE_IN = (10.0, 7.6)
 _SMALL = (5.0, 1.0)
-_RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
-_SIZE_IN = (10.0, 4.3)
+RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
+SIZE_IN = (10.0, 4.3)
 
 
 def study_figures(
@@ -52,9 +55,11 @@ def study_figures(
     *,
     seat: float,
     fit: Fit,
+    phantom: tuple[float, float] = PHANTOMS[PHANTOM],
+    measured: Sequence[FrameAgreement] = (),
     force: bool = False,
-) -> None:
-    """Draw the four figures as PNG files.
+) -> Lookalikes | None:
+    """Draw figures 5 to 8, and the frames of four lumps, as PNG files.
 
     Parameters
     ----------
@@ -64,9 +69,17 @@ def study_figures(
         Of the lumps in figures 5b to 7a.
     fit
         Fits Eq 5 to a map.
-
+    phantom
+        Diameter in mm and h/d of the lump of figure 6.
+    measured
+        Frames for figure 6a, in place of the places drawn without any.
     paths
-        Of figures 5, 6, 7 and 8.
+        Of figures 5, 6, 7 and 8, and of the frames of four lumps.
+
+    Returns
+    -------
+    Lookalikes or None
+        The pair that figure 5b shows.
 
     Raises
     ------
@@ -74,50 +87,118 @@ def study_figures(
         When one of them exists and `force` is false.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
-    figure_5(settings, paths[0], seat=seat, force=force)
-    figure_6(settings, paths[1], seat=seat, force=force)
+    found = find_lookalikes(settings, seat=seat)
+    figure_5(settings, paths[0], seat=seat, found=found, force=force)
+    figure_6(settings, paths[1], seat=seat, phantom=phantom, measured=measured, force=force)
     figure_7(of_seat, settings, paths[2], seat=seat, fit=fit, force=force)
     figure_8(of_seat, paths[3], force=force)
+    four_lumps(settings, paths[4], seat=seat, force=force)
+    return found
 
 
-def figure_5(settings: StudySettings, path: Path, *, seat: float, force: bool = False) -> None:
-    """Frames far from the lump on fat of several thicknesses with Eq 1, and frames over three lumps with Eq 3."""
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+def lookalikes_text(found: Lookalikes | None) -> str:
+    """Figure 5b's pair in a line, or that there is none."""
+    if found is None:
+        return "figure 5b: no two visible lumps of sizes that differ by half"
+    pair = " and ".join(f"d {one.d_mm:g} mm at h/d {one.depth_ratio:.3g}" for one in (found.small, found.large))
+    share = f"{100 * found.difference:.1f} % of what the lump adds ({100 * found.of_mean:.2f} % of the mean)"
+    if found.difference <= ALIKE:
+        return f"figure 5b: indistinguishable are {pair}: their frames differ by {share}"
+    return f"figure 5b: no pair within {100 * ALIKE:g} %; the most alike frames, {pair}, differ by {share}"
+
+
+def figure_5(
+    settings: StudySettings, path: Path, *, seat: float, found: Lookalikes | None, force: bool = False
+) -> None:
+    """Frames far from the lump on fat of six thicknesses with Eq 1, and frames over lumps, two of which look alike."""
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
-        for colour, fat in zip(_COLOURS, _FAT_MM, strict=False):
-            layers = Layers(fat, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
-            frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
-            left.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat:g} mm")
-            if fat == _FITTED_FAT_MM:
-                seen, half = frame.as_taxels(HEAD_PITCH_MM), settings.head.half_width_mm
-                model = fit_empirical(seen.s_mm, seen.at(0.0), seen.at(0.0), d_mm=1.0, half_width_mm=half)
-                text = f"Eq 1 fitted to taxels, fat {fat:g} mm"
-                left.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
-        for colour, (d, h) in zip(_COLOURS, _CENTRED, strict=False):
-            curves = scene_curves(Scene("", d, h, seat), settings)
-            s = curves.elastic.s_mm
-            right.plot(s, curves.elastic.at(0.0), color=colour, label=f"d {d:g} mm, h/d {h:g}")
-            right.plot(s, curves.empirical.at(0.0), ":", color=colour)
-        _finish(
+        for colour, fat in zip(COLOURS, FAT_MM, strict=True):
+            _draw_far(left, settings, fat, colour)
+        cases = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
+        for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), [*cases, _OTHER], strict=False):
+            elastic = _centred(settings, d, h, seat)
+            right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
+        title = (
+            "no two visible lumps" if found is None else f"two differ by {100 * found.difference:.1f} % of their rise"
+        )
+        finish(
             left, "(a) far from the lump, fat over gland, 70 mm in all", "position on the head (mm)", "pressure (kPa)"
         )
-        _finish(right, "(b) over the lump; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)", headroom=0.15)
+        finish(right, f"(b) over the lump: {title}", "position on the head (mm)", "pressure (kPa)", headroom=0.15)
         figure.text(0.01, 0.01, _caption("Figure 5", settings, seat), fontsize=7.5, color="0.3")
 
 
-def figure_6(settings: StudySettings, path: Path, *, seat: float, force: bool = False) -> None:
-    """Frames and map of the first phantom, elastic and empirical; the paper's rubber data are not ours to draw."""
-    d, h = PHANTOMS[_PHANTOM]
-    curves = scene_curves(Scene(_PHANTOM, d, h, seat), settings)
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+def _draw_far(axes: Axes, settings: StudySettings, fat_mm: float, colour: str) -> None:
+    """P1 on one thickness of fat; on one of them, Eq 1 fitted to what the taxels see."""
+    layers = Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
+    frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
+    axes.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat_mm:g} mm")
+    if fat_mm == _FITTED_FAT_MM:
+        seen, half = frame.as_taxels(HEAD_PITCH_MM), settings.head.half_width_mm
+        model = fit_empirical(seen.s_mm, seen.at(0.0), seen.at(0.0), d_mm=1.0, half_width_mm=half)
+        text = f"Eq 1 fitted to taxels, fat {fat_mm:g} mm"
+        axes.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
+
+
+def _centred(settings: StudySettings, d_mm: float, depth_ratio: float, seat: float) -> LineFrames:
+    """The frame over a hard lump, cell by cell."""
+    surface = settings.surface(settings.body(d_mm, depth_ratio, seat=seat))
+    return press(surface, HARD_RATIO, np.zeros(1), head=settings.head, mean_kpa=settings.mean_kpa)
+
+
+def frames_text(measured: Sequence[FrameAgreement]) -> list[str]:
+    """How far measured frames are from both models, a line for each."""
+    return [
+        f"figure 6: frame at {one.measured.x_c_mm:g} mm, MSD {100 * one.elastic_difference:.2f} % of the elastic "
+        f"model, {100 * one.empirical_difference:.2f} % of the empirical one"
+        for one in measured
+    ]
+
+
+def figure_6(
+    settings: StudySettings,
+    path: Path,
+    *,
+    seat: float,
+    phantom: tuple[float, float] = PHANTOMS[PHANTOM],
+    measured: Sequence[FrameAgreement] = (),
+    force: bool = False,
+) -> None:
+    """Frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
+    d, h = phantom
+    curves = scene_curves(Scene(PHANTOM, d, h, seat), settings)
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
-        for colour, place in zip(_COLOURS, _FRAME_PLACES_MM, strict=False):
+        for colour, one in zip(COLOURS, measured, strict=False):
+            s = one.measured.s_mm
+            text = f"measured, head at {one.measured.x_c_mm:g} mm"
+            left.plot(s, one.measured.pressure_kpa, color=colour, lw=3.5, alpha=0.4, label=text)
+            left.plot(s, one.elastic_kpa, color=colour)
+            left.plot(s, one.empirical_kpa, ":", color=colour)
+        for colour, place in zip(COLOURS, () if measured else _FRAME_PLACES_MM, strict=False):
             left.plot(curves.elastic.s_mm, curves.elastic.at(place), color=colour, label=f"head at {place:g} mm")
             left.plot(curves.empirical.s_mm, curves.empirical.at(place), ":", color=colour)
         _draw_maps(right, curves)
-        _finish(left, f"(a) frames, d {d:g} mm, h/d {h:g}; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)")
-        _finish(right, "(b) maps", "place on the skin (mm)", "pressure / mean of its frame", headroom=0.25)
+        finish(left, f"(a) frames, d {d:g} mm, h/d {h:g}; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)")
+        finish(right, "(b) maps", "place on the skin (mm)", "pressure / mean of its frame", headroom=0.25)
         figure.text(0.01, 0.01, _caption("Figure 6", settings, seat), fontsize=7.5, color="0.3")
+
+
+def four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool = False) -> None:
+    """Frame by frame for the phantoms of section 2.3, elastic and empirical: its curves "for four lumps"."""
+    with figure_file(path, size_in=_FOUR_SIZE_IN, force=force) as figure:
+        for axes, (d, h) in zip(figure.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
+            curves = scene_curves(Scene("", d, h, seat), settings)
+            ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
+            share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
+            for colour, place in zip(COLOURS, _FRAME_PLACES_MM, strict=False):
+                axes.plot(theirs.s_mm, theirs.at(place), color=colour, label=f"head at {place:g} mm")
+                axes.plot(ours.s_mm, ours.at(place), ":", color=colour)
+            title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
+            finish(axes, title, "position on the head (mm)", "pressure (kPa)", headroom=0.15)
+        text = _caption("Dotted: Eq 3", settings, seat)
+        figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
 
 
 def figure_7(
@@ -126,9 +207,9 @@ def figure_7(
     """Maps of a small lump of several stiffnesses, and how little the width depends on stiffness."""
     d, h = _SMALL
     surface = settings.surface(settings.body(d, h, seat=seat))
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
-        for colour, ratio in zip(_COLOURS, _RATIOS, strict=False):
+        for colour, ratio in zip(COLOURS, RATIOS, strict=False):
             line = build_line(settings.frames(surface, ratio))
             found = fit(line, settings.fit_radius_mm)
             near = np.abs(line.x_mm) <= 20.0
@@ -139,18 +220,18 @@ def figure_7(
         for i, diameter in enumerate(hardest):
             points = sorted((r.stiffness_ratio, r.sigma_x_mm / hardest[diameter]) for r in level if r.d_mm == diameter)
             right.plot(
-                *zip(*points, strict=True), marker=_MARKS[i % 6], color=_COLOURS[i % 6], label=f"d {diameter:g} mm"
+                *zip(*points, strict=True), marker=MARKS[i % 6], color=COLOURS[i % 6], label=f"d {diameter:g} mm"
             )
         right.axhspan(0.95, 1.05, color="0.9", zorder=0)
         right.set_xscale("log")
-        _finish(
+        finish(
             left,
             f"(a) maps, d {d:g} mm, h/d {h:g}",
             "place on the skin (mm)",
             "pressure / mean of its frame",
             headroom=0.4,
         )
-        _finish(right, "(b) width, h/d 1; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
+        finish(right, "(b) width, h/d 1; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
         figure.text(0.01, 0.01, _caption("Figure 7", settings, seat), fontsize=7.5, color="0.3")
 
 
@@ -158,15 +239,15 @@ def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> No
     """Width change against amplitude with its power law, and width against diameter with its line."""
     hard = hard_cases(rows)
     learned = learn_as_printed(rows)
-    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
         left, right = figure.subplots(1, 2)
         change = width_changes(hard)
         for i, d in enumerate(dict.fromkeys(row.d_mm for row in hard)):
             mine = [k for k, row in enumerate(hard) if row.d_mm == d]
             amplitude = [hard[k].amplitude for k in mine]
-            left.plot(amplitude, change[mine], _MARKS[i % 6], color=_COLOURS[i % 6], label=f"d {d:g} mm")
+            left.plot(amplitude, change[mine], MARKS[i % 6], color=COLOURS[i % 6], label=f"d {d:g} mm")
         level = [row for row in hard if abs(row.depth_ratio - 1.0) < 1e-9]
-        right.plot([row.sigma_x_mm for row in level], [row.d_mm for row in level], "o", color=_COLOURS[0])
+        right.plot([row.sigma_x_mm for row in level], [row.d_mm for row in level], "o", color=COLOURS[0])
         if learned is not None:
             a = np.geomspace(min(row.amplitude for row in hard), max(row.amplitude for row in hard), 100)
             power = f"{learned.e:.2f} a^{learned.f:.2f}"
@@ -177,8 +258,8 @@ def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> No
         left.set_xscale("log")
         right.set_ylim(bottom=0)
         right.set_xlim(left=0)
-        _finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
-        _finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
+        finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
+        finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
         seat = rows[0].seat if rows else "no cases"
         text = f"Figure 8: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}.  {RESEARCH_USE}"
         figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
@@ -189,9 +270,9 @@ def _draw_maps(axes: Axes, curves: Curves) -> None:
     near = np.abs(curves.elastic_map.x_mm) <= 40.0
     elastic, empirical = curves.elastic_map.mean[near], curves.empirical_map.mean[near]
     share = 100 * mean_squared_difference(empirical, elastic)
-    axes.plot(curves.elastic_map.x_mm[near], elastic, color=_COLOURS[0], label="elastic model")
+    axes.plot(curves.elastic_map.x_mm[near], elastic, color=COLOURS[0], label="elastic model")
     text = f"empirical model (MSD {share:.1f} %)"
-    axes.plot(curves.empirical_map.x_mm[near], empirical, ":", color=_COLOURS[1], label=text)
+    axes.plot(curves.empirical_map.x_mm[near], empirical, ":", color=COLOURS[1], label=text)
 
 
 def _caption(name: str, settings: StudySettings, seat: float) -> str:
@@ -202,7 +283,7 @@ def _caption(name: str, settings: StudySettings, seat: float) -> str:
     )
 
 
-def _finish(axes: Axes, title: str, x_label: str, y_label: str, *, headroom: float = 0.0) -> None:
+def finish(axes: Axes, title: str, x_label: str, y_label: str, *, headroom: float = 0.0) -> None:
     """Title, labels and a legend; `headroom` is space above the curves for it, as a share of their height."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + headroom * (high - low))

@@ -1,4 +1,4 @@
-"""The trade-off of the forward models as a picture: error in size against CPU time."""
+"""Figure of the forward models' trade-off: error in size against CPU time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.report.study_figures import _COLOURS, _MARKS, _finish
+from tactile_bayes.report.study_figures import COLOURS, MARKS, finish
 from tactile_bayes.report.tradeoff_text import TradeoffReport
 from tactile_bayes.studies.forward_tradeoff import EMPIRICAL, PLANE, SOLID
 
@@ -19,7 +19,7 @@ _SIZE_IN = (8.5, 5.0)
 
 
 def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) -> None:
-    """Draw every setting but the references, which have no error by definition.
+    """Draw all settings except the references, whose error is 0 by definition.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
             shown = [one for one in report.of(model) if one.setting.kind != "reference"]
             seconds = [one.seconds for one in shown]
             error = [max(100 * abs(report.size_error(one)), _LEAST_PERCENT) for one in shown]
-            axes.plot(seconds, error, _MARKS[i], color=_COLOURS[i], label=model)
+            axes.plot(seconds, error, MARKS[i], color=COLOURS[i], label=model)
             for one, x, y in zip(shown, seconds, error, strict=True):
                 name = one.setting.label + (" (default)" if one.setting.kind == "default" else "")
                 place = (round(2 * np.log10(x)), round(4 * np.log10(y)))
@@ -41,7 +41,7 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
                 taken[place] += 1
             if model != EMPIRICAL:
                 finest = report.reference(model).seconds
-                axes.axvline(finest, color=_COLOURS[i], lw=0.8, ls=":")
+                axes.axvline(finest, color=COLOURS[i], lw=0.8, ls=":")
                 axes.annotate(
                     f"{model}, finest",
                     (finest, _LEAST_PERCENT),
@@ -54,7 +54,7 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
         for model in (PLANE, SOLID):
             scatter = 100 * report.rules[model].scatter
             if np.isfinite(scatter):
-                axes.axhline(scatter, color=_COLOURS[1 if model == PLANE else 2], lw=0.8, ls="--")
+                axes.axhline(scatter, color=COLOURS[1 if model == PLANE else 2], lw=0.8, ls="--")
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.margins(x=0.2, y=0.1)
@@ -63,5 +63,5 @@ def draw_tradeoff(report: TradeoffReport, path: Path, *, force: bool = False) ->
             f"one lump, d {case.d_mm:g} mm, h/d {case.depth_ratio:g}; "
             "grey: not worth paying for; dashed: the calibration itself"
         )
-        _finish(axes, title, "CPU for one map (s)", "error in size (%)")
+        finish(axes, title, "CPU for one map (s)", "error in size (%)")
         figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7.5, color="0.3")

@@ -1,4 +1,4 @@
-"""The trade-off of the forward models as text and as data, with what the case does not need."""
+"""Text and data of the forward models' trade-off, with the settings that a case does not need."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.forward.plane.empirical import outside_range
 from tactile_bayes.forward.plane.study import seat_name
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.studies.forward_tradeoff import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, change, cheapest
@@ -20,7 +21,7 @@ _NAME = 52
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TradeoffReport:
-    """Everything that was measured.
+    """All measurements of a trade-off.
 
     Parameters
     ----------
@@ -40,30 +41,30 @@ class TradeoffReport:
     tolerance: float
 
     def of(self, model: str) -> list[Measured]:
-        """What was measured of one model."""
+        """Measurements of one model."""
         return [one for one in self.found if one.setting.model == model]
 
     def reference(self, model: str) -> Measured:
-        """The finest setting of the model; plane strain's for the empirical one."""
+        """Finest setting of the model; for the empirical model, that of plane strain."""
         family = PLANE if model == EMPIRICAL else model
         (found,) = (one for one in self.of(family) if one.setting.kind == "reference")
         return found
 
     def size_mm(self, one: Measured) -> float:
-        """Size by the model's own rule; plane strain's for the empirical one."""
+        """Size by the model's own rule; for the empirical model, by that of plane strain."""
         return self.rules[SOLID if one.setting.model == SOLID else PLANE].size_mm(one)
 
     def size_error(self, one: Measured) -> float:
-        """Against the model's reference, as a share."""
+        """Error of the size against the model's reference, as a share."""
         return change(self.size_mm(one), self.size_mm(self.reference(one.setting.model)))
 
     def size_change_mm(self, one: Measured) -> float:
-        """Against the model's reference, in mm."""
+        """Difference of the size from the model's reference, in mm."""
         return self.size_mm(one) - self.size_mm(self.reference(one.setting.model))
 
 
 def tradeoff_text(report: TradeoffReport) -> str:
-    """A table of every setting, and what the case does not need."""
+    """Table of all settings, and accuracy that the case does not need."""
     case = report.case
     lines = [
         f"ball of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat, "
@@ -100,7 +101,7 @@ def _line(one: Measured, report: TradeoffReport) -> str:
 
 
 def advice(report: TradeoffReport) -> list[str]:
-    """Which setting is enough, what is wasted, and what the models themselves cost."""
+    """The setting that is enough, wasted accuracy, and the error of the models themselves."""
     lines = [_enough(report, SOLID), _enough(report, PLANE)]
     solid, plane, empirical = report.reference(SOLID), report.reference(PLANE), report.of(EMPIRICAL)[0]
     if report.rules[PLANE].source == report.rules[SOLID].source:
@@ -113,6 +114,8 @@ def advice(report: TradeoffReport) -> list[str]:
         f"{report.case.d_mm:g}: no mesh mends that"
     )
     lines.append(f"Eqs 1 to 4 stand in for plane strain with {_percent(report.size_error(empirical))} in size")
+    if warning := outside_range(report.case.d_mm, report.case.depth_ratio):
+        lines.append(warning)
     for model in (SOLID, PLANE):
         rule = report.rules[model]
         default = _default(report, model)
@@ -126,7 +129,7 @@ def advice(report: TradeoffReport) -> list[str]:
 
 
 def _enough(report: TradeoffReport, model: str) -> str:
-    """The cheapest sufficient setting of a model, against its default and its reference."""
+    """The cheapest sufficient setting of a model, compared with its default and its reference."""
     found = [one for one in report.of(model) if one.setting.kind in _MESHES]
     errors: FloatArray = np.array([report.size_error(one) for one in found])
     least = cheapest(found, errors, tolerance=report.tolerance)
@@ -151,7 +154,7 @@ def _percent(share: float) -> str:
 
 
 def tradeoff_document(report: TradeoffReport) -> dict[str, Any]:
-    """The same as plain data; errors as shares."""
+    """The trade-off as plain data; errors as shares."""
     case = report.case
     return {
         "schema": "tactile-bayes/tradeoff-forward/1",

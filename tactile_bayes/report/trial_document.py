@@ -1,4 +1,4 @@
-"""A trial report as plain data, ready for JSON."""
+"""Trial report as plain data for JSON."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ CONVENTIONS: dict[str, str] = {
 
 
 def as_document(report: TrialReport) -> dict[str, Any]:
-    """The report as plain data for JSON; numbers carry 12 digits, so that summation order shows in no byte."""
+    """Trial report as plain data; numbers have 12 digits, so that the order of summation changes no byte."""
     return {
         "interval_probability": report.confidence,
         "counts": {
@@ -140,7 +140,7 @@ def _paired_document(one: PairedComparison) -> dict[str, Any]:
 
 
 def _plain(value: object) -> Any:
-    """Dataclasses, tuples and numbers as JSON has them; what is not finite becomes null."""
+    """Convert dataclasses, tuples and numbers to JSON values; what is not finite becomes null."""
     if is_dataclass(value):
         return {one.name: _plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):

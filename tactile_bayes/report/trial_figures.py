@@ -1,4 +1,4 @@
-"""Pictures of a trial as PNG bytes, equal for equal input: sizes, differences, integral transforms, coverage."""
+"""Figures of a trial as PNG bytes, equal for equal input: sizes, differences, integral transforms, coverage."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Corner = Literal["upper left", "lower right"]
 
 
 def sizes_figure(report: TrialReport) -> bytes:
-    """Size against ex-vivo size, one panel a modality, as figure 10 of Wellman & Howe (1999).
+    """Draw size against ex-vivo size, one panel per modality, as figure 10 of Wellman & Howe (1999).
 
     Error bars: +- 1 SD of the ex-vivo size where the table gives it, +- 1 SD of a mass's replicates. Dashed: identity;
     solid: line through zero. Hollow: not found, at size 0.
@@ -39,7 +39,7 @@ def sizes_figure(report: TrialReport) -> bytes:
 
 
 def differences_figure(report: TrialReport) -> bytes:
-    """Bland-Altman: difference to the ex-vivo size against the mean of both, with limits and their intervals.
+    """Draw Bland-Altman plots: difference from the ex-vivo size against the mean, with limits and intervals.
 
     All panels have the same axes, so that modalities can be compared by eye.
     """
@@ -55,14 +55,14 @@ def differences_figure(report: TrialReport) -> bytes:
 
 
 def _share_limits(axes: Sequence[Axes]) -> None:
-    """Give all panels the widest range that one of them needs."""
+    """Give all panels the widest range of any."""
     across, up = (np.array([get(panel) for panel in axes]) for get in (type(axes[0]).get_xlim, type(axes[0]).get_ylim))
     for panel in axes:
         panel.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
 
 
 def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
-    """Integral transforms as a histogram and as a distribution function with its band, and coverage by level."""
+    """Draw integral transforms as a histogram and a distribution function with its band, and coverage by level."""
 
     def draw(axes: Sequence[Axes]) -> None:
         _draw_pit(axes[0], found)
@@ -73,7 +73,7 @@ def calibration_figure(prediction: Prediction, found: Calibration) -> bytes:
 
 
 def _png(draw: Callable[[Sequence[Axes]], None], panels: int) -> bytes:
-    """The figure's bytes; the user's own matplotlib settings do not reach it."""
+    """Render a figure as PNG bytes, independent of the user's matplotlib settings."""
     import matplotlib
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""A trial report as one page that needs nothing else: tables, pictures, settings, hashes; no script, no network."""
+"""Trial report as one self-contained page: tables, figures, settings, hashes; no script, no network."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _METHODS = {
 
 
 def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -> str:
-    """The whole page.
+    """Full HTML page of a report.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def _agreement(report: TrialReport) -> Iterator[str]:
 
 
 def _trend(report: ModalityReport) -> str | None:
-    """Whether the difference changes with the ex-vivo size, where a test says so."""
+    """Whether the difference changes with the ex-vivo size, where it was tested."""
     found = report.methods.trends.get("on_ex_vivo")
     if found is None or found.p_value is None or found.p_value >= 0.05:
         return None
@@ -304,7 +304,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    """The text, with an interval in brackets set small below the number."""
+    """Text with an interval in brackets set in small type below the number."""
     if text.startswith("<code>"):
         return text
     value, bracket, rest = text.partition(" [")

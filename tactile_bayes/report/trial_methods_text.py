@@ -1,4 +1,4 @@
-"""The second table of a trial report: modalities as methods of measurement, repeatability, calibration, comparison."""
+"""Second table of a trial report: repeatability, calibration and comparison of the measuring methods."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LINES = {
 
 
 def method_lines(report: TrialReport) -> Iterator[str]:
-    """Lines of text, none longer than 150 characters."""
+    """Text lines, none longer than 150 characters."""
     yield "Detected masses as measurements (size on ex vivo; differences are size - ex vivo):"
     for one in report.modalities.values():
         yield from _modality_lines(one)
@@ -58,7 +58,7 @@ def _limits_lines(report: ModalityReport) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class LimitRow:
-    """Limits of agreement on one scale, as they are printed."""
+    """Limits of agreement on one scale, formatted."""
 
     words: str
     bias: str
@@ -67,7 +67,7 @@ class LimitRow:
 
 
 def limit_rows(report: ModalityReport) -> Iterator[LimitRow]:
-    """Of the ratio, then in mm."""
+    """Limits of the ratio, then in mm."""
     figures = report.methods.figures
     for unit in ("log_ratio", "mm"):
         one = report.methods.limits.get(unit)
@@ -82,7 +82,7 @@ def limit_rows(report: ModalityReport) -> Iterator[LimitRow]:
 
 
 def growing_line(report: TrialReport) -> str | None:
-    """Which modalities' limits in mm not to use, and why; None where errors do not grow with size."""
+    """Modalities whose limits in mm must not be used, and why; None where errors do not grow with size."""
     names = [one.name for one in report.modalities.values() if one.methods.errors_grow]
     if not names:
         return None
@@ -118,7 +118,7 @@ def _pair_line(pair: PairedComparison) -> str:
 
 
 def shown(figure: Figure, spec: str) -> str:
-    """The value with its interval in brackets."""
+    """Value with its interval in brackets."""
     if figure.value is None:
         return "-"
     return f"{figure.value:{spec}}{_ends(figure.interval, spec)}"

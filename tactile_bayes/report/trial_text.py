@@ -1,4 +1,4 @@
-"""A trial report as text for people: one table with units, then what the table leaves out."""
+"""Text report of a trial: one table with units, then its omissions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def trial_text(
     checks: Mapping[str, IntervalCheck] | None = None,
     more: Sequence[str] = (),
 ) -> str:
-    """The whole report, with the second table when `methods`; the research-use line comes last."""
+    """Full report, with the second table when `methods`; the research-use line comes last."""
     lines = [
         f"Sizes against excision: {_plural(report.masses, 'mass')} of {_plural(report.patients, 'patient')}, "
         f"{_plural(report.readings, 'reading')}{_synthetic(report)}",
@@ -75,7 +75,7 @@ def _notes(report: TrialReport) -> Iterator[str]:
 
 
 def ratio_line(name: str, one: ModalityRatio) -> str:
-    """The ratio of errors with the masses that it is over."""
+    """Ratio of errors, with the number of masses it is over."""
     if one.masses == 0:
         return f"{name}: no MAPE ratio: no mass was looked for by both this modality and the tactile one"
     line = f"{name}: MAPE {shown(one.ratio, '.2f')} times the tactile one's on {_plural(one.masses, 'common mass')}"
@@ -103,7 +103,7 @@ def _modality_notes(report: ModalityReport, *, percent: str) -> Iterator[str]:
 
 
 def _reasons(name: str, figures: Mapping[str, Figure]) -> Iterator[str]:
-    """Why figures and intervals are not there; replicates are not owed, so their absence is left to the JSON."""
+    """Reasons for missing figures and intervals; missing replicates are named in the JSON only."""
     owed = {key: one for key, one in figures.items() if not key.startswith("within_mass")}
     for reason in dict.fromkeys(one.reason for one in owed.values() if one.reason):
         affected = ", ".join(key for key, one in owed.items() if one.reason == reason)

@@ -1,23 +1,23 @@
-"""The two forms of a size calibration, and the step in which they differ: from map draws to sizes.
+"""The kinds of size calibration, and the step in which they differ: from map draws to sizes.
 
-Both forms have `at_fat`, `fitting`, `outside`, `too_far` and `omissions`; whoever uses a calibration needs no other.
+One is learned from a study or phantoms (`eq6`), one over a population of bodies (`body_calibration`). Both have
+`at_fat`, `fitting`, `outside`, `too_far` and `omissions`; whoever uses a calibration needs no other.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import assert_never
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import SizeCalibration
-from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
 from tactile_bayes.size.posterior import SizePosterior, push_sizes
 
-Calibration = SizeCalibration | LogQuadratic
+Calibration = SizeCalibration | BodyCalibration
 
 
 def draw_sizes(
@@ -31,25 +31,31 @@ def draw_sizes(
     replicates: Labels | None,
     rng: np.random.Generator,
 ) -> SizePosterior:
-    """Sizes from the joint draws of one map.
+    """Draw sizes from the joint draws of one map.
 
     Parameters
     ----------
     amplitude, sigma_x_mm, sigma_y_mm, angle_rad : (chain, draw) arrays
         Of Eq 7.
     priors
-        Spread between maps, shape of the lump, known properties of the body; Eq 6 uses none of them.
+        Spread between maps, shape of the lump, known properties of the body. Eq 6 uses the spread, for the interval
+        of another exam, and nothing else.
     replicates : (chain * draw,) array
         As `ParameterDraws.replicates`.
     """
     match calibration:
-        case LogQuadratic():
+        case BodyCalibration():
             one = ShapeDraws.of(amplitude, sigma_x_mm, sigma_y_mm, angle_rad, labels=replicates)
-            size = pooled_size([one], calibration=calibration, priors=priors, rng=rng)
-            shape = amplitude.shape
-            return replace(size, d_x_mm=size.d_x_mm.reshape(shape), d_y_mm=size.d_y_mm.reshape(shape))
+            return pooled_size([one], calibration=calibration, priors=priors, rng=rng).reshaped(amplitude.shape)
         case SizeCalibration():
             return push_sizes(
-                amplitude, sigma_x_mm, sigma_y_mm, angle_rad, calibration=calibration, rng=rng, replicates=replicates
+                amplitude,
+                sigma_x_mm,
+                sigma_y_mm,
+                angle_rad,
+                calibration=calibration,
+                rng=rng,
+                replicates=replicates,
+                another_exam=priors.another_exam or priors.between_maps,
             )
     assert_never(calibration)

@@ -17,17 +17,17 @@ Domain = Mapping[str, tuple[float, float]]
 
 
 def outside_domain(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
-    """Which of the two lie outside their ranges in a table, in words."""
+    """Quantities outside their ranges in a table, in words."""
     return _beyond(domain, amplitude, sigma_mm, factors=dict.fromkeys(FARTHEST, 1.0))
 
 
 def too_far(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
-    """Which of the two lie so far outside that no size is given, in words."""
+    """Quantities so far outside that no size is given, in words."""
     return _beyond(domain, amplitude, sigma_mm, factors=FARTHEST)
 
 
 def extrapolated(far: Sequence[str]) -> Abstention:
-    """The map lies so far outside the calibration's table that nothing is known of the size's error."""
+    """Reason for no size: the map is too far outside the calibration's table to know the size's error."""
     advice = (
         "learn a calibration whose table holds such lumps (`population`, `calibrate size`), or give "
         "--size-calibration none for amplitude and widths"

@@ -1,4 +1,4 @@
-"""Elongation of the lump: a ball's map is oval under an oblong head, and only what exceeds that is evidence."""
+"""Elongation of the lump: a ball's map is oval under an oblong head; only a larger axis ratio is evidence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tactile_bayes.records import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ShapePrior:
-    """Prior on the half log axis ratio of a lump, as a vector along and 45 degrees from the head's x axis.
+    """Prior of a lump's half log axis ratio, as a vector along and 45 degrees from the head's x axis.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class ShapePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Elongation:
-    """Posterior of a lump's half log axis ratio: round with one probability, else normal.
+    """Posterior of a lump's half log axis ratio: round with a probability, else normal.
 
     Parameters
     ----------
@@ -42,19 +42,19 @@ class Elongation:
     covariance: FloatArray
 
     def at(self, points: FloatArray) -> FloatArray:
-        """(n, 2) draws from (n, 3) uniform points: the first says oval or round; (0, 0) where the lump is round."""
+        """(n, 2) draws from (n, 3) uniform points: the first decides between oval and round, which is (0, 0)."""
         values, vectors = np.linalg.eigh(self.covariance)
         normal = normal_quantile(points[:, 1:]) @ (vectors * np.sqrt(np.clip(values, 0.0, None))).T
         return np.where(points[:, :1] < self.probability, self.mean + normal, 0.0)
 
     @property
     def magnitude(self) -> float:
-        """Half log axis ratio if the lump is oval."""
+        """Posterior mean half log axis ratio of an oval lump."""
         return float(np.hypot(*self.mean))
 
 
 def elongation(excess: FloatArray, covariance: FloatArray, *, slope: float, prior: ShapePrior) -> Elongation:
-    """Weigh a round lump against an oval one.
+    """Compare a round lump with an oval one.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def elongation(excess: FloatArray, covariance: FloatArray, *, slope: float, prio
 
 
 def turned(vector: FloatArray, angle_rad: float) -> FloatArray:
-    """(..., 2) half log axis ratios, seen in axes turned back by an angle: an ellipse repeats after half a turn."""
+    """(..., 2) half log axis ratios in rotated axes: an ellipse repeats after half a turn."""
     c, s = np.cos(2 * angle_rad), np.sin(2 * angle_rad)
     return np.asarray(vector @ np.array([[c, s], [-s, c]]))
 

@@ -1,4 +1,4 @@
-"""Eq 6: from width and amplitude of a map to the diameter of a lump, with the uncertainty of its coefficients."""
+"""Eq 6: diameter of a lump from the width and amplitude of its map, with uncertain coefficients."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COEFFICIENTS = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How the maps of a table were built and fitted; a patient's map must share it.
+    """How a table's maps were built and fitted; a patient's map must agree.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Recipe:
     def differences(
         self, *, normalise: str, background: str, radius_mm: float, noise: str, flat_field: bool | None = None
     ) -> list[str]:
-        """What differs from another recipe, in words; empty when nothing does. What is not known does not differ."""
+        """Differences from another recipe in words; empty without any. Unknown settings do not differ."""
         pairs = [
             ("normalise", self.normalise, normalise),
             ("background", self.background, background),
@@ -59,8 +59,14 @@ class Recipe:
             pairs.append(("flat field", words[self.flat_field], words[flat_field]))
         return [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
 
+    @property
+    def map_command(self) -> str:
+        """The command that makes maps of this recipe from a scan."""
+        flat_field = " --flat-field" if self.flat_field else ""
+        return f"`map --normalise {self.normalise}{flat_field}`"
+
     def __str__(self) -> str:
-        """One line of a report."""
+        """The recipe in one line."""
         parts = [f"normalise {self.normalise}", f"background {self.background}", f"fit radius {self.radius_mm:g} mm"]
         parts.append(f"noise {self.noise}")
         if self.flat_field is not None:
@@ -68,13 +74,13 @@ class Recipe:
         return ", ".join(parts)
 
     def as_dict(self) -> dict[str, object]:
-        """As a calibration's file has it; what is not known is left out."""
+        """Plain data for a calibration's file; unknown settings are left out."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisCalibration:
-    r"""Draws of the coefficients of Eq 6 for the widths along one axis of the head.
+    r"""Draws of Eq 6's coefficients for the widths along one axis of the head.
 
     Parameters
     ----------
@@ -133,17 +139,17 @@ class AxisCalibration:
             return np.asarray(use[..., 4] * ratio ** -use[..., 5])
 
     def outside(self, sigma_mm: float, amplitude: float) -> list[str]:
-        """Which inputs lie outside the table's range, in words."""
+        """Inputs outside the table's range, in words."""
         return outside_domain(self.domain, amplitude, sigma_mm)
 
     def too_far(self, sigma_mm: float, amplitude: float) -> list[str]:
-        """Which inputs lie so far outside that there is no size, in words."""
+        """Inputs so far outside that no size is given, in words."""
         return too_far(self.domain, amplitude, sigma_mm)
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOutErrors:
-    """How far sizes are off when each geometry of a study is left out of the learning in turn.
+    """Cross-validated errors of sizes, leaving out each geometry of a study in turn.
 
     Parameters
     ----------
@@ -179,6 +185,8 @@ class SizeCalibration:
         ``("x", "y")``, or ``("both",)`` when the table has one width only.
     left_out
         Errors in geometries left out, where the table was a study.
+    cautions
+        What of the table's lumps is of one kind, or unlike a patient's, in words.
     """
 
     x: AxisCalibration
@@ -187,6 +195,7 @@ class SizeCalibration:
     recipe: Recipe
     axes: tuple[str, ...] = ("x", "y")
     left_out: LeftOutErrors | None = None
+    cautions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not -1.0 <= self.residual_correlation <= 1.0:
@@ -194,31 +203,31 @@ class SizeCalibration:
 
     @property
     def fat_mm(self) -> None:
-        """The depth of fat that the calibration is for: Eq 6 has none."""
+        """Depth of fat of the calibration: None for Eq 6."""
 
     def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> SizeCalibration:
-        """This calibration: Eq 6 has no depth of fat."""
+        """Return the calibration unchanged: Eq 6 does not depend on the depth of fat."""
         del profiles
         return self
 
     def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> SizeCalibration:
-        """This calibration: there is no other for other maps."""
+        """Return the calibration unchanged: it is the same for all maps."""
         del amplitude, sigma_x_mm, sigma_y_mm
         return self
 
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
-        """In what a map lies outside the tables of the two axes, in words; empty when it lies inside."""
-        return self._by_axis(self.x.outside(sigma_x_mm, amplitude), self.y.outside(sigma_y_mm, amplitude))
+        """In what a map lies or may lie outside the tables of the two axes, in words; empty when it lies inside."""
+        by_axis = self._by_axis(self.x.outside(sigma_x_mm, amplitude), self.y.outside(sigma_y_mm, amplitude))
+        return [*self.cautions, *by_axis]
 
     def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
-        """In what a map lies so far outside the tables that there is no size, in words."""
+        """Quantities of a map so far outside the tables that no size is given, in words."""
         return self._by_axis(self.x.too_far(sigma_x_mm, amplitude), self.y.too_far(sigma_y_mm, amplitude))
 
     @staticmethod
     def _by_axis(x: Sequence[str], y: Sequence[str]) -> list[str]:
         return [f"x: {text}" for text in x] + [f"y: {text}" for text in y]
 
-    def omissions(self, between_map_sd: float) -> list[str]:
-        """What a size does not contain, in words; Eq 6 knows no spread between maps."""
-        del between_map_sd
-        return [omissions.SPREAD] + ([omissions.ONE_WIDTH] if self.axes == ("both",) else [])
+    def omissions(self) -> list[str]:
+        """Sources of error that a size does not contain, in words."""
+        return [omissions.ONE_WIDTH] if self.axes == ("both",) else []

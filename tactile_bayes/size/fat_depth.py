@@ -1,4 +1,4 @@
-r"""A size calibration conditional on the depth of fat, which the pressure profile over the head gives.
+r"""Size calibration conditional on the depth of fat, which is estimated from the head's pressure profile.
 
 Amplitude and width alone leave the lump's seat open: how far it stands out of the gland. Where no lump lies, the
 pressure over the head depends on the depth F of the fat-gland boundary, so the profile tells F. ln d is then a full
@@ -27,19 +27,20 @@ ROUND = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
 """The same for what makes a ball's map oval."""
 SPREADS = 3
 """Parameters after the coefficients: those of `log_quadratic.PARAMETERS`."""
+Powers = tuple[tuple[int, int], ...]
 MOST_LEVERAGE = 1.0
 """A profile is unlike the table's where its leverage exceeds this multiple of the table's largest."""
 
 
 def head_profile(quality: Mapping[str, float]) -> tuple[float, ...] | None:
-    """`HEAD_PROFILE` of a map from its figures; None where it has none, as an imported grid."""
+    """Read `HEAD_PROFILE` from a map's figures; None for a map without one, such as an imported grid."""
     values = tuple(float(quality.get(name, np.nan)) for name in HEAD_PROFILE)
     return values if np.isfinite(values).all() else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FatDepth:
-    """ln F as a full quadratic in the profile.
+    """Regression of ln F, F the depth of fat in mm: a full quadratic in the profile.
 
     Parameters
     ----------
@@ -71,14 +72,14 @@ class FatDepth:
         return np.asarray(self.terms(profile) @ self.coefficients)
 
     def unlike(self, profile: FloatArray) -> FloatArray:
-        """(...) leverage over the table's largest."""
+        """(...) leverage over the table's largest; above 1 the profile lies outside the table."""
         x = self.terms(profile)
         return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FatCubic:
-    """The calibration for maps with a profile; made by `learn_fat_cubic`.
+class FatTerms:
+    """The calibration for maps with a profile, of a form that its subclasses name.
 
     Parameters
     ----------
@@ -86,19 +87,20 @@ class FatCubic:
         From profile to F.
     centre
         alpha_0, p_0 and w_0.
-    mean, covariance : (23,), (23, 23) arrays
-        Posterior of the coefficients of `POWERS` and of the three spreads.
+    mean, covariance : (k + 3,), (k + 3, k + 3) arrays
+        Posterior of the k coefficients and of the three spreads.
     round_coefficients : (6,) array
         Of `ROUND` in q0, see `RoundLumps`.
     round_sd
         Its spreads between bodies and between exams.
-    information_inverse : (20, 20) array
+    information_inverse : (c, c) array
+        Of the c features by which a map is like or unlike the table's.
     most_leverage
-        As in `LogQuadratic`.
+        As in `BodyCalibration`.
     fat_mm
         Range of F in the table.
     hidden
-        As in `LogQuadratic`, with (k, 20) `expected`.
+        As in `BodyCalibration`, with `expected` over the c features.
     fit
         Figures of the fit.
     """
@@ -116,16 +118,31 @@ class FatCubic:
     fit: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        k = len(POWERS) + SPREADS
-        shapes = {"mean": (k,), "covariance": (k, k), "round_coefficients": (len(ROUND),)}
-        shapes["information_inverse"] = (len(POWERS), len(POWERS))
+        k, c = len(self.coefficient_powers), len(self.feature_powers)
+        shapes = {"mean": (k + SPREADS,), "covariance": (k + SPREADS, k + SPREADS)}
+        shapes |= {"round_coefficients": (len(ROUND),), "information_inverse": (c, c)}
         for name, shape in shapes.items():
             values = getattr(self, name)
             if values.shape != shape or not np.isfinite(values).all():
-                raise BadDataError(f"fat_cubic.{name} is no finite {shape}", way_out="learn the calibration anew")
+                raise BadDataError(f"{self.file_key}.{name} is no finite {shape}", way_out="learn the calibration anew")
+
+    @property
+    def file_key(self) -> str:
+        """Its name in a calibration's file."""
+        raise NotImplementedError
+
+    @property
+    def coefficient_powers(self) -> Powers:
+        """Which coefficient at one depth each of the k belongs to, and the power of w that multiplies it."""
+        raise NotImplementedError
+
+    @property
+    def feature_powers(self) -> Powers:
+        """The same of the features."""
+        raise NotImplementedError
 
     def depths_apart(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float, float] | None:
-        """Least and largest depth of fat in mm by the profiles of maps, where they can hardly be of one body.
+        """Least and largest depth of fat in mm, where maps differ too much to be of one body.
 
         None where they agree to three SDs of a difference between two exams, or where fewer than two tell a depth.
         """
@@ -135,7 +152,7 @@ class FatCubic:
         return float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))
 
     def log_depth(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float | None, str]:
-        """ln F of a mass from the profiles of its maps, and why there is none.
+        """ln F of a mass from its maps' profiles, or the reason why there is none.
 
         Profiles unlike the table's are left out; those of one mass are averaged, for its exams share the body.
         """
@@ -151,27 +168,57 @@ class FatCubic:
         return log_depth, ""
 
     def _log_depths(self, profiles: Sequence[tuple[float, ...] | None]) -> FloatArray:
-        """(n,) ln F of the profiles that are like the table's."""
+        """(n,) ln F of the profiles that resemble the table's."""
         known = np.array([one for one in profiles if one is not None], dtype=np.float64)
         known = known.reshape(-1, len(self.depth.centre))
         return self.depth.log_depth(known[self.depth.unlike(known) <= MOST_LEVERAGE])
 
     def contraction(self, log_depth: float) -> FloatArray:
-        """(10, 20) matrix: what the coefficients come to at one depth, in the order of `polynomials.powers`."""
-        w, left = log_depth - self.centre[2], powers(ORDER)
-        found = np.zeros((len(left), len(POWERS)))
-        for column, (i, j, k) in enumerate(POWERS):
-            found[left.index((i, j)), column] = w**k
+        """Matrix that takes the k coefficients to those at one depth."""
+        return self._contracted(self.coefficient_powers, log_depth)
+
+    def feature_contraction(self, log_depth: float) -> FloatArray:
+        """Matrix that takes what is linear in the features to the same at one depth."""
+        return self._contracted(self.feature_powers, log_depth)
+
+    def _contracted(self, columns: Powers, log_depth: float) -> FloatArray:
+        w = log_depth - self.centre[2]
+        found = np.zeros((1 + max(row for row, _ in columns), len(columns)))
+        for column, (row, power) in enumerate(columns):
+            found[row, column] = w**power
         return found
 
     def round_lumps(self, log_depth: float) -> RoundLumps:
-        """What a ball's map looks like at one depth."""
+        """Map of a ball at one depth of fat."""
         c, w = self.round_coefficients, log_depth - self.centre[2]
         return RoundLumps(np.asarray(c[:3] + w * c[3:]), *self.round_sd)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FatCubic(FatTerms):
+    """ln d as a full cubic in u, v and w; made by `learn_fat_cubic`."""
+
+    @property
+    def file_key(self) -> str:
+        """Its name in a calibration's file."""
+        return "fat_cubic"
+
+    @property
+    def coefficient_powers(self) -> Powers:
+        """At one depth a cubic in u and v is left, in the order of `polynomials.powers`."""
+        return _CUBIC
+
+    @property
+    def feature_powers(self) -> Powers:
+        """The terms themselves."""
+        return _CUBIC
+
+
+_CUBIC: Powers = tuple((powers(ORDER).index((i, j)), k) for i, j, k in POWERS)
+
+
 def cubic_terms(u: FloatArray, v: FloatArray, w: FloatArray) -> FloatArray:
-    """(n, 20) terms `POWERS`."""
+    """(n, 20) polynomial terms `POWERS`."""
     return monomials((u, v, w), POWERS)
 
 

@@ -1,4 +1,4 @@
-"""Properties of the body in a size calibration: the shape of a ball's map, and what no map shows."""
+"""Hidden properties in a size calibration: the oval map of a ball, and properties of the body that no map shows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LOGGED = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoundLumps:
-    """The oval that a ball's map is, and how far single maps stray from it.
+    """Axis ratio of a ball's map, and the scatter of single maps about it.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class RoundLumps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HiddenTerms:
-    """What goes into B: properties of a body that no map shows, jointly normal with it given the map.
+    """Components of B: properties of a body that no map shows, jointly normal with it given the map.
 
     Parameters
     ----------
@@ -55,13 +55,13 @@ class HiddenTerms:
     body_variance: float
 
     def share(self, *names: str) -> float:
-        """Share of B's variance that goes when these are known."""
+        """Share of B's variance removed by knowing these properties."""
         at = [self.names.index(name) for name in names]
         gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
         return float(np.clip(gain @ self.with_body[at] / self.body_variance, 0.0, 1.0))
 
     def expected_body(self, known: Mapping[str, float], terms: FloatArray) -> FloatArray:
-        """(...,) mean of B when some are known, for (..., 6) terms of the map."""
+        """(...,) mean of B given known properties, for (..., 6) terms of the map."""
         at = [self.names.index(name) for name in known]
         gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
         given = np.array([np.log(v) if name in LOGGED else v for name, v in known.items()])

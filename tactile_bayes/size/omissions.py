@@ -1,4 +1,4 @@
-"""Descriptions of what a size leaves out."""
+"""Sources of error that a size leaves out, in words."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ ONE_WIDTH: Final = "a difference between the head's axes: the calibration has on
 
 
 def fat_depth(why: str) -> str:
-    """The depth of the fat, where maps do not give it."""
+    """The depth of fat as a source left out, where maps do not give it."""
     return f"the depth of the fat, which would narrow the size: {why}"

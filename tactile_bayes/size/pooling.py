@@ -1,9 +1,10 @@
-r"""Sizes from the maps of one mass, one or several, through the log-quadratic calibration.
+r"""Sizes from the maps of one mass, one or several, through a calibration over a population.
 
-Map i gives :math:`g_i`, the log size by the calibration's quadratic, with its own noise. Maps of one mass differ by
+Map i gives :math:`g_i`, the log size by the calibration's form, with its own noise. Maps of one mass differ by
 more than that: :math:`g_i = \ln d - B + E_i`, with :math:`E_i \sim N(0, \tau^2)` between maps. tau is learned from the
-maps at hand with a prior centred on the paper's 15 %; one map says nothing about it, so there the prior speaks. B, what
-no map shows of a body, is common to all of them and does not average out.
+maps at hand, with a prior about the spread that the calibration's exams show; one map says nothing about it, so there
+the prior speaks. A second interval has a prior about the spread of the paper's maps. B, what no map shows of a body, is
+common to all maps of a mass and does not average out.
 """
 
 from __future__ import annotations
@@ -19,53 +20,41 @@ from tactile_bayes.inference.draws import REPLICATES, Labels, even_replicates
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.paired import evened, paired_points
 from tactile_bayes.records import dataclass
+from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, turned
-from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.posterior import SizePosterior, shares
 
-OUTLYING = 3.0
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
 """Of the points: ln d given tau and the spread of B, these two, oval or round, and the two components of an oval."""
 MOST_INVALID = 0.05
-_GRID = np.geomspace(1e-3, 1.5, 240)
-
-
-@dataclass(frozen=True, slots=True)
-class BetweenMaps:
-    """Prior on tau, the standard deviation of ln d between maps of one mass: log-normal.
-
-    Parameters
-    ----------
-    median
-        0.15 in the paper (section 4: within-mass SD 15 %); 0 leaves the term out.
-    log_sd
-        0 takes the median as known.
-    """
-
-    median: float = 0.15
-    log_sd: float = 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class SizePriors:
-    """What the size of a mass assumes besides its calibration.
+    """Assumptions about a mass's size besides the calibration.
 
     Parameters
     ----------
+    between_maps
+        Spread between the maps at hand; None takes what the calibration's exams show.
+    another_exam
+        Spread that exams of one mass may have beyond simulated ones: the second interval's. None leaves that out.
     known
         Properties of the body that somebody knows, by the names of `HiddenTerms`.
     """
 
-    between_maps: BetweenMaps = field(default_factory=BetweenMaps)
+    between_maps: BetweenMaps | None = None
+    another_exam: BetweenMaps | None = field(default_factory=BetweenMaps)
     shape: ShapePrior = field(default_factory=ShapePrior)
     known: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeDraws:
-    """Joint draws of what one map shows, each (n,).
+    """Joint draws of one map's amplitude and shape, each (n,).
 
     Parameters
     ----------
@@ -96,7 +85,7 @@ class ShapeDraws:
 
     @property
     def order(self) -> tuple[float, ...]:
-        """What maps are put in order by before they are pooled."""
+        """Sort key of maps before pooling."""
         return tuple(float(np.nansum(v)) for v in (self.log_width, self.log_amplitude, self.q, self.r))
 
     @classmethod
@@ -111,7 +100,7 @@ class ShapeDraws:
         profile: tuple[float, ...] | None = None,
         labels: Labels | None = None,
     ) -> ShapeDraws:
-        """From draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
+        """Prepare from draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
         with np.errstate(invalid="ignore", divide="ignore"):
             log_a = np.log(np.where(amplitude > 0, amplitude, np.nan)).ravel()
         half = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel()
@@ -121,12 +110,12 @@ class ShapeDraws:
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Medians of the amplitude and of the geometric mean width in mm."""
+        """Medians of the amplitude and of the geometric mean width, mm."""
         amplitude, sigma_mm = (float(np.exp(np.nanmedian(v))) for v in (self.log_amplitude, self.log_width))
         return amplitude, sigma_mm
 
     def rows(self, index: Labels) -> ShapeDraws:
-        """Some of the draws, as if independent."""
+        """Subset of the draws, treated as independent."""
         drawn = {name: getattr(self, name)[index] for name in ("log_amplitude", "log_width", "q", "r")}
         return replace(self, **drawn, labels=None)
 
@@ -134,12 +123,12 @@ class ShapeDraws:
 def pooled_size(
     maps: Sequence[ShapeDraws],
     *,
-    calibration: LogQuadratic,
+    calibration: BodyCalibration,
     priors: SizePriors,
     rng: np.random.Generator,
     number: int | None = None,
 ) -> SizePosterior:
-    """Size of a mass from its maps, with the calibration for the depth of fat that they tell.
+    """Size of a mass from its maps, by the calibration at their depth of fat.
 
     Parameters
     ----------
@@ -151,7 +140,7 @@ def pooled_size(
     Returns
     -------
     SizePosterior
-        Draws of shape (n,). `figures` holds ``between_map_sd`` (median), ``oval_probability``,
+        Draws of shape (n,). `figures` holds ``between_map_sd`` (root mean square), ``oval_probability``,
         ``oval_half_log_ratio`` and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
 
     Notes
@@ -163,48 +152,88 @@ def pooled_size(
     calibration = calibration.at_fat([one.profile for one in maps])
     used, replicates = _matched(maps, number, rng)
     by_map = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
-    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
     log_size = by_map if used is maps else [calibration.log_size(m.log_amplitude, m.log_width) for m in maps]
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
-    tau = _between_at(points[:, 1], centre, noise, priors.between_maps)
-    weight = 1.0 / (noise[:, None] + tau**2 + 1e-12)
-    weight /= weight.sum(axis=0)
-    z, score = normal_quantile(points[:, [0, 2]].T)
-    known, variances = _left_open(used, calibration, priors, tau=tau, weight=weight, score=score)
-    map_part = np.sum(weight * by_map, axis=0)
     oval, slope = _elongation(maps, calibration, priors.shape)
-    half = oval.at(points[:, 3:])
-    longer = np.hypot(half[:, 0], half[:, 1])
-    # round and oval draws are evened apart: a round lump's two sizes stay equal
-    mean, sd = map_part + known + longer, np.sqrt(sum(variances.values()))
-    log_largest = evened(mean + sd * z, mean, sd, 2 * replicates + (longer > 0))
-    log_smallest, o = log_largest.copy(), longer > 0
-    shorter = 2.0 * longer[o]
-    log_smallest[o] = evened(log_largest[o] - shorter, mean[o] - shorter, sd[o], replicates[o])
-    wide = half[:, 0] >= 0
-    share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(one)) for name, one in variances.items()}}
+    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
+    pool = _Pool(used, by_map, centre, noise, points, oval.at(points[:, 3:]), replicates, calibration, priors.known)
     figures = {
-        "between_map_sd": float(np.median(tau)),
         "oval_probability": oval.probability,
         "oval_half_log_ratio": oval.magnitude,
         "width_slope": slope,
-        **({f"weight_{i + 1}": float(w) for i, w in enumerate(weight.mean(axis=1))} if len(maps) > 1 else {}),
     }
-    return SizePosterior(
-        np.exp(np.where(wide, log_largest, log_smallest)),
-        np.exp(np.where(wide, log_smallest, log_largest)),
-        _shares(share | {"shape": float(np.var(longer))}),
-        int((~np.isfinite(mean)).sum()),
-        replicates,
-        figures,
-        outlying_maps(centre, noise, priors.between_maps),
+    between = priors.between_maps or calibration.between_exams
+    another = priors.another_exam
+    return replace(
+        pool.size(between, figures),
+        outliers=outlying_maps(centre, noise, BetweenMaps() if another is None else another),
+        another_exam=None if another is None else pool.size(another, figures),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pool:
+    """Draws of the k maps of a mass, before a spread between maps is added.
+
+    Parameters
+    ----------
+    by_map : (k, n) array
+        ln d by each map.
+    centre, noise : (k,) arrays
+        Its mean and variance.
+    points : (n, `DIMENSIONS`) array
+    half : (n, 2) array
+        Half log axis ratio of the lump, in two components.
+    """
+
+    maps: Sequence[ShapeDraws]
+    by_map: FloatArray
+    centre: FloatArray
+    noise: FloatArray
+    points: FloatArray
+    half: FloatArray
+    replicates: Labels
+    calibration: BodyCalibration
+    known: Mapping[str, float]
+
+    def size(self, between: BetweenMaps, figures: Mapping[str, float]) -> SizePosterior:
+        """Sizes under a prior of the spread between maps."""
+        tau = between.at(self.points[:, 1], self.centre, self.noise)
+        weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
+        weight /= weight.sum(axis=0)
+        z, score = normal_quantile(self.points[:, [0, 2]].T)
+        known, variances = _left_open(self.maps, self.calibration, self.known, tau=tau, weight=weight, score=score)
+        map_part = np.sum(weight * self.by_map, axis=0)
+        longer = np.hypot(self.half[:, 0], self.half[:, 1])
+        mean, sd = map_part + known + longer, np.sqrt(sum(variances.values()))
+        log_largest, log_smallest = self._evened(mean, sd, z, longer)
+        wide = self.half[:, 0] >= 0
+        share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
+        weights = {f"weight_{i + 1}": float(w) for i, w in enumerate(weight.mean(axis=1))} if len(weight) > 1 else {}
+        return SizePosterior(
+            np.exp(np.where(wide, log_largest, log_smallest)),
+            np.exp(np.where(wide, log_smallest, log_largest)),
+            shares(share | {"shape": float(np.var(longer))}),
+            int((~np.isfinite(mean)).sum()),
+            self.replicates,
+            {"between_map_sd": float(np.sqrt(np.mean(tau**2))), **figures, **weights},
+        )
+
+    def _evened(
+        self, mean: FloatArray, sd: FloatArray, z: FloatArray, longer: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Logs of both sizes, smoothed separately for round and oval draws, so that a round lump's sizes stay equal."""
+        largest = evened(mean + sd * z, mean, sd, 2 * self.replicates + (longer > 0))
+        smallest, o = largest.copy(), longer > 0
+        shorter = 2.0 * longer[o]
+        smallest[o] = evened(largest[o] - shorter, mean[o] - shorter, sd[o], self.replicates[o])
+        return largest, smallest
 
 
 def _matched(
     maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
 ) -> tuple[Sequence[ShapeDraws], Labels]:
-    """As many draws of each map, replicates beside replicates, and their labels."""
+    """Equal numbers of draws of each map, matched by replicate, with their labels."""
     if number is None and len(maps) == 1:
         return maps, maps[0].replicates
     replicates = even_replicates(len(maps[0].q) if number is None else number)
@@ -212,7 +241,7 @@ def _matched(
 
 
 def _picked(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
-    """Places of draws whose labels are the wanted ones, each draw of a replicate as often as the others."""
+    """Indices of draws with the wanted labels, using a replicate's draws equally often."""
     index = np.empty(len(wanted), dtype=np.intp)
     for label in range(REPLICATES):
         members, places = np.flatnonzero(have == label), np.flatnonzero(wanted == label)
@@ -223,14 +252,14 @@ def _picked(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
 
 def _left_open(
     maps: Sequence[ShapeDraws],
-    calibration: LogQuadratic,
-    priors: SizePriors,
+    calibration: BodyCalibration,
+    known: Mapping[str, float],
     *,
     tau: FloatArray,
     weight: FloatArray,
     score: FloatArray,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """What the maps leave open of ln d, a normal a draw: its mean, and its variances by source.
+    """Distribution of ln d given each draw of the maps, a normal: its mean, and its variances by source.
 
     Parameters
     ----------
@@ -246,7 +275,7 @@ def _left_open(
     middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
     terms = np.sum(weight[..., None] * calibration.terms(log_a, log_width), axis=0)
     body_sd, shift, error = calibration.body_and_error(terms, middle_a, score)
-    expected, left = _known_body(calibration, priors.known, middle_a, middle_width)
+    expected, left = _known_body(calibration, known, middle_a, middle_width)
     return expected + shift, {
         "between_maps": np.sum(weight**2, axis=0) * tau**2,
         "calibration": error,
@@ -256,7 +285,7 @@ def _left_open(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PooledEstimate:
-    """The answer for one mass.
+    """Result of pooling the maps of one mass.
 
     Parameters
     ----------
@@ -282,18 +311,18 @@ class PooledEstimate:
     centres: Mapping[int, float] = field(default_factory=dict)
     outlying: tuple[int, ...] = ()
     outside: tuple[str, ...] = ()
-    calibration: LogQuadratic | None = None
+    calibration: BodyCalibration | None = None
     fat_apart_mm: tuple[float, float] | None = None
 
 
 def pool_maps(
     shapes: Sequence[ShapeDraws | None],
     *,
-    calibration: LogQuadratic,
+    calibration: BodyCalibration,
     priors: SizePriors,
     rng: np.random.Generator,
 ) -> PooledEstimate:
-    """One size from the maps of a mass; None stands for a map on which no lump was found.
+    """Pool the maps of a mass to one size; None stands for a map on which no lump was found.
 
     When fewer than half of the maps show the lump there is no size: those that do may be the noise's.
     """
@@ -304,7 +333,7 @@ def pool_maps(
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
     used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
     profiles = [one.profile for one in used]
-    fat_apart_mm = None if calibration.fat_cubic is None else calibration.fat_cubic.depths_apart(profiles)
+    fat_apart_mm = None if calibration.with_fat is None else calibration.with_fat.depths_apart(profiles)
     calibration = calibration.at_fat(profiles)
     middles = [one.middle for one in used]
     for middle in middles:  # one map that does not go with the depth is enough: it is the same body
@@ -329,70 +358,25 @@ def pool_maps(
     return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration, fat_apart_mm)
 
 
-def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> tuple[int, ...]:
-    """Places of the maps that lie more than three standard deviations from what the others lead one to expect.
-
-    The spread between maps is taken from the others alone, so that an outlier cannot hide itself by widening it.
-    """
-    if len(centre) < 3:
-        return ()
-    found = []
-    for i in range(len(centre)):
-        others = np.delete(centre, i), np.delete(noise, i)
-        density = _between_density(*others, prior)
-        tau2 = float(density @ _grid(prior) ** 2)
-        weight = 1.0 / (others[1] + tau2)
-        expected, variance = float(weight @ others[0] / weight.sum()), float(1.0 / weight.sum() + noise[i] + tau2)
-        if abs(centre[i] - expected) > OUTLYING * np.sqrt(variance):
-            found.append(i)
-    return tuple(found)
-
-
-def _grid(prior: BetweenMaps) -> FloatArray:
-    """Values of tau that are looked at."""
-    return np.array([prior.median]) if prior.median <= 0 or prior.log_sd <= 0 else _GRID
-
-
-def _between_density(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> FloatArray:
-    """Posterior weights over `_grid`: restricted likelihood of the maps' centres times the prior."""
-    grid = _grid(prior)
-    if len(grid) == 1:
-        return np.ones(1)
-    variance = noise[:, None] + grid**2
-    weight = 1.0 / variance
-    mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
-    log = -0.5 * np.sum(np.log(variance) + weight * (centre[:, None] - mean) ** 2, axis=0)
-    log += -0.5 * np.log(weight.sum(axis=0)) - 0.5 * (np.log(grid / prior.median) / prior.log_sd) ** 2
-    density = np.exp(log - log.max())  # even steps in ln tau, in which the prior is normal
-    return np.asarray(density / density.sum())
-
-
-def _between_at(points: FloatArray, centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> FloatArray:
-    """Draws of tau from its posterior, at uniform points."""
-    edges = np.cumsum(_between_density(centre, noise, prior))
-    grid = _grid(prior)
-    return np.asarray(grid[np.minimum(np.searchsorted(edges, points), len(grid) - 1)])
-
-
 def _known_body(
-    calibration: LogQuadratic, known: Mapping[str, float], log_amplitude: FloatArray, log_width: FloatArray
+    calibration: BodyCalibration, known: Mapping[str, float], log_amplitude: FloatArray, log_width: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Mean of B given what is known of the body, and the share of its standard deviation that is left."""
+    """Mean of B given the known properties, and the remaining share of its standard deviation."""
     if not known:
         return np.zeros(len(log_width)), 1.0
     hidden = calibration.hidden
     names = () if hidden is None else hidden.names
     for name in known:
         if name not in names:
-            raise UsageError(
-                f"the calibration knows nothing of {name}; it knows {', '.join(names) or 'nothing of a body'}"
-            )
+            raise UsageError(f"the calibration has no property {name}; it has {', '.join(names) or 'none'}")
     assert hidden is not None
-    expected = hidden.expected_body(known, calibration.terms(log_amplitude, log_width))
+    expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
     return expected, float(np.sqrt(1.0 - hidden.share(*known)))
 
 
-def _elongation(maps: Sequence[ShapeDraws], calibration: LogQuadratic, prior: ShapePrior) -> tuple[Elongation, float]:
+def _elongation(
+    maps: Sequence[ShapeDraws], calibration: BodyCalibration, prior: ShapePrior
+) -> tuple[Elongation, float]:
     """Posterior of the lump's shape in the axes the maps share, and the slope that leads from map to lump."""
     excess, covariance, slope = np.zeros(2), np.zeros((2, 2)), 0.0
     k = len(maps)
@@ -406,8 +390,3 @@ def _elongation(maps: Sequence[ShapeDraws], calibration: LogQuadratic, prior: Sh
     balls = calibration.round_lumps
     covariance += (balls.body_sd**2 + balls.exam_sd**2 / k + 1e-12) * np.eye(2)
     return elongation(excess, covariance, slope=slope, prior=prior), slope
-
-
-def _shares(parts: dict[str, float]) -> dict[str, float]:
-    total = float(sum(parts.values()))
-    return {name: float(100.0 * value / total) if total > 0 else 0.0 for name, value in parts.items()}

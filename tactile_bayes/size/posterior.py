@@ -1,9 +1,9 @@
-"""Map draws through Eq 6, draw by draw: the size posterior and where its variance comes from."""
+"""Size posterior by Eq 6, draw by draw, with its sources of variance."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -13,7 +13,12 @@ from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.paired import paired_points
 from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.records import dataclass
+from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+
+EXTREMES = ("max_size_mm", "min_size_mm")
+SIZES = (*EXTREMES, "d_x_mm", "d_y_mm")
+"""Names of the sizes that a posterior has, in the order of reports."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +40,9 @@ class SizePosterior:
         What else the calibration found: the probability of a lump that is not round, the spread between maps...
     outliers
         Of several maps, those that lie apart from the rest, by their place in the list.
+    another_exam
+        The same if another exam of the mass may come out as far apart as in the paper's trial; None where that is
+        not told.
     """
 
     d_x_mm: FloatArray
@@ -44,6 +52,7 @@ class SizePosterior:
     replicates: Labels
     figures: Mapping[str, float] = field(default_factory=dict)
     outliers: tuple[int, ...] = ()
+    another_exam: SizePosterior | None = None
 
     @property
     def max_size_mm(self) -> FloatArray:
@@ -55,8 +64,14 @@ class SizePosterior:
         """(chain, draw) smaller diameter of each draw."""
         return np.minimum(self.d_x_mm, self.d_y_mm)
 
+    def reshaped(self, shape: tuple[int, ...]) -> SizePosterior:
+        """The same draws as arrays of another shape, (chain, draw)."""
+        another = None if self.another_exam is None else self.another_exam.reshaped(shape)
+        d_x_mm, d_y_mm = self.d_x_mm.reshape(shape), self.d_y_mm.reshape(shape)
+        return replace(self, d_x_mm=d_x_mm, d_y_mm=d_y_mm, another_exam=another)
+
     def summarise(self, name: str, *, probability: float) -> Quantity:
-        """The sizes of one name, ``"max_size_mm"``, ``"d_x_mm"``..., with the Monte-Carlo error of their interval."""
+        """Summary of one of `SIZES`, with the Monte-Carlo error of its interval."""
         return summarise(getattr(self, name), probability=probability, replicates=self.replicates)
 
 
@@ -77,8 +92,9 @@ def push_sizes(
     calibration: SizeCalibration,
     rng: np.random.Generator,
     replicates: Labels | None = None,
+    another_exam: BetweenMaps | None = None,
 ) -> SizePosterior:
-    """Each map draw through Eq 6 with a draw of its coefficients and a draw of its residual scatter.
+    """Convert each map draw by Eq 6, with a draw of its coefficients and one of its residual scatter.
 
     Parameters
     ----------
@@ -88,6 +104,8 @@ def push_sizes(
         Of the points that pair map draws with calibration draws and scatter, see `paired_points`.
     replicates : (chain * draw,) array
         Label of the independent replicate of each draw. Default: the draws are independent.
+    another_exam
+        Spread between exams of a mass, for `SizePosterior.another_exam`.
 
     Notes
     -----
@@ -108,20 +126,34 @@ def push_sizes(
     scattered_x = d_x * np.exp(calibration.x.scatter(inputs.amplitude, draws=coefficients_x) * z[0])
     scattered_y = d_y * np.exp(calibration.y.scatter(inputs.amplitude, draws=coefficients_y) * z[1])
     valid = (d_x > 0) & (d_y > 0)
-    share = _variance_share(inputs, calibration, coefficients_x, coefficients_y)
-    return SizePosterior(
-        np.where(valid, scattered_x, np.nan).reshape(shape),
-        np.where(valid, scattered_y, np.nan).reshape(shape),
-        share,
-        int((~valid).sum()),
-        replicates,
+    parts = _variances(inputs, calibration, coefficients_x, coefficients_y)
+    d_x, d_y = np.where(valid, scattered_x, np.nan), np.where(valid, scattered_y, np.nan)
+    size = SizePosterior(d_x, d_y, shares(parts), int((~valid).sum()), replicates)
+    if another_exam is not None:
+        size = replace(size, another_exam=_another(size, parts, another_exam, rng))
+    return size.reshaped(shape)
+
+
+def _another(
+    size: SizePosterior, parts: Mapping[str, float], between: BetweenMaps, rng: np.random.Generator
+) -> SizePosterior:
+    """The sizes with a spread between exams beside what one exam has, a factor that both axes share."""
+    points = paired_points(size.max_size_mm, size.replicates, 2, rng)
+    tau = between.at(points[:, 0], np.zeros(1), np.zeros(1))
+    factor = np.exp(tau * normal_quantile(points[:, 1]))
+    return replace(
+        size,
+        d_x_mm=size.d_x_mm * factor,
+        d_y_mm=size.d_y_mm * factor,
+        variance_share=shares({**parts, "between_maps": float(np.mean(tau**2))}),
+        figures={"between_map_sd": float(np.sqrt(np.mean(tau**2)))},
     )
 
 
 def _coefficients_at(
     points: FloatArray, axis: AxisCalibration, sigma_mm: FloatArray, amplitude: FloatArray
 ) -> FloatArray:
-    """(n, 6) rows of the calibration's draws at uniform points, in order of the size that they give a middling draw."""
+    """(n, 6) draws of the coefficients at uniform points, ordered by the size that they give a median map."""
     middle = np.full(len(axis.draws), np.nanmedian(sigma_mm)), np.full(len(axis.draws), np.nanmedian(amplitude))
     in_order = axis.draws[np.argsort(axis.size_mm(*middle, draws=axis.draws), kind="stable")]
     return np.asarray(in_order[(points * len(in_order)).astype(np.intp)])
@@ -141,23 +173,27 @@ def _sizes(
     return blend(inputs.sigma_x_mm, along), blend(inputs.sigma_y_mm, 1.0 - along)
 
 
-def _variance_share(
+def _variances(
     inputs: _Inputs, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
 ) -> dict[str, float]:
-    """Variance of ln(max size) with all but one source held at its centre, in percent of their sum."""
+    """Variance of ln(max size) with all but one source held at its centre."""
     middle = _Inputs(*(np.full(1, np.median(values)) for values in (
         inputs.amplitude, inputs.sigma_x_mm, inputs.sigma_y_mm, inputs.angle_rad
     )))  # fmt: skip
     by_map = _sizes(inputs, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0))
     by_coefficients = _sizes(middle, calibration, coefficients_x, coefficients_y)
     larger: AxisCalibration = calibration.x if np.nanmedian(by_map[0] - by_map[1]) >= 0 else calibration.y
-    parts = {
+    return {
         "map": _log_variance(np.maximum(*by_map)),
         "calibration": _log_variance(np.maximum(*by_coefficients)),
         "residual": float(larger.scatter(middle.amplitude)[0] ** 2),
     }
-    total = sum(parts.values())
-    return {name: 100.0 * value / total if total > 0 else 0.0 for name, value in parts.items()}
+
+
+def shares(variances: Mapping[str, float]) -> dict[str, float]:
+    """Percent of the sum of some variances."""
+    total = float(sum(variances.values()))
+    return {name: float(100.0 * value / total) if total > 0 else 0.0 for name, value in variances.items()}
 
 
 def _log_variance(size_mm: FloatArray) -> float:

@@ -1,292 +1,246 @@
-"""Cost of accuracy on one map: every method and setting against a long reference of the same posterior."""
+"""Cost of accuracy on one map: whole estimates at many settings against a long run of the default's posterior."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import ParameterDraws
-from tactile_bayes.inference.importance import ImportanceOptions, importance
-from tactile_bayes.inference.optimise import optimise
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
-from tactile_bayes.posterior.correlated.fit import FieldFit, laplace_mixture, shape_draws
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.search import search
-from tactile_bayes.posterior.white.fit import BumpFit, fit_bump
-from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES
+from tactile_bayes.size.calibration import Calibration
+from tactile_bayes.studies.cost_ladder import Clock, Ladder, Priced, Progress, Reference, Run, priced
+from tactile_bayes.studies.size_answers import SizeAnswer, answer_of
 
-ENDS = (0.025, 0.975)
-REFERENCE_POINTS = 16384
-"""Points of each of the reference's replicates."""
-ACCURACIES_SD = (0.05, 0.02, 0.01, 0.005)
-STEPS = (150, 600, 2400)
-FIELDS = (12, FIELD_COSINES, 24, FINE_FIELD_COSINES)
-FIELD_ACCURACY_SD = 0.01
-Clock = Callable[[], float]
-Progress = Callable[[int, int], None]
+LONG_RUNS = (("importance", 0.003), ("importance", 0.01), ("ensemble", 0.05), ("ensemble", 0.1))
+"""Methods and accuracies (SD) of the reference: the first that converges."""
+ACCURACIES_SD = (0.05, 0.01, 0.005)
+CHAIN_ACCURACIES_SD = (0.05,)
+LAPLACE_DRAWS = (400, 16000)
+FIELDS = (8, 12, 18, 24, 30, MOST_FIELD_COSINES)
+RADII_MM = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
+METHOD, ACCURACY, FIELD, WINDOW = "method", "draws", "noise field", "fit window"
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
-    """One method at one setting.
+class Setting:
+    """One way to estimate.
 
     Parameters
     ----------
-    method, setting
-        The setting as the command line has it; empty where there is none.
-    cpu_s
-        Mean CPU time of a run, the search for the mode left out: all share it.
-    evaluations
-        Densities asked for; 0 where there is no density.
-    error_sd, error_mm
-        Root mean square over runs and the four ends of the 95 % intervals of the widths: of ln sigma in posterior SDs,
-        of sigma in mm. Bias and Monte-Carlo error together.
-    failed
-        Why there is nothing; empty where there is.
+    axis, label, default, usable
+        As of `Priced`.
+    options
+        Of the estimate.
+    weight
+        About how many times the default's CPU time it takes, for a forecast.
     """
 
-    method: str
-    setting: str
-    cpu_s: float
-    evaluations: float
-    error_sd: float
-    error_mm: float
-    failed: str = ""
+    axis: str
+    label: str
+    options: EstimateOptions
+    weight: float = 1.0
+    default: bool = False
+    usable: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Tradeoff:
-    """A map's ladder.
+def settings_of(options: EstimateOptions, *, level_known: bool) -> list[Setting]:
+    """Everything that is tried, the default first.
 
     Parameters
     ----------
-    measured
-        Methods and settings, from the cheapest kind up.
-    reference_error_sd
-        The reference's own Monte-Carlo error.
-    search_cpu_s
-        From the map to the mode: detection, scene.
-    sd_mm
-        Posterior SDs of sigma_x and sigma_y.
-    runs
-        Runs that errors and times are means of.
-    fields
-        Noise fields from coarse to fine.
-    cosines
-        Of the noise field under which the methods ran: what an estimate of this map takes by itself.
+    options
+        What `estimate` takes by itself for this map.
+    level_known
+        Whether the map has a background that the paper's least squares can be fixed at.
     """
-
-    measured: tuple[Measured, ...]
-    reference_error_sd: float
-    search_cpu_s: float
-    sd_mm: tuple[float, float]
-    runs: int
-    fields: tuple[FieldRow, ...] = ()
-    cosines: int = FIELD_COSINES
-
-    def advised(self, tolerance_sd: float) -> Measured | None:
-        """The cheapest within a tolerance; None where there is none."""
-        within = [one for one in self.measured if not one.failed and one.error_sd <= tolerance_sd]
-        return min(within, key=lambda one: one.cpu_s) if within else None
+    return [
+        Setting(METHOD, f"--method {options.method}", options, default=True),
+        *_methods(options, level_known=level_known),
+        *_draws(options),
+        *(_fields(options) if options.fit.correlated else ()),
+        *_windows(options),
+    ]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapCase:
-    """What the methods start from.
+def worth_trying(settings: list[Setting], answer: SizeAnswer) -> list[Setting]:
+    """The settings that can make a difference where the default gives this answer.
 
-    Parameters
-    ----------
-    least_squares
-        The bump that `optimise` reports.
-    fit
-        The mode under correlated errors, with the scene that the map supports.
+    Without draws their number plays no part. Where the default has fallen through to chains, noise fields and windows
+    are tried by laplace: chains for each would take minutes.
     """
-
-    least_squares: BumpFit
-    fit: FieldFit
-
-
-def map_case(
-    tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior, cosines: int | None = None
-) -> MapCase | str:
-    """The highest bump's fits, or why there is none."""
-    fit = FitOptions("free", radius_mm, "auto", noise="field", field_cosines=cosines)
-    candidates, seen = search(tactile_map, EstimateOptions(fit=fit, prior=prior))
-    if not candidates:
-        return "nothing rises above the background"
-    found = candidates[-1]
-    if seen is None or seen.scene is None or found.fit is None:
-        return f"no bump can be measured: {found.fault}"
-    printed = FitOptions("free" if tactile_map.background is None else "fixed", radius_mm, "off")
-    judged, _ = fit_bump(tactile_map, found.centre_mm, options=printed)
-    return MapCase(judged or found.fit, seen.scene.fit)
+    if answer.reported is None and answer.code != "method":
+        kept = [one for one in settings if one.axis != ACCURACY]
+        return [replace(one, weight=min(one.weight, 1.0)) if one.axis == METHOD else one for one in kept]
+    default = settings[0].options
+    if answer.method != "ensemble" or default.method == "ensemble":
+        return settings
+    return [settings[0], *map(_beside_chains, settings[1:])]
 
 
-@dataclass(frozen=True, slots=True)
-class FieldRow:
-    """A noise field of so many cosines along each axis.
-
-    Parameters
-    ----------
-    cosines
-        Of `FitOptions.field_cosines`.
-    cpu_s
-        From the map to the draws.
-    change_sd, change_mm
-        Root mean square over the four ends of the 95 % intervals of the widths, against the finest field: of ln sigma
-        in its posterior SDs, of sigma in mm.
-    """
-
-    cosines: int
-    cpu_s: float
-    change_sd: float
-    change_mm: float
-
-
-def field_ladder(
-    tactile_map: TactileMap, *, radius_mm: float, prior: BumpPrior, clock: Clock, seed: int = 1
-) -> tuple[FieldRow, ...]:
-    """The same map under noise fields from coarse to fine; empty where one of them shows no bump to draw."""
-    spent, widths = [], []
-    for cosines in FIELDS:
-        begun = clock()
-        try:
-            case = map_case(tactile_map, radius_mm=radius_mm, prior=prior, cosines=cosines)
-            if isinstance(case, str):
-                return ()
-            density, rng = Sampled.of(case.fit), np.random.default_rng([seed, 3])
-            draws = density.finished(importance_draws(density, rng=rng, accuracy_sd=FIELD_ACCURACY_SD), rng)
-        except NotConvergedError:
-            return ()
-        spent.append(clock() - begun)
-        widths.append(_widths(case.fit, draws))
-    ends = [np.quantile(one, ENDS, axis=1) for one in widths]
-    log_sd = np.log(widths[-1]).std(axis=1)
-    return tuple(
-        FieldRow(
-            cosines,
-            cpu_s,
-            float(np.sqrt(np.mean(((np.log(one) - np.log(ends[-1])) / log_sd) ** 2))),
-            float(np.sqrt(np.mean((one - ends[-1]) ** 2))),
+def _beside_chains(one: Setting) -> Setting:
+    """A setting with a weight against chains; by laplace if it is another model."""
+    if one.options.method == "ensemble":
+        return replace(one, weight=one.weight / 8.0)
+    if one.axis in (FIELD, WINDOW):
+        return replace(
+            one, label=f"{one.label}, laplace", options=_by(one.options, "laplace"), weight=0.05 * one.weight
         )
-        for cosines, cpu_s, one in zip(FIELDS, spent, ends, strict=True)
-    )
+    return replace(one, weight=0.2 * one.weight)
+
+
+def _methods(options: EstimateOptions, *, level_known: bool) -> Iterator[Setting]:
+    printed = replace(options.fit, noise="independent", background="fixed" if level_known else "free")
+    if options.method != "optimise":
+        # another model: no noise field, no prior
+        plain = replace(options, method="optimise", fit=printed, scene="auto", accuracy_mm=None)
+        yield Setting(METHOD, "--method optimise", plain, 0.5, usable=False)
+    for method, weight in (("laplace", 1.0), ("importance", 1.0), ("ensemble", 8.0)):
+        if method != options.method:
+            yield Setting(METHOD, f"--method {method}", _by(options, method), weight)
+
+
+def _draws(options: EstimateOptions) -> Iterator[Setting]:
+    for number in LAPLACE_DRAWS:
+        drawn = replace(_by(options, "laplace"), draws=number)
+        if options.fit.correlated:
+            yield Setting(ACCURACY, f"laplace, {number} draws", drawn, usable=False)
+    for accuracy in ACCURACIES_SD:
+        label = f"--accuracy-sd {accuracy:g}"
+        yield Setting(ACCURACY, label, _by(options, "importance", accuracy), 1.0 + 0.005 / accuracy)
+    for accuracy in CHAIN_ACCURACIES_SD if options.fit.correlated else ():
+        label = f"--method ensemble --accuracy-sd {accuracy:g}"
+        yield Setting(ACCURACY, label, _by(options, "ensemble", accuracy), 25.0)
+
+
+def _fields(options: EstimateOptions) -> Iterator[Setting]:
+    for number in FIELDS:
+        finer = replace(options, fit=replace(options.fit, field_cosines=number))
+        yield Setting(FIELD, f"field_cosines {number}", finer, max(0.7, (number / 18.0) ** 3.2), usable=False)
+
+
+def _windows(options: EstimateOptions) -> Iterator[Setting]:
+    for radius in RADII_MM:
+        if radius != options.fit.radius_mm:
+            other = replace(options, fit=replace(options.fit, radius_mm=radius))
+            yield Setting(WINDOW, f"fit_radius_mm {radius:g}", other, usable=False)
+
+
+def _by(options: EstimateOptions, method: Any, accuracy_sd: float | None = None) -> EstimateOptions:
+    """The options with another method, which stands for itself: where it fails no other one is tried."""
+    return replace(options, method=method, accuracy_sd=accuracy_sd, accuracy_mm=None, step_up=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimator:
+    """Estimates of one map, seeded by the map and the number of the run.
+
+    Parameters
+    ----------
+    calibration
+        From widths to sizes; None stops at widths.
+    seed
+        Of the random numbers.
+    clock
+        CPU seconds so far.
+    probability
+        Of the intervals.
+    """
+
+    tactile_map: TactileMap
+    calibration: Calibration | None
+    seed: int
+    clock: Clock
+    probability: float = INTERVAL
+
+    def run(self, options: EstimateOptions) -> Run:
+        """A whole estimate, from the map to the size, as a function of the number of the run."""
+        calibration = fitted_as(self.calibration, options)
+
+        def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
+            rng = np.random.default_rng([self.seed, number, self.tactile_map.fingerprint])
+            begun = self.clock()
+            try:
+                found = estimate_map(self.tactile_map, calibration=calibration, options=options, rng=rng)
+                answer = answer_of(found, probability=self.probability)
+            except NotConvergedError as error:
+                answer = SizeAnswer(str(error), code="method")
+            return {"estimate": self.clock() - begun}, answer
+
+        return once
+
+    def reference(self, options: EstimateOptions) -> Reference:
+        """The same posterior by the first long run that converges; without one, or without a lump, no answer."""
+        spent, answer = 0.0, SizeAnswer("")
+        for method, accuracy in LONG_RUNS:
+            seconds, answer = self.run(_by(options, method, accuracy))(-1 % 2**32)
+            spent += seconds["estimate"]
+            if answer.reported is not None:
+                name = "importance sampling" if method == "importance" else "MCMC (four ensembles)"
+                return Reference(f"{name} of the default's posterior, asked for {accuracy:g} SD", answer, spent)
+            if answer.code != "method":  # no draws are made, so none can be more exact
+                break
+        return Reference(f"none: {answer.reason}", None, spent)
+
+
+def fitted_as(calibration: Calibration | None, options: EstimateOptions) -> Calibration | None:
+    """The calibration as if it had been learned from maps fitted as the options say.
+
+    `estimate` refuses a size from a map fitted in another way; here it is wanted, to see how far off it would be.
+    """
+    if calibration is None:
+        return None
+    fit = options.fit
+    recipe = replace(calibration.recipe, background=fit.background, radius_mm=fit.radius_mm, noise=fit.noise)
+    return replace(calibration, recipe=recipe)
 
 
 def measure(
     tactile_map: TactileMap,
     *,
-    radius_mm: float,
-    prior: BumpPrior,
+    calibration: Calibration | None,
+    options: EstimateOptions,
     clock: Clock,
+    tolerance_mm: float,
     seed: int = 1,
-    runs: int = 4,
+    runs: int = 3,
+    probability: float = INTERVAL,
+    announce: Callable[[float], None] = lambda _seconds: None,
     progress: Progress | None = None,
-) -> Tradeoff | str:
-    """Run the ladder on one map.
+) -> Ladder:
+    """Run every setting on one map.
 
     Parameters
     ----------
+    calibration, options
+        What `estimate` takes by itself for this map.
     clock
         CPU seconds so far.
-
-    Returns
-    -------
-    Tradeoff, or why there is nothing to measure.
+    tolerance_mm
+        See `Ladder`.
+    runs
+        Of each setting: times are the least of them, distances their root mean square.
+    announce
+        Called once, when the default has been timed, with about how many CPU seconds the rest will take.
+    progress
+        Called with settings done and in all.
     """
-    begun = clock()
-    case = map_case(tactile_map, radius_mm=radius_mm, prior=prior)
-    if isinstance(case, str):
-        return case
-    search_s = clock() - begun
-    density = Sampled.of(case.fit)
-    many = ImportanceOptions(accuracy_sd=1.0, first=REFERENCE_POINTS)
-    rng = np.random.default_rng([seed, 0])
-    long = importance(density, density.mean, density.covariance, rng=rng, options=many)
-    truth = _widths(case.fit, density.finished(long, rng))
-    ladder = _ladder(case, density)
-    found = []
-    for number, (method, setting, run) in enumerate(ladder):
-        found.append(_timed(method, setting, run, truth, clock=clock, seed=seed, runs=runs))
+    estimator = Estimator(tactile_map, calibration, seed, clock, probability)
+    default = estimator.run(options)
+    default(0)  # imports and first calls cost nothing afterwards
+    seconds, answer = default(0)
+    settings = worth_trying(settings_of(options, level_known=tactile_map.background is not None), answer)
+    announce(seconds["estimate"] * (4.0 + runs * sum(one.weight for one in settings)))
+    reference = estimator.reference(options)
+    rows: list[Priced] = []
+    for number, one in enumerate(settings, start=1):
+        run = estimator.run(one.options)
+        rows.append(priced(one.axis, one.label, run, reference, runs=runs, default=one.default, usable=one.usable))
         if progress is not None:
-            progress(number + 1, len(ladder))
-    sd = np.std(truth, axis=1)
-    fields = field_ladder(tactile_map, radius_mm=radius_mm, prior=prior, clock=clock, seed=seed)
-    error_sd, sd_mm = long.diagnostics["end_error_sd"], (float(sd[0]), float(sd[1]))
-    return Tradeoff(tuple(found), error_sd, search_s, sd_mm, runs, fields, case.fit.target.window.cosines)
-
-
-Run = Callable[[np.random.Generator], tuple[FloatArray, float]]
-
-
-def _ladder(case: MapCase, density: Sampled) -> list[tuple[str, str, Run]]:
-    """Name, setting, and a function from random numbers to (2, n) draws of the widths and the evaluations."""
-
-    def of(make: Callable[[np.random.Generator], ParameterDraws]) -> Run:
-        def run(rng: np.random.Generator) -> tuple[FloatArray, float]:
-            draws = make(rng)
-            return _widths(case.fit, draws), draws.diagnostics.get("evaluations", 0.0)
-
-        return run
-
-    def least_squares(rng: np.random.Generator) -> tuple[FloatArray, float]:
-        fit = case.least_squares
-        draws = optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
-        return np.array(fit.bump.widths(draws.flat)[:2]), 0.0
-
-    def weighted(accuracy: float) -> Run:
-        return of(lambda rng: density.finished(importance_draws(density, rng=rng, accuracy_sd=accuracy), rng))
-
-    def chains(steps: int) -> Run:
-        return of(lambda rng: density.finished(_fixed_length(density, steps, rng), rng))
-
-    return [
-        ("optimise", "", least_squares),
-        ("laplace", "", of(lambda rng: laplace_mixture(case.fit, rng=rng))),
-        *(("importance", f"--accuracy-sd {accuracy:g}", weighted(accuracy)) for accuracy in ACCURACIES_SD),
-        *(("ensemble", f"{steps} steps", chains(steps)) for steps in STEPS),
-    ]
-
-
-def _fixed_length(density: Sampled, steps: int, rng: np.random.Generator) -> ParameterDraws:
-    """An ensemble of so many steps, whatever its diagnostics say."""
-    from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
-
-    options = EnsembleOptions(block=steps, max_steps=steps, least_ess=0.0, most_rhat=np.inf)
-    return ensemble(density, density.mean, density.covariance, rng=rng, options=options)
-
-
-def _timed(method: str, setting: str, run: Run, truth: FloatArray, *, clock: Clock, seed: int, runs: int) -> Measured:
-    spent, evaluations, off_sd, off_mm = [], [], [], []
-    exact, exact_log = np.quantile(truth, ENDS, axis=1), np.quantile(np.log(truth), ENDS, axis=1)
-    sd = np.log(truth).std(axis=1)
-    try:
-        run(np.random.default_rng([seed, 1]))  # imports and the first call's memory cost nothing
-        for number in range(runs):
-            begun = clock()
-            widths, used = run(np.random.default_rng([seed, 2, number]))
-            spent.append(clock() - begun)
-            evaluations.append(used)
-            off_mm.append(np.quantile(widths, ENDS, axis=1) - exact)
-            off_sd.append((np.quantile(np.log(widths), ENDS, axis=1) - exact_log) / sd)
-    except NotConvergedError as error:
-        return Measured(method, setting, float("nan"), float("nan"), float("nan"), float("nan"), str(error))
-    return Measured(
-        method,
-        setting,
-        float(np.mean(spent)),
-        float(np.mean(evaluations)),
-        float(np.sqrt(np.mean(np.square(off_sd)))),
-        float(np.sqrt(np.mean(np.square(off_mm)))),
-    )
-
-
-def _widths(fit: FieldFit, draws: ParameterDraws) -> FloatArray:
-    """(2, n) draws of sigma_x and sigma_y."""
-    return np.array(shape_draws(fit, draws.flat)[:2])
+            progress(number, len(settings))
+    return Ladder(tuple(rows), reference, tolerance_mm)

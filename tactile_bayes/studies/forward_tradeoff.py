@@ -38,7 +38,7 @@ Clock = Callable[[], float]
 
 @dataclass(frozen=True, slots=True)
 class LumpCase:
-    """The lump that is looked at.
+    """The lump of a comparison.
 
     Parameters
     ----------
@@ -58,12 +58,12 @@ class LumpCase:
 
     @property
     def body(self) -> Body:
-        """Geometry and tissues."""
+        """Geometry and tissues of the body."""
         return self.plane.body(self.d_mm, self.depth_ratio, seat=self.seat)
 
     @property
     def heads(self) -> dict[str, str]:
-        """Where the shoulders of each model's head lie, of `presets.HEADS`."""
+        """Place of the shoulders of each model's head, one of `presets.HEADS`."""
         return {PLANE: self.plane.head.shoulders, SOLID: self.solid.head.shoulders}
 
 
@@ -92,7 +92,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One setting's cost and map.
+    """Cost and map of one setting.
 
     Parameters
     ----------
@@ -118,12 +118,12 @@ class Measured:
 
     @property
     def seconds(self) -> float:
-        """CPU for one map from nothing."""
+        """CPU seconds for one map from scratch."""
         return self.lump_s + self.map_s
 
 
 def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
-    """The lump of a scene, and both models' settings for its body and head.
+    """Lump of a scene, with both models' settings for its body and head.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
 
 
 def settings_of(case: LumpCase) -> list[Setting]:
-    """Every setting that is compared, cheap ones first within a model, each model's reference last."""
+    """All settings to compare: within a model the cheap ones first, its reference last."""
     found = [Setting(EMPIRICAL, "Eqs 1 to 4", case.plane, "default")]
     for fineness, cell in _PLANE:
         chosen = replace(case.plane, fineness=fineness, cell_mm=cell)
@@ -190,7 +190,7 @@ def _kind(default: bool, mesh_only: bool, reference: bool, other: str) -> str:
 def measure(
     case: LumpCase, setting: Setting, *, fit: Fit, raster_fit: RasterFitter, clock: Clock, runs: int = 1
 ) -> Measured:
-    """Compute the map by one setting, and take the time.
+    """Compute the map by one setting and measure the time.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def _element_mm(case: LumpCase, setting: Setting) -> float:
 def teach(
     case: LumpCase, model: str, *, fit: Fit, raster_fit: RasterFitter, progress: Callable[[int, int], None]
 ) -> list[StudyRow]:
-    """Hard lumps of several sizes and depths in the case's body, by a model's default: what Eq 6 is learned from."""
+    """Simulate hard lumps of several sizes and depths in the case's body, to learn Eq 6 from."""
     geometries = [Geometry(case.seat, d, h, (HARD_RATIO,)) for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS]
     deepest = max(d * (h + max(0.6, 0.5 * case.seat)) + 2.0 for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS)
     thickness = max(case.solid.thickness_mm or THICKNESS_MM, deepest)
@@ -291,7 +291,7 @@ def teach(
 
 
 def change(value: float | None, reference: float | None) -> float:
-    """Relative difference; NaN where one of both is missing."""
+    """Relative difference; NaN where either is missing."""
     if value is None or reference is None:
         return float("nan")
     return value / reference - 1.0

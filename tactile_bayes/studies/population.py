@@ -1,4 +1,4 @@
-"""Measurements of simulated exams of known lumps: the rows that a size calibration is learned from."""
+"""Measurements of simulated exams of known lumps, from which a size calibration is learned."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _DRAWS_SEED = 1
 
 
 def measuring_options() -> EstimateOptions:
-    """How the maps of a population are fitted: as a patient's, along the head's axes, by mode and curvature."""
+    """Fit options for a population's maps: as for a patient's, along the head's axes, by mode and curvature."""
     return EstimateOptions(method="laplace", fit=FitOptions("free", FIT_RADIUS_MM, "off", None, "field"))
 
 
 @dataclass(frozen=True, slots=True)
 class MassRow:
-    """One exam of one mass: what it was, and what its map shows; the fields are the table's columns.
+    """One exam of one mass: true properties and measurements; the fields are the table's columns.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class MassRow:
 def measure_mass(
     scenes: Sequence[Scene], *, body: int, scan: Callable[[Scene], Scan], normalise: str = DEFAULT_NORMALISE
 ) -> list[MassRow]:
-    """The rows of one mass: each scene scanned, mapped and fitted as a patient's.
+    """Scan, map and fit each scene of a mass; returns its rows.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def measure_mass(
 
 
 def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> MassRow:
-    """The row of one exam; a map that cannot be built or shows no lump has none of the measured columns."""
+    """Row of one exam; the measured columns are empty where no map can be built or no lump is detected."""
     lump, tissue = scene.solid_lumps[0], scene.body
     assert tissue is not None
     row = MassRow(
@@ -150,7 +150,7 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
 
 
 def population_table(columns: Mapping[str, Sequence[float | None]]) -> PopulationTable:
-    """The detected rows of a table with the fields of `MassRow`, as the learning needs them.
+    """Detected rows of a table with the fields of `MassRow`, in the form for learning.
 
     A row without a profile of the head has NaN for it.
     """
@@ -181,7 +181,7 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
 
 
 def _profiles(columns: Mapping[str, Sequence[float | None]], kept: Sequence[int]) -> FloatArray | None:
-    """(n, 3) `presets.HEAD_PROFILE` of the rows kept; None where none of them has one."""
+    """(n, 3) `presets.HEAD_PROFILE` of the chosen rows; None where none has one."""
     if not all(name in columns for name in HEAD_PROFILE):
         return None
     rows = [{name: value for name in HEAD_PROFILE if (value := columns[name][i]) is not None} for i in kept]

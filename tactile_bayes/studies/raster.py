@@ -1,4 +1,4 @@
-"""The map of a study's raster of frames, built and fitted as a patient's map is."""
+"""Maps of a study's raster of frames, built and fitted like a patient's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TRIED: Final = 14
 
 
 def raster_scan(frames: RasterFrames) -> Scan:
-    """The raster as a scan: level poses in a base that is the body's own frame, readings over the frame's mean."""
+    """Convert a raster to a scan: level poses in the body's frame, readings over the frame's mean."""
     import numpy as np
 
     from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
@@ -46,7 +46,7 @@ def raster_scan(frames: RasterFrames) -> Scan:
 
 
 def raster_map(frames: RasterFrames) -> TactileMap:
-    """The map of a raster: cells of half a pitch, so that every reading falls on the middle of one.
+    """Build the map of a raster with cells of half a pitch, so that every reading lies in the middle of one.
 
     Notes
     -----
@@ -64,7 +64,7 @@ def raster_map(frames: RasterFrames) -> TactileMap:
 
 
 def _readings(pressure_kpa: FloatArray) -> CountArray:
-    """(..., rows, columns) whole numbers of frames over their means."""
+    """(..., rows, columns) frames over their means, as whole numbers."""
     import numpy as np
 
     share = pressure_kpa / pressure_kpa.mean(axis=(-2, -1), keepdims=True)
@@ -73,7 +73,7 @@ def _readings(pressure_kpa: FloatArray) -> CountArray:
 
 
 def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
-    """Eq 7 about the lump's axis, all cells alike; the level is fitted, or 1, as the settings say.
+    """Fit Eq 7 about the lump's axis with equal weights; the level is fitted or 1, by the settings.
 
     Notes
     -----
@@ -109,7 +109,7 @@ def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
 
 
 def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[float, float]:
-    """The best amplitude of a bump of these widths on a level of 1 or a free one, and the squares that it leaves."""
+    """Best amplitude of a bump of given widths on a level of 1 or a free one, and the remaining sum of squares."""
     import numpy as np
 
     from tactile_bayes.posterior.lump.bump import Bump

@@ -1,4 +1,4 @@
-r"""Simulation-based calibration of the posterior of a map: truths from its own prior, and where they rank.
+r"""Simulation-based calibration of a map's posterior: ranks of true values drawn from its own prior.
 
 Where a parameter is drawn from the prior, a map from the model, and draws from the posterior of that map, the rank of
 the parameter among the draws is uniform: any departure is a fault of the posterior. The priors here are those that
@@ -34,6 +34,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.rank_tests import RankTest, rank_test, uniform_strays
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
@@ -69,7 +70,7 @@ ROUND = SizePriors(shape=ShapePrior(oval_sd=1e-9))
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What one simulated map was made from.
+    """True parameters of one simulated map.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class MapRanks:
-    """One simulated map, and where its truth lies in the posterior.
+    """Ranks of one simulated map's true parameters in its posterior.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ class MapRanks:
 
 
 def settings(method: str, seed: int, *, size: str = "", cosines: int | None = None) -> dict[str, object]:
-    """All that the ranks of a map depend on besides its number."""
+    """All settings that a map's ranks depend on besides its number."""
     return {
         "method": method,
         "seed": seed,
@@ -136,7 +137,7 @@ def settings(method: str, seed: int, *, size: str = "", cosines: int | None = No
 def ranks_of_map(
     index: int, *, method: Method, seed: int, calibration: LogQuadratic | None = None, cosines: int | None = None
 ) -> MapRanks:
-    """Draw one map from the prior, estimate it and rank its truth: all random numbers come from seed and index.
+    """Draw a map from the prior, estimate it and rank its truth; seed and index fix all random numbers.
 
     Without a size calibration the size is not ranked.
     """
@@ -145,7 +146,10 @@ def ranks_of_map(
     truth = draw_truth(rng, prior)
     fit = FitOptions("free", RADIUS_MM, "off", None, "field", field_cosines=cosines)
     options = EstimateOptions(method=method, fit=fit, prior=prior)
-    found = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
+    try:
+        found = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
+    except NotConvergedError:  # of the ensemble, which no method follows
+        return MapRanks(index, truth, None, "method")
     if found.map_posterior is None or found.draws is None or found.detection is None:
         return MapRanks(index, truth, None, found.code or "none")
     probability = found.detection.probability
@@ -156,7 +160,7 @@ def ranks_of_map(
 
 
 def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
-    """Whether the measured bump is another rise: further from the true centre than either reaches with its width."""
+    """Whether the estimate measured another rise: its centre is further from the true one than both widths."""
     away = np.hypot(np.median(posterior.x_mm) - truth.x_mm, np.median(posterior.y_mm) - truth.y_mm)
     widths = truth.sigma_x_mm, truth.sigma_y_mm, np.median(posterior.sigma_x_mm), np.median(posterior.sigma_y_mm)
     return bool(away > max(widths))
@@ -164,7 +168,7 @@ def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class OtherRises:
-    """Maps on which another rise was measured.
+    """Maps whose estimate measured another rise than the true lump.
 
     Parameters
     ----------
@@ -182,12 +186,12 @@ class OtherRises:
 
     @property
     def too_many(self) -> bool:
-        """Whether the draws are too sure of the place: they keep to the rise that was found first."""
+        """Whether there are more such maps than the estimates' own probabilities allow."""
         return self.chance < MANY_ELSEWHERE
 
 
 def other_rises(maps: list[MapRanks]) -> OtherRises:
-    """Weigh the maps measured elsewhere against what their estimates announced; the chance is a Poisson one."""
+    """Compare the number of maps measured elsewhere with what their estimates predicted, by a Poisson probability."""
     from scipy.stats import poisson
 
     number = sum(one.outcome == ELSEWHERE for one in maps)
@@ -198,7 +202,7 @@ def other_rises(maps: list[MapRanks]) -> OtherRises:
 def _ranks_in(
     posterior: MapPosterior, truth: Truth, rng: np.random.Generator, calibration: LogQuadratic | None
 ) -> tuple[int, ...]:
-    """Ranks of a truth among some of the joint draws, the same ones for every parameter."""
+    """Ranks of a truth in a subset of the joint draws, the same subset for every parameter."""
     number = posterior.x_mm.size
     chosen = rng.choice(number, size=DRAWS, replace=number < DRAWS)
     drawn = {name: getattr(posterior, name).ravel()[chosen] for name in PARAMETERS}
@@ -212,14 +216,14 @@ def _ranks_in(
 
 
 def _sizes(bumps: Mapping[str, FloatArray], calibration: LogQuadratic, rng: np.random.Generator) -> FloatArray:
-    """(n,) sizes in mm, one a bump; one without a rise has none and counts as small."""
+    """(n,) sizes in mm, one per bump; without a rise there is none, which ranks as small."""
     a, sigma_x, sigma_y = (bumps[name] for name in PARAMETERS[:3])
     draws = ShapeDraws.of(a, sigma_x, sigma_y, np.zeros_like(a))
     return np.nan_to_num(pooled_size([draws], calibration=calibration, priors=ROUND, rng=rng).max_size_mm.ravel())
 
 
 def draw_truth(rng: np.random.Generator, prior: BumpPrior) -> Truth:
-    """Bump and noise field from the prior of the field posterior; see the module for what is improper there."""
+    """Draw bump and noise field from the prior of the field posterior; the module describes improper parts."""
     p, q = _draw_log_widths(rng, prior)
     away, direction = CENTRE_MM * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
     return Truth(
@@ -235,7 +239,7 @@ def draw_truth(rng: np.random.Generator, prior: BumpPrior) -> Truth:
 
 
 def _draw_log_widths(rng: np.random.Generator, prior: BumpPrior) -> tuple[float, float]:
-    """Mean and half difference of the log widths, none wider than the window allows."""
+    """Draw mean and half difference of the log widths, none wider than the window allows."""
     widest = np.log(WIDEST_IN_RADII * RADIUS_MM)
     while True:
         p = np.log(prior.width_median_mm) + prior.log_width_sd * rng.standard_normal()
@@ -245,7 +249,7 @@ def _draw_log_widths(rng: np.random.Generator, prior: BumpPrior) -> tuple[float,
 
 
 def draw_map(truth: Truth, rng: np.random.Generator, prior: BumpPrior) -> TactileMap:
-    """A map of the bump on a sloping level of 1, with independent errors by count and the noise field."""
+    """Draw a map of the bump on a sloping level about 1, with independent errors by count and the noise field."""
     axis = np.arange(-HALF_MM, HALF_MM + 0.5 * CELL_MM, CELL_MM)
     count = rng.integers(COUNTS[0], COUNTS[1], size=(len(axis), len(axis)), endpoint=True)
     reading_variance = truth.noise_sd**2 / float(np.mean(1.0 / count))
@@ -265,14 +269,14 @@ def draw_map(truth: Truth, rng: np.random.Generator, prior: BumpPrior) -> Tactil
 
 
 def _bump(axis: FloatArray, truth: Truth) -> FloatArray:
-    """(n, n) cell means of the bump of unit height."""
+    """(n, n) cell means of a bump of unit height."""
     centre, width = np.array([truth.x_mm, truth.y_mm]), np.array([truth.sigma_x_mm, truth.sigma_y_mm])
     columns, rows = cell_mean_profile(axis - centre[:, None], sigma_mm=width, cell_mm=CELL_MM)
     return np.asarray(rows[:, None] * columns)
 
 
 def draw_field(axis: FloatArray, rng: np.random.Generator, *, length_mm: float) -> FloatArray:
-    """(n, n) field of variance 1 and exponential correlation, cut from a torus on which the wrap does not matter."""
+    """Draw an (n, n) field of variance 1 and exponential correlation, cut from a torus too wide to wrap around."""
     cell_mm = float(axis[1] - axis[0])
     size = len(axis) + int(10 * length_mm / cell_mm)
     lag = np.fft.fftfreq(size, 1 / size) * cell_mm
@@ -282,7 +286,7 @@ def draw_field(axis: FloatArray, rng: np.random.Generator, *, length_mm: float) 
 
 
 def rank_tests(maps: list[MapRanks]) -> list[RankTest]:
-    """One verdict a parameter; none where no map has ranks."""
+    """Test each parameter's ranks; empty where no map has ranks."""
     ranks = np.array([one.ranks for one in maps if one.ranks is not None])
     if not len(ranks):
         return []

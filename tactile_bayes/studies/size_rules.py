@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.forward.plane.study import StudyRow, learn_as_printed
+from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
 from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.eq6 import SizeCalibration
-from tactile_bayes.size.log_quadratic import LogQuadratic, mean_width_mm
 from tactile_bayes.studies.forward_tradeoff import Measured
 
 Sizes = Callable[[float, float, float | None], list[float]]
@@ -21,7 +21,7 @@ Outside = Callable[[float, float, float | None], list[str]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizeRule:
-    """How a width becomes a size.
+    """Rule that converts amplitude and widths to a size.
 
     Parameters
     ----------
@@ -41,20 +41,20 @@ class SizeRule:
     outside_of: Outside | None = None
 
     def size_mm(self, one: Measured) -> float:
-        """Size of a measured map; NaN where its amplitude has none."""
+        """Size of a measured map; NaN where its amplitude allows none."""
         if not one.amplitude > 0:
             return float("nan")
         return max(self.sizes(one.amplitude, one.sigma_x_mm, one.sigma_y_mm))
 
     def outside(self, one: Measured) -> list[str]:
-        """In what a measured map lies outside the calibration's table, in words."""
+        """Quantities of a measured map that lie outside the calibration's table, in words."""
         if self.outside_of is None:
             return []
         return self.outside_of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm)
 
 
 def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
-    """Eq 6 in two stages from a study's rows, each axis of the head its own, and what it leaves of them."""
+    """Learn Eq 6 in two stages from a study's rows, for each axis of the head, and its scatter over the rows."""
     axes = ["x", "y"] if rows[0].sigma_y_mm is not None else ["x"]
     learned = [learn_as_printed(rows, axis=axis) for axis in axes]
 
@@ -75,13 +75,13 @@ def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
 
 def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
     """The point estimate of a calibration of either form; `name` is for people."""
-    if isinstance(calibration, LogQuadratic):
-        return _quadratic_rule(calibration, name)
+    if isinstance(calibration, BodyCalibration):
+        return _body_rule(calibration, name)
     return _eq6_rule(calibration, name)
 
 
 def _eq6_rule(calibration: SizeCalibration, name: str) -> SizeRule:
-    """Eq 6 with the mean coefficients, each axis of the head its own."""
+    """Eq 6 with its mean coefficients for each axis of the head."""
 
     def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
         a = np.array([amplitude])
@@ -97,8 +97,8 @@ def _eq6_rule(calibration: SizeCalibration, name: str) -> SizeRule:
     return SizeRule(sizes, float(calibration.x.draws.mean(axis=0)[4]), f"Eq 6 of {name}", outside)
 
 
-def _quadratic_rule(calibration: LogQuadratic, name: str) -> SizeRule:
-    """The quadratic with its mean coefficients, for a round lump in a body of which nothing is known.
+def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
+    """A calibration over a population with its mean coefficients, for a round lump in a body of which nothing is known.
 
     Notes
     -----
@@ -110,5 +110,5 @@ def _quadratic_rule(calibration: LogQuadratic, name: str) -> SizeRule:
         width = mean_width_mm(sigma_x_mm, sigma_y_mm)
         return [float(np.exp(calibration.log_size(np.log(np.array(amplitude)), np.log(np.array(width)))))]
 
-    scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.mean[6])))
-    return SizeRule(sizes, float(scatter), f"the log-quadratic of {name}", calibration.outside)
+    scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.mean[-3])))
+    return SizeRule(sizes, float(scatter), f"{calibration.form_name} of {name}", calibration.outside)

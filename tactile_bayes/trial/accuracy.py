@@ -31,7 +31,7 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
 
 
 def mape_figure(sizes: ModalitySizes, *, confidence: float) -> Figure:
-    """Percent error with its interval, a mass not found counting 100 %."""
+    """Percent error with its interval; a mass not found counts as 100 %."""
     return figure_with_misses(
         mape_percent, sizes, scale="log", confidence=confidence, weight=alike, missed=lambda _: 100.0
     )
@@ -75,7 +75,7 @@ def median_percent(sizes: ModalitySizes) -> float:
 
 
 def some(values: FloatArray) -> FloatArray:
-    """The values, or `UndefinedError` when there are none."""
+    """Return the values; `UndefinedError` when there are none."""
     if len(values) == 0:
         raise UndefinedError("no mass to average over")
     return values

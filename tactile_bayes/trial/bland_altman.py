@@ -105,7 +105,7 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
 
 
 def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confidence: float = 0.95) -> Limits:
-    r"""Limits for single readings from replicates of an unchanging true size, x and y not paired one by one.
+    r"""Limits for single readings from unpaired replicates of an unchanging true size.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Trend:
 
 
 def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.95) -> Trend:
-    """Proportional bias: slope of the differences on size.
+    """Test proportional bias: slope of the differences on size.
 
     `sizes` are the means of both methods (Bland & Altman 1999) or, when the reference is much the better of the two,
     the reference itself (Krouwer 2008, Stat. Med. 27, 778): against the mean, unequal errors alone make a slope.
@@ -156,7 +156,7 @@ def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.9
 
 
 def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
-    r"""Whether ln y - ln x is likelier to be normal with one SD than y - x is, by a factor of `LIKELIER`.
+    r"""Whether normal ln y - ln x with one SD is likelier than normal y - x, by a factor of `LIKELIER`.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class _Within:
 
     @property
     def restored(self) -> float:
-        """What averaging over replicates took out of the variance of one reading."""
+        """Variance of one reading that averaging over replicates removed."""
         return (1 - 1 / self.harmonic) * self.variance
 
 
@@ -225,7 +225,7 @@ def _from_means(means: FloatArray, within: Sequence[_Within], *, names: Sequence
 def _recovered(
     parts: Sequence[tuple[float, int]], total: float, *, z: float, bias_variance: float, confidence: float
 ) -> Ends:
-    """Outer and inner reach of the interval of a limit, from chi-squared intervals of each variance (Zou 2013)."""
+    """Outer and inner reach of a limit's interval, from chi-squared intervals of each variance (Zou 2013)."""
     from scipy.special import chdtri
 
     tail = 0.5 - 0.5 * confidence

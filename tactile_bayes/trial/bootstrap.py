@@ -19,7 +19,7 @@ _LEAST_DEFINED = 0.99
 
 
 class Intervals(float):
-    """A probability of intervals that also says how they are made; a plain number means the jackknife.
+    """Probability of intervals together with their method; a plain number means the jackknife.
 
     Parameters
     ----------
@@ -44,13 +44,13 @@ class Intervals(float):
 
 
 def method_of(confidence: float) -> Method:
-    """How intervals of this probability are made."""
+    """Method of the intervals of a probability."""
     return confidence.method if isinstance(confidence, Intervals) else "jackknife"
 
 
 @lru_cache(maxsize=8)
 def draw_patients(patients: int, *, resamples: int, seed: int) -> FloatArray:
-    """(resamples, patients) how often each patient is drawn, with replacement; the same for every figure."""
+    """(resamples, patients) how often each patient is drawn, with replacement; equal for every figure."""
     rng = np.random.default_rng([seed, patients])
     draws = rng.multinomial(patients, np.full(patients, 1 / patients), size=resamples).astype(np.float64)
     draws.flags.writeable = False
@@ -58,13 +58,13 @@ def draw_patients(patients: int, *, resamples: int, seed: int) -> FloatArray:
 
 
 def percentile_interval(drawn: FloatArray, *, confidence: float) -> tuple[float, float]:
-    """Quantiles of the redrawn figure: Efron & Tibshirani (1993), ch. 13."""
+    """Percentile interval from quantiles of the redrawn figure: Efron & Tibshirani (1993), ch. 13."""
     low, high = np.quantile(_defined(drawn), [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence])
     return float(low), float(high)
 
 
 def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confidence: float) -> tuple[float, float]:
-    r"""Quantiles corrected for bias and acceleration.
+    r"""BCa interval: quantiles corrected for bias and acceleration.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Calibration of stated uncertainties: probability integral transforms, scores, and the correction they imply.
+"""Calibration of stated uncertainties: probability integral transforms, scores, and the implied correction.
 
 A stated uncertainty becomes a predictive distribution of the size that the caliper will read: normal on the logarithm
 of size, through the stated interval (or mean and SD), widened in quadrature by the caliper's own error.
@@ -22,7 +22,7 @@ BINS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Predictive distributions of log ex-vivo sizes, one a reading, beside what was found.
+    """Predictive distributions of log ex-vivo sizes, one per reading, with the sizes found.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class LevelCoverage:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """How honest the stated uncertainties are.
+    """Figures that show how well the stated uncertainties are calibrated.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Calibration:
 
 
 def calibration(prediction: Prediction, *, confidence: float) -> Calibration | None:
-    """Judge predictions; None without any.
+    """Judge predictions; None when there are none.
 
     Notes
     -----
@@ -165,7 +165,7 @@ def interval_score(prediction: Prediction, *, probability: float) -> FloatArray:
 def log_normal(
     low_mm: float | None, high_mm: float | None, probability: float | None, size_mm: float, sd_mm: float | None
 ) -> tuple[float, float] | None:
-    """Median (log of mm) and SD of the logarithm that a reading states: by its interval, else by size and SD."""
+    """Median (log of mm) and SD of the log of a reading: from its interval, else from size and SD."""
     from scipy.special import ndtri
 
     if low_mm is not None and high_mm is not None and probability is not None and 0 < low_mm < high_mm:
@@ -184,7 +184,7 @@ def predictions(
     masses: Sequence[int],
     patients: Sequence[int],
 ) -> Prediction:
-    """Stated medians and SDs with the caliper's relative error added in quadrature."""
+    """Stated medians and SDs, with the caliper's relative error added in quadrature."""
     found = np.array(ex_vivo_mm, dtype=np.float64)
     caliper = np.array([sd or 0.0 for sd in ex_vivo_sd_mm]) / (found if len(found) else 1.0)
     medians, sds = (np.array([one[i] for one in stated], dtype=np.float64) for i in (0, 1))
@@ -206,7 +206,7 @@ def _level(z: FloatArray, masses: int, level: float, *, confidence: float) -> Le
 
 
 def _scale(z: FloatArray, mass: FloatArray, *, confidence: float) -> tuple[float, tuple[float, float]]:
-    """Root mean square of z, and its chi-squared interval with one degree of freedom a mass."""
+    """Root mean square of z, and its chi-squared interval with one degree of freedom per mass."""
     from scipy.special import chdtri
 
     masses = len(np.unique(mass))

@@ -1,4 +1,4 @@
-"""Cautions about a modality's intervals, given where the data meet their condition."""
+"""Cautions about a modality's intervals, where the data meet a caution's condition."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FEW_MISSES = 3
 
 
 def cautions(sizes: ModalitySizes, *, confidence: float) -> tuple[str, ...]:
-    """Sentences about this modality's intervals; measured shares are in docs/coverage.md."""
+    """Cautions about this modality's intervals; docs/coverage.md has the measured shares."""
     missed = len(sizes.size_mm) - int(sizes.detected.sum())
     if not 0 < missed <= FEW_MISSES or method_of(confidence) == "corrected":
         return ()

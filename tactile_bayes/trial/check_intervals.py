@@ -1,4 +1,4 @@
-"""Coverage of the chosen intervals, in simulated trials of this trial's size and errors."""
+"""Coverage of the chosen intervals in simulated trials with this trial's size and errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """Errors of one modality on the logarithm of size: normal, shared in part by the masses of a patient.
+    """Errors of one modality in log size: normal, partly shared by the masses of a patient.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class ErrorModel:
 
     @property
     def true_mape_percent(self) -> float:
-        r"""Expected percent error, misses at 100 %.
+        r"""Expected percent error; a miss counts as 100 %.
 
         .. math:: E|e^X - 1| = e^{b + s^2/2}(2\Phi(b/s + s) - 1) - (2\Phi(b/s) - 1)
         """
@@ -46,7 +46,7 @@ class ErrorModel:
 
 @dataclass(frozen=True, slots=True)
 class IntervalCheck:
-    """Intervals of the percent error in simulated trials.
+    """Coverage of the percent error's intervals in simulated trials.
 
     Attributes
     ----------
@@ -69,12 +69,12 @@ class IntervalCheck:
 
     @property
     def share(self) -> float:
-        """Share of trials covered."""
+        """Share of trials whose interval covered the true error."""
         return self.covered / self.trials
 
 
 def observed_errors(sizes: ModalitySizes) -> ErrorModel | None:
-    """Errors like those of the trial: mean and SD of log ratios of found masses, share of masses missed."""
+    """Error model of a trial: mean and SD of log ratios of found masses, share of missed masses."""
     found = sizes.only_detected()
     if len(found.size_mm) < 3:
         return None
@@ -90,7 +90,7 @@ def simulate(
     rng: np.random.Generator,
     name: str = "tactile",
 ) -> ModalitySizes:
-    """One trial of these patients and masses with errors drawn from the model."""
+    """Simulate one trial of these patients and masses with errors from the model."""
     n = len(ex_vivo_mm)
     _, index = np.unique(patient, return_inverse=True)
     shared = rng.normal(0, model.patient_sd, index.max() + 1)[index] if model.patient_sd else 0.0
@@ -103,7 +103,7 @@ def simulate(
 def check_intervals(
     sizes: ModalitySizes, model: ErrorModel, *, confidence: float, trials: int, seed: int
 ) -> IntervalCheck | None:
-    """Count how often intervals of the percent error, made as `confidence` says, hold the true one.
+    """Count how often intervals of the percent error, by the method in `confidence`, cover the true one.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def check_intervals(
 def check_all(
     sizes: Mapping[str, ModalitySizes], *, confidence: float, trials: int, seed: int
 ) -> dict[str, IntervalCheck]:
-    """`check_intervals` of every modality with errors to simulate."""
+    """Run `check_intervals` for every modality with errors to simulate."""
     checks = {
         name: check_intervals(one, model, confidence=confidence, trials=trials, seed=seed)
         for name, one in sizes.items()

@@ -36,7 +36,7 @@ class ModalityRatio:
 
 
 def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dict[str, ModalityRatio]:
-    """Every other modality against the tactile one; empty without a tactile one."""
+    """Ratio of every other modality to the tactile one; empty without a tactile one."""
     reference = sizes.get(REFERENCE)
     if reference is None:
         return {}
@@ -57,13 +57,13 @@ def _modality_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidenc
 
 
 def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:
-    """Both modalities on the masses that both have, in the same order."""
+    """Both modalities, limited to their common masses, in the same order."""
     _, of_one, of_other = np.intersect1d(one.mass, other.mass, return_indices=True)
     return one.take(of_one), other.take(of_other)
 
 
 def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> Figure:
-    """The plain quotient of two percent errors, as measured.
+    """Quotient of two percent errors.
 
     The interval leaves each patient out of both at once, so that patients hard for both do not widen it.
     """
@@ -72,7 +72,7 @@ def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: fl
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """A number made from the percent errors of two modalities, ready to be resampled by patients of either."""
+    """A statistic of two modalities' percent errors, which can be resampled by patients."""
 
     sizes: ModalitySizes
     reference: ModalitySizes
@@ -88,17 +88,17 @@ class Pair:
         return Sample(mape_percent, self.sizes, among), Sample(mape_percent, self.reference, among)
 
     def value(self) -> float:
-        """From all patients."""
+        """The statistic from all patients."""
         one, other = (sample.value() for sample in self._samples())
         return self._combined(np.array(one), np.array(other)).item()
 
     def left_out(self) -> FloatArray:
-        """(g,) without each patient."""
+        """(g,) statistic without each patient."""
         one, other = (sample.left_out() for sample in self._samples())
         return self._combined(one, other)
 
     def redrawn(self, draws: FloatArray) -> FloatArray:
-        """(b,) from patients drawn anew."""
+        """(b,) statistic from patients drawn anew."""
         one, other = (sample.redrawn(draws) for sample in self._samples())
         return self.combine(one, other)
 

@@ -12,7 +12,7 @@ from tactile_bayes.trial.readings import IntervalReading
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Intervals of one nominal probability that cover the ex-vivo size: `covered` of `n`, on `masses` masses.
+    """Coverage of the ex-vivo size by intervals of one nominal probability: `covered` of `n`, on `masses` masses.
 
     The ex-vivo size is itself a measurement (+-5 % in the paper), so even honest intervals of the true size cover it a
     little less often than they say.

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import Protocol, assert_never
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,7 @@ Leverage = Callable[[ModalitySizes], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One number about one modality; never NaN or infinite.
+    """A number about one modality, never NaN or infinite.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Figure:
     has_interval: bool = False
 
     def mapped(self, function: Callable[[float], float]) -> Figure:
-        """The figure in other units, by an increasing function; ends beyond double precision leave no interval."""
+        """Convert the figure by an increasing function; ends beyond double precision drop the interval."""
         ends = self.interval
         one = replace(self, value=None if self.value is None else function(self.value))
         if ends is None:
@@ -71,7 +71,7 @@ def figure(
     confidence: float | None = None,
     leverage: Leverage | None = None,
 ) -> Figure:
-    """The statistic of these masses, with an interval over patients when `scale` and `confidence` are given.
+    """Compute a statistic of these masses, with an interval over patients when `scale` and `confidence` are given.
 
     Parameters
     ----------
@@ -94,29 +94,29 @@ def figure(
 
 
 class Resampled(Protocol):
-    """A number that can be had without one patient, or from patients drawn anew."""
+    """A statistic that can be computed without one patient, or from patients drawn anew."""
 
     @property
     def patients(self) -> npt.NDArray[np.int64]:
-        """Those to leave out in turn."""
+        """Patients to leave out in turn."""
         ...
 
     def value(self) -> float:
-        """With all patients; raises `UndefinedError`."""
+        """The statistic from all patients; raises `UndefinedError`."""
         ...
 
     def left_out(self) -> FloatArray:
-        """(g,) without each patient; raises `UndefinedError`."""
+        """(g,) statistic without each patient; raises `UndefinedError`."""
         ...
 
     def redrawn(self, draws: FloatArray) -> FloatArray:
-        """(b,) for each row of (b, g) counts of patients; NaN where there is none."""
+        """(b,) statistic for each row of (b, g) counts of patients; NaN where undefined."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One statistic of one modality, ready to be resampled."""
+    """A statistic of one modality, which can be resampled."""
 
     statistic: Statistic
     sizes: ModalitySizes
@@ -152,7 +152,7 @@ class Sample:
 
 
 def resampled(sample: Resampled, *, scale: Scale, confidence: float, freedom: float | None = None) -> Figure:
-    """A figure with its interval over patients; `freedom` as in `interval_from_values`."""
+    """Compute a figure with its interval over patients; `freedom` as in `interval_from_values`."""
     plain = _plain(sample.value)
     if plain.value is None:
         return replace(plain, has_interval=True, interval_reason=plain.reason)
@@ -168,13 +168,16 @@ def _interval(
     sample: Resampled, value: float, *, scale: Scale, confidence: float, freedom: float | None
 ) -> tuple[float, float]:
     chosen = confidence if isinstance(confidence, Intervals) else Intervals(confidence)
-    if chosen.method in ("corrected", "jackknife"):
-        return interval_from_values(value, sample.left_out(), scale=scale, confidence=float(chosen), freedom=freedom)
-    draws = draw_patients(len(sample.patients), resamples=chosen.resamples, seed=chosen.seed)
-    drawn = sample.redrawn(draws)
-    if chosen.method == "percentile":
-        return percentile_interval(drawn, confidence=float(chosen))
-    return bca_interval(value, drawn, sample.left_out(), confidence=float(chosen))
+    draws = partial(draw_patients, len(sample.patients), resamples=chosen.resamples, seed=chosen.seed)
+    match chosen.method:
+        case "corrected" | "jackknife":
+            left_out = sample.left_out()
+            return interval_from_values(value, left_out, scale=scale, confidence=float(chosen), freedom=freedom)
+        case "percentile":
+            return percentile_interval(sample.redrawn(draws()), confidence=float(chosen))
+        case "bca":
+            return bca_interval(value, sample.redrawn(draws()), sample.left_out(), confidence=float(chosen))
+    assert_never(chosen.method)
 
 
 def _plain(compute: Callable[[], float]) -> Figure:
@@ -185,7 +188,7 @@ def _plain(compute: Callable[[], float]) -> Figure:
 
 
 def finite(statistic: Statistic, sizes: ModalitySizes) -> float:
-    """The statistic's value, or `UndefinedError` where double precision cannot hold it."""
+    """Compute the statistic; `UndefinedError` where double precision cannot hold it."""
     with np.errstate(all="ignore"):
         value = float(statistic(sizes))
     if not abs(value) < LARGEST:

@@ -19,7 +19,7 @@ WIDEST = 1000.0
 
 
 class UndefinedError(Exception):
-    """A figure, or its interval, that the data leave undefined; the message is the reason."""
+    """The data leave a figure or its interval undefined; the message is the reason."""
 
 
 def need_patients(groups: int) -> None:
@@ -36,7 +36,7 @@ def interval_from_values(
     confidence: float,
     freedom: float | None = None,
 ) -> tuple[float, float]:
-    r"""Two-sided interval of a statistic from its values with one patient left out.
+    r"""Two-sided jackknife interval of a statistic from its values with one patient left out.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def interval_from_values(
 
 
 def effective_number(weights: npt.NDArray[np.float64], patient: npt.NDArray[np.int64]) -> float:
-    r"""How many equal patients carry as much as these, :math:`(\sum_g W_g)^2 / \sum_g W_g^2` (Satterthwaite 1946).
+    r"""Effective number of patients, :math:`(\sum_g W_g)^2 / \sum_g W_g^2` (Satterthwaite 1946).
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def kurtosis_freedom(values: npt.NDArray[np.float64]) -> float:
 
 
 def on_scale(values: Values, scale: Scale) -> Values:
-    """The values as they are, their logarithms, or Fisher's z; `UndefinedError` where one has none."""
+    """Transform values to a scale: unchanged, logarithms, or Fisher's z; `UndefinedError` where one has none."""
     if scale == "linear":
         return values
     if scale == "fisher":

@@ -1,4 +1,4 @@
-"""Straight lines between two methods: least squares, Deming and weighted Deming.
+"""Straight lines between two methods: least squares, Deming and weighted Deming regression.
 
 x is the reference and y the method under test. The Deming lines take `error_ratio`, the variance of the error of x over
 that of y, as Linnet (1990) does; 1 is orthogonal regression, and 0 and infinity are the two least-squares lines.
@@ -46,7 +46,7 @@ class Line:
 
 
 def least_squares(x: FloatArray, y: FloatArray, *, weights: FloatArray | None = None) -> Line:
-    """The line of least squared vertical distance, weighted when asked (1/x^2 for a constant relative error).
+    """Fit by least vertical squares, weighted when asked (1/x^2 for a constant relative error).
 
     Raises
     ------
@@ -68,7 +68,7 @@ def least_squares(x: FloatArray, y: FloatArray, *, weights: FloatArray | None = 
 
 
 def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
-    r"""The line of least squared distance when both methods err, each with constant error.
+    r"""Fit a Deming line: both methods err, each with a constant SD.
 
     Notes
     -----
@@ -104,7 +104,7 @@ def weighted_deming(
     max_iterations: int = MAX_ITERATIONS,
     threshold: float = THRESHOLD,
 ) -> Line:
-    r"""Deming's line when both errors grow in proportion to the size: weights 1 over the squared fitted size.
+    r"""Fit a Deming line whose errors grow in proportion to size: weights 1 over the squared fitted size.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def weighted_deming(
 def jackknife_errors(
     fit: Callable[[FloatArray, FloatArray], Line], x: FloatArray, y: FloatArray
 ) -> tuple[float, float]:
-    """Standard errors of intercept and slope by leaving out one pair at a time, as laboratories' programs give them.
+    """Standard errors of intercept and slope from leaving out one pair at a time, as laboratory programs report.
 
     Linnet (1990), (1993): the SD of the pseudo-values over root n; their interval takes Student's t with n - 2 degrees
     of freedom. It is right for independent pairs; masses of one patient are not, so reports use patients instead.
@@ -153,7 +153,7 @@ def jackknife_errors(
 
 
 def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
-    """Deming's slope from the sums of squares of x and y and of their products, by whichever form does not cancel.
+    """Deming's slope from sums of squares and products of x and y, by the formula without cancellation.
 
     Raises
     ------
@@ -172,12 +172,12 @@ def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
 
 
 def all_equal(values: FloatArray) -> bool:
-    """Whether (n,) values, at least one, differ by no more than rounding."""
+    """Whether (n,) values, n > 0, differ by rounding only."""
     return bool(np.ptp(values) <= EQUAL * np.abs(values).max())
 
 
 def centred(values: FloatArray, mean: float) -> FloatArray:
-    """(n,) values about their mean, or zeros where they differ by rounding only."""
+    """(n,) values less their mean; zeros where they differ by rounding only."""
     off = values - mean
     return np.zeros_like(off) if all_equal(values) else off
 
@@ -190,7 +190,7 @@ def student(freedom: float, *, confidence: float) -> float:
 
 
 def _by_size(x: FloatArray, y: FloatArray, intercept: float, slope: float, error_ratio: float) -> FloatArray:
-    """1 over the squared size that the line gives each pair."""
+    """1 over the squared size at each pair by the line."""
     off = y - intercept - slope * x
     share = off / (1 + error_ratio * slope**2)
     size = (x + error_ratio * slope * share + error_ratio * (y - share)) / (1 + error_ratio)

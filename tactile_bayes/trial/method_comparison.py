@@ -31,7 +31,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class MethodComparison:
-    """What the detected masses say of one modality as a method of measurement.
+    """Comparison of one modality's detected sizes with excision.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class MethodComparison:
 
 
 def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0) -> MethodComparison:
-    """Compare the detected sizes of one modality with excision."""
+    """Compare one modality's detected sizes with excision."""
     found = sizes.only_detected()
     x, y = found.ex_vivo_mm, found.size_mm
     robust = _Fit(partial(passing_bablok, confidence=float(confidence)))
@@ -91,13 +91,13 @@ def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float, rob
 
 
 def _squared_distance(sizes: ModalitySizes) -> FloatArray:
-    """(n,) what each ex-vivo size adds to their variance: how much the mass bears on a slope."""
+    """(n,) contribution of each ex-vivo size to their variance, the leverage of a mass on a slope."""
     share = sizes.ex_vivo_mm / sizes.ex_vivo_mm.max()
     return np.asarray((share - share.mean()) ** 2)
 
 
 def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[str, Statistic, Scale]]:
-    """Every figure with its name and the scale of its interval."""
+    """All figures with their names and the scales of their intervals."""
     demings = partial(_deming_slope, error_ratio=error_ratio)
     fits = (
         ("weighted_deming", _Fit(partial(weighted_deming, error_ratio=error_ratio))),
@@ -172,7 +172,7 @@ def _sd(sums: FloatArray) -> FloatArray:
 
 
 class _Fit:
-    """A line that several figures are parts of: not fitted twice in a row to the same masses."""
+    """A line that several figures share, fitted once to the same masses."""
 
     def __init__(self, fit: Callable[[FloatArray, FloatArray], Line | PassingBablok]) -> None:
         self._fit = fit
@@ -189,7 +189,7 @@ class _Fit:
 
 
 def _guarded(statistic: Statistic) -> Statistic:
-    """The statistic, refusing what has no squares."""
+    """Wrap a statistic to be undefined where the sums of squares vanish."""
     if isinstance(statistic, SumStatistic):
         return SumStatistic(lambda sizes: statistic.terms(_checked(sizes)), statistic.finish, statistic.undefined)
     return lambda sizes: statistic(_checked(sizes))
@@ -228,7 +228,7 @@ def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ra
 def _jackknifed(
     fit: Callable[[FloatArray, FloatArray], Line], x: FloatArray, y: FloatArray, *, confidence: float
 ) -> dict[str, Ends | None]:
-    """Intervals by leaving out one mass at a time, n - 2 degrees of freedom: customary where there is no formula."""
+    """Intervals by leaving out one mass at a time, n - 2 degrees of freedom: usual where no formula exists."""
     line = _or_none(partial(fit, x, y)) if 3 < len(x) <= MOST_REFITTED else None
     errors = None if line is None else _or_none(partial(jackknife_errors, fit, x, y))
     if line is None or errors is None:

@@ -1,4 +1,4 @@
-"""Figures that count a missed mass as size 0, with intervals that allow for misses not yet seen.
+"""Figures that count a missed mass as size 0, with intervals that allow for misses not yet observed.
 
 Where one mass in 25 is missed, a trial of 25 has none, one or two misses, and each moves the mean error by some 3
 points. Leaving out or redrawing patients sees only the misses that occurred: without any, the interval allows for none.
@@ -30,7 +30,7 @@ def figure_with_misses(
     weight: Callable[[ModalitySizes], FloatArray],
     missed: Callable[[ModalitySizes], float],
 ) -> Figure:
-    r"""A weighted mean over masses, found and missed, with an interval over patients.
+    r"""Weighted mean over masses, found and missed, with an interval over patients.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def figure_with_misses(
 
 
 def share_interval(share: float, number: float, *, confidence: float) -> Ends:
-    """Equal-tailed interval of a proportion under Jeffreys' prior; it holds the share observed (Brown et al. 2001).
+    """Equal-tailed interval of a proportion with Jeffreys' prior; it contains the observed share (Brown et al. 2001).
 
     Parameters
     ----------
@@ -79,15 +79,15 @@ def share_interval(share: float, number: float, *, confidence: float) -> Ends:
 
 
 def alike(sizes: ModalitySizes) -> FloatArray:
-    """Weight 1 for each mass."""
+    """Equal weights of 1."""
     return np.ones_like(sizes.ex_vivo_mm)
 
 
 def by_size(sizes: ModalitySizes) -> FloatArray:
-    """Weight by ex-vivo size, over the largest."""
+    """Weights by ex-vivo size, over the largest."""
     return np.asarray(sizes.ex_vivo_mm / sizes.ex_vivo_mm.max())
 
 
 def by_square(sizes: ModalitySizes) -> FloatArray:
-    """Weight by squared ex-vivo size, over the largest."""
+    """Weights by squared ex-vivo size, over the largest."""
     return by_size(sizes) ** 2

@@ -41,7 +41,7 @@ PRIOR_MISS = 1 / 3
 
 
 class Draws(Protocol):
-    """What a sampler returns."""
+    """Result of a sampler."""
 
     @property
     def theta(self) -> FloatArray:
@@ -50,12 +50,12 @@ class Draws(Protocol):
 
     @property
     def diagnostics(self) -> Mapping[str, float]:
-        """Figures of convergence."""
+        """Convergence diagnostics."""
         ...
 
 
 class Sampler(Protocol):
-    """Draws from a vectorised log density about its mode."""
+    """Function that draws from a vectorised log density about its mode."""
 
     def __call__(
         self, log_density: Any, centre: FloatArray, covariance: FloatArray, /, *, rng: np.random.Generator
@@ -64,7 +64,7 @@ class Sampler(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """One modality: draws of its parameters and of the percent error that the next mass would have on average.
+    """Posterior of one modality: draws of its parameters and of the next mass's expected percent error.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True)
 class NextMass:
-    """All modalities, and for every pair the probability that the first errs less on the next mass."""
+    """Posteriors of all modalities, and for every pair the probability that the first errs less on the next mass."""
 
     posteriors: Mapping[str, Posterior]
     probability_less_error: Mapping[str, float]
@@ -114,7 +114,7 @@ class NextMass:
         }  # fmt: skip
 
     def lines(self) -> list[str]:
-        """Text for people."""
+        """Text lines of the report."""
         lines = ["Bayesian errors-in-variables model, beside the table above and not instead of it:"]
         for name, one in self.posteriors.items():
             error, found, bias, slope = (
@@ -249,7 +249,7 @@ class LogModel:
         self._patients = int(self._patient.max()) + 1
 
     def start(self) -> tuple[FloatArray, FloatArray]:
-        """A guess of the mode and of the covariance about it."""
+        """Starting values of the mode, and the covariance about it."""
         off = self._y - self._x
         residual = max(float(off.std()), 0.02)
         within2 = max(self._within / self._freedom, 1e-4) if self._freedom else residual**2
@@ -276,7 +276,7 @@ class LogModel:
         return np.asarray(log_like + log_prior(theta, spread=self.spread, caliper=self.caliper))
 
     def _patients_part(self, rho2: FloatArray, off: FloatArray, precision: FloatArray) -> FloatArray:
-        """What a shared patient effect adds to independent masses (Woodbury, patient by patient)."""
+        """Log-likelihood contribution of the shared patient effect (Woodbury, patient by patient)."""
         sums = np.zeros((2, len(rho2), self._patients))
         for row, values in enumerate((off, precision)):
             np.add.at(sums[row].T, self._patient, values.T)
@@ -286,7 +286,7 @@ class LogModel:
 
 
 def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Variances of ln size between patients, between masses of a patient and between readings of a mass.
+    """Variances of ln size: between patients, between masses of a patient, between readings of a mass.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray:
-    r"""(m,) unnormalised log prior; the Jacobians of the logarithm and the logits are in it.
+    r"""(m,) unnormalised log prior, with the Jacobians of logarithms and logits.
 
     Parameters
     ----------
@@ -332,7 +332,7 @@ def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray
 
 
 def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArray) -> FloatArray:
-    r"""(n,) mean of :math:`100 |y/\xi - 1|` for one reading of a new mass, a miss counting 100.
+    r"""(n,) mean of :math:`100 |y/\xi - 1|` for one reading of a new mass; a miss counts as 100.
 
     On the logarithm the error is normal; its size-dependent mean is averaged over normal sizes like the trial's.
     """
@@ -345,7 +345,7 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
 
 
 def _total_variance(log_sd: FloatArray) -> FloatArray:
-    """The variance of ln size; logarithms so far out that the prior excludes them are clipped, against overflow."""
+    """Variance of ln size, clipped against overflow where the prior excludes it anyway."""
     return np.asarray(np.exp(2 * np.clip(log_sd, -14, 5)))
 
 

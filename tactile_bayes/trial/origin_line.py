@@ -1,4 +1,4 @@
-"""The line through zero that the paper draws, and the three figures that are all called r squared.
+"""The paper's line through zero, with three figures that are all called r squared.
 
 The paper names no convention for r squared; its printed 0.14 can only be the centred or Pearson's (shared reading of
 Fig. 10), so the centred one leads. The regression is of sizes y on ex-vivo sizes e.
@@ -18,7 +18,7 @@ from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
 
 def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
-    """Slope and r squared with masses not found at size 0 (the paper's convention), then over detected masses only."""
+    """Slope and r squared with missed masses at size 0 (the paper's convention), then over detected masses only."""
     result: dict[str, Figure] = {}
     for suffix, subset in (("", sizes), ("_detected", sizes.only_detected())):
         result[f"slope_through_origin{suffix}"] = figure_with_misses(
@@ -87,7 +87,7 @@ r2_pearson = SumStatistic(_terms_of_varied_pairs, lambda sums: _pearson(sums) **
 
 
 def _scaled(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
-    """Ex-vivo sizes and sizes over the largest ex-vivo size, so that squares neither overflow nor vanish."""
+    """Sizes over the largest ex-vivo size, so that squares neither overflow nor vanish."""
     unit = some(sizes.ex_vivo_mm).max()
     return sizes.ex_vivo_mm / unit, sizes.size_mm / unit
 

@@ -1,4 +1,4 @@
-"""Angles of the lines through all pairs of points, in order: listed, or counted when there are many."""
+"""Ordered angles of the lines through all pairs of points: listed, or counted when there are many."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PairAngles:
             self.number = len(self._angles)
 
     def below(self, angle: float, *, inclusive: bool) -> int:
-        """How many angles are below `angle` (in (-pi/2, pi/2)), or not above it when inclusive."""
+        """Number of angles below `angle` (in (-pi/2, pi/2)), or not above it when inclusive."""
         if not self._counted:
             return int(np.searchsorted(self._angles, angle, side="right" if inclusive else "left"))
         slope = math.copysign(1.0, angle) if abs(angle) == math.pi / 4 else math.tan(angle)
@@ -53,7 +53,7 @@ class PairAngles:
         return _inversions(self._x, z, ties=inclusive) + upright - (self._coincident if inclusive else 0)
 
     def ranked(self, rank: int) -> float:
-        """The angle of this rank, from 1."""
+        """The angle of a rank, from 1."""
         if not self._counted:
             return float(self._angles[rank - 1])
         low, high = -math.pi / 2, math.pi / 2
@@ -71,20 +71,20 @@ class PairAngles:
         return high
 
     def shift(self, *, rising: bool) -> int:
-        """Twice the shift of the median's rank: angles beyond 45 degrees against the line, those on it by half."""
+        """Twice the shift of the median's rank: one for each angle beyond 45 degrees against the line, half at it."""
         if rising:
             return self.below(-math.pi / 4, inclusive=True) + self.below(-math.pi / 4, inclusive=False)
         on_or_above = self.number - self.below(math.pi / 4, inclusive=False)
         return -(on_or_above + self.number - self.below(math.pi / 4, inclusive=True))
 
     def exactly_on_the_shift(self, *, rising: bool) -> int:
-        """How many angles are exactly 45 degrees against the line."""
+        """Number of angles exactly 45 degrees against the line."""
         at = -math.pi / 4 if rising else math.pi / 4
         return self.below(at, inclusive=True) - self.below(at, inclusive=False)
 
 
 def kendall_sign(x: FloatArray, y: FloatArray) -> int:
-    """Sign of Kendall's tau: of concordant less discordant pairs."""
+    """Sign of Kendall's tau: concordant less discordant pairs."""
     if len(x) <= MOST_LISTED:
         first, second = np.triu_indices(len(x), 1)
         return int(np.sign(np.sum(np.sign(x[second] - x[first]) * np.sign(y[second] - y[first]))))
@@ -111,7 +111,7 @@ def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _next_share(rank: int, count_low: int, count_high: int, widths: Sequence[float]) -> float:
-    """Where in the bracket to count next: by proportion, a hair to either side in turn so that both ends close in.
+    """Where to count next in the bracket: by interpolation, offset to alternate sides so that both ends close in.
 
     Where that does not shrink the bracket eightfold in three steps, its middle.
     """
@@ -124,14 +124,14 @@ def _next_share(rank: int, count_low: int, count_high: int, widths: Sequence[flo
 
 
 def _pairs_of_equals(rows: FloatArray) -> int:
-    """How many pairs of equal rows there are in (n, k) sorted rows."""
+    """Number of pairs of equal rows in (n, k) sorted rows."""
     new = np.any(rows[1:] != rows[:-1], axis=1)
     lengths = np.diff(np.concatenate([[-1], np.flatnonzero(new), [len(rows) - 1]]))
     return int(np.sum(lengths * (lengths - 1) // 2))
 
 
 def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
-    """Pairs of ascending x whose z descends; with `ties`, also those whose z is equal, points of equal x and z too."""
+    """Number of pairs of ascending x whose z descends; with `ties`, also pairs of equal z, or of equal x and z."""
     order = np.lexsort((z, x))
     ordered = z[order]
     index = np.arange(len(z))
@@ -142,7 +142,7 @@ def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
 
 
 def _inversions_of_permutation(rank: npt.NDArray[np.int64]) -> int:
-    """Pairs out of order, bit by bit: within equal higher bits, every 1 before a 0."""
+    """Number of inversions, counted bit by bit: within equal higher bits, every 1 before a 0."""
     total = 0
     for bit in reversed(range(max(1, int(len(rank) - 1).bit_length()))):
         group, one = rank >> (bit + 1), (rank >> bit) & 1

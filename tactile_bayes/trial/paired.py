@@ -49,7 +49,7 @@ class PairedComparison:
 def paired_comparisons(
     sizes: Mapping[str, ModalitySizes], *, confidence: float, seed: int = 0
 ) -> list[PairedComparison]:
-    """Every pair of modalities on their common set, p values corrected by Holm's method."""
+    """Compare every pair of modalities on their common masses, with Holm's correction of p values."""
     pairs = [
         _compare(sizes[one], sizes[other], confidence=confidence, seed=seed) for one, other in combinations(sizes, 2)
     ]
@@ -58,7 +58,7 @@ def paired_comparisons(
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """P values corrected for their number, None left out: Holm (1979), Scand. J. Statist. 6, 65."""
+    """Correct p values for their number, leaving None out: Holm (1979), Scand. J. Statist. 6, 65."""
     known = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0
@@ -69,7 +69,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float | None:
-    """Two-sided p value of a sum of patients' differences, each as likely up as down.
+    """Two-sided p value of a sum of patients' differences, by a permutation test that flips their signs.
 
     Parameters
     ----------

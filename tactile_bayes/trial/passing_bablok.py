@@ -22,7 +22,7 @@ Measure = Literal["radian", "tangent"]
 
 @dataclass(frozen=True, slots=True)
 class PassingBablok:
-    """The line, and its intervals at the probability they were asked for; ends may be infinite for few masses."""
+    """A Passing-Bablok line with its intervals; ends may be infinite for few masses."""
 
     intercept: float
     slope: float

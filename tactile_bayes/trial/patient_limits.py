@@ -1,4 +1,4 @@
-"""Limits of agreement with intervals over patients, which need neither normal differences nor one mass a patient.
+"""Limits of agreement with intervals over patients, for differences of any distribution and any masses per patient.
 
 The exact and the approximate intervals that other programs print take the masses as independent and the differences as
 normal; they are in `bland_altman` and stand beside these in the JSON report.
@@ -50,7 +50,7 @@ def _limit(
 def _recovered(
     terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
 ) -> Ends:
-    """The limit's interval from those of the mean and, on the logarithm, of the SD (Zou 2013, see `bland_altman`)."""
+    """Interval of a limit from those of the mean and, on the log scale, of the SD (Zou 2013, see `bland_altman`)."""
     mean, around = _jackknifed(SumStatistic(terms, _mean, _ONE), found, scale="linear", confidence=confidence)
     sd, about = _jackknifed(SumStatistic(terms, _sd, _ONE), found, scale="log", confidence=confidence)
     limit = mean + sign * _SHARE * sd
@@ -62,7 +62,7 @@ def _recovered(
 def _jackknifed(
     statistic: SumStatistic, found: ModalitySizes, *, scale: Scale, confidence: float
 ) -> tuple[float, Ends]:
-    """A value and its jackknife interval, with the degrees of freedom that its leave-one-out values have."""
+    """Value with its jackknife interval, and the degrees of freedom of its leave-one-out values."""
     sample = Sample(statistic, found)
     value, left = sample.value(), sample.left_out()
     freedom = kurtosis_freedom(np.asarray(on_scale(left, scale)))
@@ -95,7 +95,7 @@ def _mean(sums: FloatArray) -> FloatArray:
 
 
 def _sd(sums: FloatArray) -> FloatArray:
-    """SD of one difference: that of the masses' means, and what averaging over replicates took out of it."""
+    """SD of one difference: that of the masses' means, plus the part that averaging over replicates removed."""
     n, _, first, second, inverse, squares, freedom = np.moveaxis(sums, -1, 0)
     between = ratio(second - first**2 / n, n - 1)
     within = np.where(freedom > 0.5, ratio(squares, freedom), 0.0)

@@ -26,12 +26,12 @@ LEVEL = 0.05
 
 @dataclass(frozen=True, slots=True)
 class PlanCase:
-    """One design under one assumption of errors: everything that its simulation depends on.
+    """One design with assumed errors: all that its simulation depends on.
 
     Attributes
     ----------
     patients, maps
-        Patients with one mass each, and tactile maps a mass.
+        Patients with one mass each, and tactile maps per mass.
     tactile_bias, mass_sd, map_sd
         Of ln(size / ex vivo): mean, SD shared by all maps of a mass, SD of single maps.
     other_bias, other_sd, other_miss
@@ -52,13 +52,13 @@ class PlanCase:
 
     @property
     def key(self) -> str:
-        """Unique among the designs of one plan."""
+        """Unique key among the designs of one plan."""
         return f"{self.patients} patients, {self.maps} maps"
 
 
 @dataclass(frozen=True, slots=True)
 class PlanResult:
-    """What trials of one design find.
+    """Results of the simulated trials of one design.
 
     Attributes
     ----------
@@ -85,14 +85,14 @@ class PlanResult:
 
 
 def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) -> Iterator[PlanCase]:
-    """Every number of patients with every number of maps."""
+    """All combinations of numbers of patients and numbers of maps."""
     for n in patients:
         for m in maps:
             yield PlanCase(patients=n, maps=m, **assumptions)
 
 
 def run_case(case: PlanCase) -> dict[str, Any]:
-    """Simulate the trials of one design; plain data, so that it can travel between processes."""
+    """Simulate the trials of one design; returns plain data that can be sent between processes."""
     found = [_trial(case, trial) for trial in range(case.trials)]
     wins = sum(one.won for one in found)
     return PlanResult(
@@ -106,7 +106,7 @@ def run_case(case: PlanCase) -> dict[str, Any]:
 
 
 def map_gains(results: Mapping[tuple[int, int], PlanResult | Mapping[str, Any]]) -> list[dict[str, float | int]]:
-    """What each further map brings at the same number of patients: change of power and of tactile error.
+    """Gain from each further map at the same number of patients: change of power and of tactile error.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class _Found:
 
 
 def _trial(case: PlanCase, number: int) -> _Found:
-    """One trial; designs that differ in maps alone meet the same masses, which makes their difference sharp."""
+    """Simulate one trial; designs that differ only in maps get the same masses, for a precise difference."""
     n, rng = case.patients, np.random.default_rng([case.seed, case.patients, number])
     ex_vivo = MEDIAN_MM * np.exp(rng.normal(0, SIZE_LOG_SD, n))
     shared = rng.normal(case.tactile_bias, case.mass_sd, n)
@@ -183,7 +183,7 @@ def _plain(result: PlanResult | Mapping[str, Any]) -> Mapping[str, Any]:
 def assumptions_from(
     tactile: ModalitySizes, other: ModalitySizes, *, map_sd: float | None = None
 ) -> dict[str, float] | None:
-    """Errors like those of a pilot trial: bias, SDs between and within masses, share missed.
+    """Errors of a pilot trial: bias, SDs between and within masses, share missed.
 
     Parameters
     ----------

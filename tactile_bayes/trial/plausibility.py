@@ -1,4 +1,4 @@
-"""Plausibility of a trial's units: sizes no lump has, and modalities that differ from excision by a factor of 10."""
+"""Plausibility of a trial's units: impossible sizes, and modalities that differ from excision tenfold."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NEAR = 1.6
 
 
 def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> list[str]:
-    """One sentence for each thing that looks like another unit than mm; empty where nothing does.
+    """One sentence for each column that seems to be in another unit than mm; empty if none does.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Shares k of n with exact intervals."""
+"""Exact intervals of a proportion k of n."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readings of masses by several modalities, checked against one another and gathered a mass at a time."""
+"""Readings of masses by several modalities, checked for consistency and grouped by mass."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MassKey = tuple[str, str]  # patient, mass
 
 
 class CellFault(Protocol):
-    """Makes the error for one cell; whoever read the columns knows the file and the line of each row."""
+    """Function that makes the error for one cell, with the file and line of its row."""
 
     def __call__(self, row: int, column: str, what: str, /, *, way_out: str) -> BadDataError: ...
 
@@ -62,7 +62,7 @@ class IntervalReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModalitySizes:
-    """What one modality says of n masses, in the order of patient and mass, whatever the order of the rows.
+    """Sizes of n masses by one modality, ordered by patient and mass whatever the order of the rows.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class ModalitySizes:
         return np.unique(self.patient)
 
     def only(self, keep: npt.NDArray[np.bool_]) -> ModalitySizes:
-        """The same modality on the masses where `keep` is true; counts of readings and of masses left out go to 0."""
+        """Copy with only the masses where `keep` is true; counts of readings and of masses left out become 0."""
         return ModalitySizes(
             name=self.name,
             patient=self.patient[keep],
@@ -126,7 +126,7 @@ class ModalitySizes:
         )
 
     def take(self, masses: npt.NDArray[np.int64]) -> ModalitySizes:
-        """The masses at these indices, as often as each is named; for resampling."""
+        """Copy with the masses at these indices, repeated as given; for resampling."""
         return ModalitySizes(
             name=self.name,
             patient=self.patient[masses],
@@ -137,20 +137,20 @@ class ModalitySizes:
         )
 
     def only_detected(self) -> ModalitySizes:
-        """The masses that this modality found."""
+        """Copy with only the masses that this modality found."""
         return self.only(self.detected)
 
     def only_replicated(self) -> ModalitySizes:
-        """The masses with two or more detected replicates."""
+        """Copy with only the masses that have two or more detected replicates."""
         return self.only(np.array([len(sizes) > 1 for sizes in self.replicates_mm], dtype=bool))
 
     def without(self, patient: int) -> ModalitySizes:
-        """All masses but those of one patient."""
+        """Copy without the masses of one patient."""
         return self.only(self.patient != patient)
 
 
 def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFault) -> list[Reading]:
-    """Readings from the columns of a trial table, with the rules that tie one cell of a row to another.
+    """Make readings from a trial table's columns, checking rules between the cells of a row.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
 
 
 def _status(row: int, status: str | None, size_mm: float | None, *, fault: CellFault) -> str:
-    """The status, checked against the size; a row blank in both was not done."""
+    """Status of a row, checked against the size; a row without both was not done."""
     if status is None and size_mm is None:
         return "not_done"
     if status is None:

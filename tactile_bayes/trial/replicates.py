@@ -1,4 +1,4 @@
-"""Repeatability as a ratio, and the sources of the scatter of sizes: masses, readers or maps."""
+"""Repeatability as a ratio, and components of the scatter of sizes: masses, readers and maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PAIR = 1.959963984540054 * math.sqrt(2)
 
 
 def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
-    """Figures of replicates on the logarithm of size, over masses with two or more.
+    """Figures of replicates in log size, over masses with two or more.
 
     `repeatability_low_percent` and `repeatability_high_percent` bound the change between two readings of one mass in
     95 % of pairs; they are not symmetric, for +50 % and -33 % are the same step up and down.
@@ -34,14 +34,14 @@ def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
 
 
 def _swapped(one: Figure) -> Figure:
-    """A figure that falls as its source rises has its ends the other way round."""
+    """Figure whose ends are swapped, because it falls as its source rises."""
     from dataclasses import replace
 
     return one if one.interval is None else replace(one, interval=(one.interval[1], one.interval[0]))
 
 
 def _logs(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Number, mean and sum of squares about the mean of the logarithms of each mass's replicates."""
+    """Number, mean and sum of squares about the mean of each mass's log sizes."""
     if not sizes.replicates_mm:
         raise UndefinedError("no mass has two detected replicates")
     number = np.array([len(group) for group in sizes.replicates_mm], dtype=np.float64)
@@ -77,7 +77,7 @@ icc = SumStatistic(_log_terms, _icc, undefined="one mass, or no scatter at all, 
 def reader_components(
     log_sizes: Sequence[float], masses: Sequence[object], readers: Sequence[str | None]
 ) -> Components | None:
-    """Variances of the logarithm of size between masses, between readers and between maps, by REML.
+    """Variances of log size between masses, between readers and between maps, by REML.
 
     Readings without a reader are left out when any has one. None where nothing was replicated.
     """

@@ -28,7 +28,7 @@ FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (accuracy.figures, orig
 
 @dataclass(frozen=True, slots=True)
 class ModalityReport:
-    """Counts, figures and coverage of one modality; `n` masses were looked for."""
+    """Counts, figures and coverage of one modality on its `n` masses."""
 
     name: str
     n: int
@@ -51,7 +51,7 @@ class ModalityReport:
 
 @dataclass(frozen=True, slots=True)
 class TrialReport:
-    """All modalities, their percent errors over the tactile one's, every pair of them, and what was counted.
+    """Reports of all modalities, ratios to the tactile one, paired comparisons, and counts.
 
     `sizes` are those that the figures were made from; `ex_vivo_sd_mm` is by the number of the mass. `doubts` says what
     looks like another unit than mm.
@@ -80,7 +80,7 @@ def summarise(
     ex_vivo_sd_mm: Mapping[MassKey, float | None] | None = None,
     seed: int = SEED,
 ) -> TrialReport:
-    """Compare each modality's sizes with excision.
+    """Summarise a trial: compare each modality's sizes with excision.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def summarise(
 
 
 class _Beside:
-    """What single readings say beside their sizes: readers and stated uncertainties, modality by modality."""
+    """Readers and stated uncertainties of the single readings, by modality."""
 
     def __init__(
         self,
@@ -137,7 +137,7 @@ class _Beside:
         self._masses, self._patients = mass_numbers(ex_vivo_mm), patient_numbers(ex_vivo_mm)
 
     def components(self, modality: str) -> Components | None:
-        """Variances of the logarithm of size between masses, readers and maps."""
+        """Variances of log size between masses, readers and maps."""
         found = self._found.get(modality, [])
         logs = [math.log(one.size_mm) for one in found if one.size_mm is not None]
         return reader_components(logs, [one.key for one in found], [one.reader for one in found])
@@ -169,7 +169,7 @@ def _stated(reading: Reading) -> tuple[float, float] | None:
 def modality_report(
     sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0, beside: _Beside | None = None
 ) -> ModalityReport:
-    """Counts, all families' figures and the coverage of one modality."""
+    """Report one modality: counts, all figures, coverage."""
     prediction = None if beside is None else beside.prediction(sizes.name)
     n, detected = len(sizes.size_mm), int(sizes.detected.sum())
     return ModalityReport(

@@ -31,31 +31,31 @@ class SumStatistic:
     undefined: str = "the masses do not determine it"
 
     def __call__(self, sizes: ModalitySizes) -> float:
-        """The figure of these masses."""
+        """Compute the statistic of these masses."""
         value = float(self.finish(self.terms(sizes).sum(axis=0)))
         if np.isnan(value):
             raise UndefinedError(self.undefined)
         return value
 
     def left_out(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
-        """(g,) the figure without each of the patients in turn; one of none of the masses changes nothing."""
+        """(g,) statistic without each patient in turn; a patient without a mass changes nothing."""
         terms = self.terms(sizes)
         return self.finish(terms.sum(axis=0) - self.by_patient(terms, sizes, patients))
 
     def redrawn(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
-        """(b,) the figure for each row of (b, g) `draws`: how often each patient was drawn."""
+        """(b,) statistic for each row of (b, g) `draws`: how often each patient was drawn."""
         return self.finish(draws @ self.by_patient(self.terms(sizes), sizes, patients))
 
     @staticmethod
     def by_patient(terms: FloatArray, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
-        """(g, k) the terms added up within each patient."""
+        """(g, k) sums of the terms within each patient."""
         sums = np.zeros((len(patients), terms.shape[1]))
         np.add.at(sums, np.searchsorted(patients, sizes.patient), terms)
         return sums
 
 
 def columns(*values: FloatArray | float) -> FloatArray:
-    """(n, k) array of k columns, each of length n or one number for all."""
+    """(n, k) array of k columns, each of length n or one number for all rows."""
     return np.stack(np.broadcast_arrays(*values), axis=-1).astype(np.float64)
 
 

@@ -42,7 +42,7 @@ class _Mass:
 
 
 def trial_csv(seed: int = SEED) -> str:
-    """The readings: three to five tactile maps with 95 % intervals, one ultrasound and one examination of each mass."""
+    """Readings as CSV: three to five tactile maps with 95 % intervals, one ultrasound and one examination per mass."""
     rng = np.random.default_rng([seed, 1])
     rows = [_HEADER]
     for index, mass in enumerate(_masses(seed), start=1):
@@ -55,7 +55,7 @@ def trial_csv(seed: int = SEED) -> str:
 
 
 def excision_csv(seed: int = SEED) -> str:
-    """The sizes after excision, with the caliper's +-5 % as a standard deviation."""
+    """Sizes after excision as CSV, with the caliper's +-5 % as a standard deviation."""
     rows = ["patient,mass,ex_vivo_mm,ex_vivo_second_mm,sd_mm,synthetic"]
     for mass in _masses(seed):
         sd_mm = CALIPER_SHARE * mass.size_mm

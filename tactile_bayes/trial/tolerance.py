@@ -56,7 +56,7 @@ def content_factor(n: int, *, content: float, confidence: float) -> float:
 
 
 def _radius(shift: FloatArray, content: float) -> FloatArray:
-    """r with Phi(shift + r) - Phi(shift - r) = content."""
+    """Solve Phi(shift + r) - Phi(shift - r) = content for r."""
     from scipy.special import ndtr, ndtri
 
     low, high = np.zeros_like(shift), np.abs(shift) + float(ndtri(0.5 + 0.5 * content)) + 1e-9
@@ -83,7 +83,7 @@ def _chi_nodes(freedom: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _root(function: Callable[[float], float], target: float) -> float:
-    """Where an increasing function reaches the target, to 1e-12 of its size, by bisection."""
+    """Solve an increasing function for a target by bisection, to 1e-12 of its size."""
     low, high = -1.0, 1.0
     while function(high) < target and high < 1e12:
         low, high = high, 4 * high

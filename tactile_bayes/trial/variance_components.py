@@ -31,7 +31,7 @@ class Components:
 
 
 def components(y: FloatArray, mass: Index, reader: Index) -> Components:
-    """REML variances.
+    """Estimate the variances by REML.
 
     Parameters
     ----------
@@ -61,12 +61,12 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
 
 
 def _variance(ratio: float, residual: float) -> float:
-    """The variance at this ratio of SDs; 0 where the search has gone to its lower end."""
+    """Variance at a ratio of SDs; 0 where the search ended at its lower limit."""
     return 0.0 if ratio < 1e-6 else float(ratio**2 * residual)
 
 
 class _Problem:
-    """Sums that the criterion needs, gathered once: by mass, by reader and by pair of the two."""
+    """Sums that the REML criterion needs: by mass, by reader and by pair of the two."""
 
     def __init__(self, y: FloatArray, mass: Index, reader: Index) -> None:
         masses, readers = int(mass.max()) + 1, int(reader.max()) + 1
@@ -107,7 +107,7 @@ class _Problem:
 
 
 def _least(function: _Criterion, start: FloatArray) -> FloatArray:
-    """The minimum by Newton's method with differences, kept downhill; the better of a few starts."""
+    """Minimum by Newton's method with finite differences, kept downhill; the best of a few starts."""
     found = [_descend(function, start * factor) for factor in (1.0, 0.2, 5.0)]
     return min(found, key=function)
 

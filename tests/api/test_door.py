@@ -167,7 +167,7 @@ BAD: dict[str, tuple[Any, type[Exception], str]] = {
     "settings that contradict": (
         lambda f: tb.estimate(f / "map.nc", noise="independent", scene="round", size_calibration="none"),
         UsageError,
-        "goes with correlated errors",
+        "needs correlated errors",
     ),
     "a map to pool": (lambda f: tb.pool(f / "map.nc"), UsageError, "give a list"),
     "no map to pool": (lambda _: tb.pool([]), UsageError, "no map to pool"),

@@ -17,7 +17,8 @@ from tactile_bayes.forward.tissue import SolidLump
 
 Run = Callable[..., "CompletedProcess[str]"]
 TRUE_MM = 15.0
-STEPS = ["map", "estimate", "map", "calibrate", "estimate", "validate"]
+MAP, OUTPUT = ["my demo/map.nc"], ["-o", "my demo/posterior_eq6.nc", "--force"]
+STEPS = ["map", "estimate", "estimate", "validate"]
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,8 @@ def test_it_shows_the_default_road_first_and_ends_with_truth_and_results(shown: 
     first_map, first_estimate = typed(shown)[:2]
     assert "--normalise" not in first_map
     assert "--size-calibration" not in first_estimate
+    assert typed(shown)[2][1:] == [*MAP, "--size-calibration", "eq6", "--method", "ensemble", *OUTPUT]
+    assert "Eq 6 lies -" in shown.stdout
     summary = shown.stdout.partition("Largest size of the lump")[2]
     assert re.search(rf"^true +{TRUE_MM:.1f}$", summary, flags=re.MULTILINE)
     assert shown.stdout.rstrip().endswith("Research use only: not a diagnostic device.")
@@ -71,7 +74,7 @@ def test_the_scan_is_of_a_body_that_the_calibration_has_seen(run_cli: Run, place
 def test_it_leaves_every_file_behind_for_its_owner_only(shown: CompletedProcess[str], place: Path) -> None:
     assert shown.returncode == 0
     files = {path.name: path for path in (place / "my demo").iterdir()}
-    made = {"scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "map.nc", "size.json", "posterior.nc"}
+    made = {"scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "map.nc", "posterior.nc", "posterior_eq6.nc"}
     assert made | {"size.png", "map.png", "trial.json", "trial.html"} <= set(files)
     assert {path.stat().st_mode & 0o777 for path in files.values()} == {0o600}
 

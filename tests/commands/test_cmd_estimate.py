@@ -343,7 +343,7 @@ def test_a_checkpoint_goes_on_where_it_stopped(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "keys", "message"),
     [
-        (["a.nc", "--scene", "round"], {"noise": "independent"}, "goes with correlated errors"),
+        (["a.nc", "--scene", "round"], {"noise": "independent"}, "needs correlated errors"),
         (["a.nc", "b.nc"], {"checkpoint": "c.npz"}, "a checkpoint is of one map"),
         (["a.nc"], {"noise": "field", "background": "free", "checkpoint": "c.npz"}, "give --method ensemble"),
     ],

@@ -59,8 +59,8 @@ def test_each_shipped_calibration_opens_and_says_what_it_was_made_of(name: str) 
     assert path is not None
     document = json.loads(path.read_text())
     read_size_calibration(path)  # trusted: what comes with the program is held against its schema here
-    schema = "size_quadratic" if document.get("form") == "log-quadratic" else "size_calibration"
-    check_document(document, f"{schema}.schema.json", path=path)
+    schemas = {"log-quadratic": "size_quadratic", "eq6-population": "size_population_eq6", "eq6": "size_calibration"}
+    check_document(document, f"{schemas[document['form']]}.schema.json", path=path)
     assert document["provenance"]["command"].startswith("calibrate size")
     assert document["provenance"]["inputs"]
 
@@ -120,10 +120,13 @@ def test_none_gives_widths_and_a_map_made_otherwise_says_why_it_has_no_size(fold
 def test_a_pooled_mass_keeps_its_schema_and_its_maps(pooled: dict, folder: Path) -> None:
     check_document(pooled, "pooled.schema.json", path=Path("stdout"))
     assert [one["map"] for one in pooled["maps"]] == ["mass1.nc", "mass2.nc", "mass3.nc"]
-    alone = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)["max_size_mm"]
-    size = pooled["max_size_mm"]
+    alone = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)
+    size, another = pooled["max_size_mm"], pooled["another_exam"]["max_size_mm"]
+    of_one = alone["another_exam"]["max_size_mm"]
     assert size["low"] < size["median"] < size["high"]
-    assert size["high"] - size["low"] < 0.8 * (alone["high"] - alone["low"])
+    assert another["low"] < size["low"]
+    assert size["high"] < another["high"]
+    assert another["high"] - another["low"] < 0.8 * (of_one["high"] - of_one["low"])
     assert sum(pooled["variance_share"].values()) == pytest.approx(100.0)
     assert (folder / "size.png").read_bytes().startswith(b"\x89PNG")
 
@@ -182,7 +185,7 @@ def test_a_known_seat_moves_the_size(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["mass1.nc", "--known", "weather", "1"], 2, "nothing of weather; it knows depth_mm"),
+        (["mass1.nc", "--known", "weather", "1"], 2, "no property weather; it has depth_mm"),
         (["mass1.nc", "--known", "depth_mm", "0"], 2, "depth_mm is 0"),
         (["mass1.nc", "--known", "seat", "-1"], 2, "seat is -1"),
         (["mass1.nc", "mass2.nc", "--pool", "--size-calibration", "none"], 2, "--pool needs a size calibration"),

@@ -14,6 +14,7 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.population import BodyPrior, centred, draw_mass
 from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.population_eq6 import PopulationEq6
 from tactile_bayes.studies.population import MassRow, measure_mass
 
 
@@ -75,11 +76,26 @@ def test_a_calibration_is_learned_from_a_table(table: Path, tmp_path: Path) -> N
     assert run_here("show", "size.json", cwd=tmp_path).returncode == 0
 
 
+def test_eq6_is_learned_from_the_same_table(table: Path, tmp_path: Path) -> None:
+    """The rows follow d = e^(1.2 + 0.3 ln a + ln sigma): f is -0.3 and m / e is e^1.2."""
+    done = run_here("calibrate", "size", table, "--form", "eq6", "-o", "size.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "40 bodies, 80 maps" in done.stdout
+    found = read_size_calibration(tmp_path / "size.json")
+    assert isinstance(found, PopulationEq6)
+    assert float(found.log_size(np.array(-1.0), np.array(1.4))) == pytest.approx(2.3, abs=0.04)
+    constants = found.constants()
+    assert constants["f"] == pytest.approx(-0.3, abs=0.05)
+    assert constants["m"] / constants["e"] == pytest.approx(np.exp(1.2), rel=0.15)
+    shown = run_here("show", "size.json", cwd=tmp_path)
+    assert "eq6-population" in shown.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--fit-radius-mm", "10"], 2, "--fit-radius-mm is for --form eq6"),
-        (["--seed", "4"], 2, "--seed is for --form eq6"),
+        (["--fit-radius-mm", "10"], 2, "--fit-radius-mm is for tables of lumps"),
+        (["--seed", "4"], 2, "--seed is for tables of lumps"),
     ],
 )
 def test_what_the_table_fixes_cannot_be_declared(table: Path, tmp_path: Path, arguments, code, words) -> None:

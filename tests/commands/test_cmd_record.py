@@ -266,7 +266,7 @@ def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, 
         process = start(devices, preexec_fn=little_room)
         _, err = process.communicate(timeout=20)
     assert process.returncode == 3
-    assert "cannot be written on (File too large)" in err
+    assert "cannot be written any further (File too large)" in err
     assert err.count("\n") == 1
     assert "`tactile-bayes repair`" in err
     assert len(read_scan_report(tmp_path / "a.mcap").scan.frames) > 50

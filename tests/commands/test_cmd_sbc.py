@@ -133,7 +133,7 @@ def test_a_map_that_fails_is_named_and_the_others_count(tmp_path: Path, monkeypa
     ("arguments", "words"),
     [
         (["--maps", "0"], "--maps"),
-        (["--method", "ensemble"], "--method"),
+        (["--method", "optimise"], "--method"),
         (["--seed", "-1"], "--seed"),
         (["--maps", "2", "-o", "nowhere/s.csv"], "nowhere"),
     ],

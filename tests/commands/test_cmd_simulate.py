@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from subprocess import CompletedProcess
 
+import pytest
+
 from tactile_bayes.files.scan_mcap import read_scan_report
 
 Run = Callable[..., "CompletedProcess[str]"]
@@ -45,3 +47,15 @@ def test_mistakes_end_in_one_line_and_their_code(run_cli: Run, tmp_path: Path) -
     assert done.returncode == 2
     assert "--force" in done.stderr
     assert (tmp_path / "a.mcap").read_text() == "mine"
+
+
+@pytest.mark.parametrize(("depth_ratio", "warns"), [(1.5, True), (0.8, False)])
+def test_a_lump_outside_the_empirical_models_range_is_warned_of(
+    run_cli: Run, tmp_path: Path, depth_ratio: float, warns: bool
+) -> None:
+    text = f"[scene]\nseed = 4\nduration_s = 0.2\n[body]\n[[lump]]\nd_mm = 20\ndepth_ratio = {depth_ratio}\n"
+    (tmp_path / "scene.toml").write_text(text)
+    done = run_cli("simulate", "scene.toml", "-o", "scan.mcap", "--fidelity", "empirical", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert ("warning: h/d 1.5: the empirical model" in done.stderr) == warns
+    assert ("warning" in done.stderr) == warns

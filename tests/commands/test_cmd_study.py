@@ -173,6 +173,8 @@ def test_four_figures_are_drawn(folder: Path, run_cli: Run) -> None:
     assert done.returncode == 0, done.stderr
     for number in (5, 6, 7, 8):
         assert (folder / "figures" / f"figure_{number}.png").read_bytes().startswith(PNG)
+    assert (folder / "figures" / "four_lumps.png").read_bytes().startswith(PNG)
+    assert "figure 5b: " in done.stderr
     again = run_cli(*words, cwd=folder)
     assert again.returncode == EXIT_USAGE
     assert "figure_5.png exists" in again.stderr

@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
 
-from tactile_bayes.commands.tables import tables_text
 from tactile_bayes.errors import EXIT_BAD_DATA
+from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.plane.study import LineFit
-from tactile_bayes.forward.plane.tables import OTHER_DEFINITIONS, Agreement, phantom_scenes, table_scenes
+from tactile_bayes.forward.plane.tables import (
+    NEAREST_HEADS,
+    OTHER_DEFINITIONS,
+    PRINTED_FRAMES,
+    PRINTED_MAPS,
+    TABLE_DEPTH_RATIOS,
+    TABLE_DIAMETERS_MM,
+    TRIED_HEADS,
+    Agreement,
+    phantom_scenes,
+    table_distance,
+    table_scenes,
+)
+from tactile_bayes.report.tables_text import heads_text, tables_text
 
 Run = Callable[..., "CompletedProcess[str]"]
 
@@ -23,7 +37,8 @@ def agreement(scene) -> Agreement:
 
 
 def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> None:
-    text = tables_text([agreement(s) for s in table_scenes(0.0)], [agreement(s) for s in phantom_scenes(0.0)])
+    lumps, phantoms = [agreement(s) for s in table_scenes(0.0)], [agreement(s) for s in phantom_scenes(0.0)]
+    text = tables_text(lumps, phantoms, head=Head())
     assert text.startswith("MSD = sum of squared differences over the sum of squares of the elastic model")
     assert "5.0 (4.1)" in text
     assert "1.0 (2.7)" in text
@@ -32,6 +47,39 @@ def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> No
     assert "phantom 18.75 mm" in text
     assert "root mean square over the largest      20.0 (20.0 to 20.0)  15.0 (15.0 to 15.0)" in text
     assert max(map(len, text.splitlines()[1:])) <= 100
+    beside = tables_text(lumps, phantoms, head=Head(), nearest=TRIED_HEADS[0], beside=lumps)
+    assert "5.0 / 5.0 (4.1)" in beside
+    assert "the head nearest to the print: R 13 mm, shoulders-inside of 3 mm" in beside
+
+
+def test_the_distance_from_the_printed_tables_is_0_for_them_and_is_what_ranks_the_heads() -> None:
+    def printed(more: float) -> list[Agreement]:
+        rows = []
+        for scene in table_scenes(0.0):
+            column = TABLE_DIAMETERS_MM.index(scene.d_mm)
+            frame, of_map = PRINTED_FRAMES[scene.depth_ratio][column], PRINTED_MAPS[scene.depth_ratio][column]
+            rows.append(replace(agreement(scene), centred_frame=(frame + more) / 100, map=(of_map + more) / 100))
+        return rows
+
+    assert set(PRINTED_MAPS) == set(TABLE_DEPTH_RATIOS)
+    assert table_distance(printed(0.0)) == pytest.approx(0.0, abs=1e-12)
+    assert table_distance(printed(1.5)) == pytest.approx(1.5)
+    text = heads_text({TRIED_HEADS[0]: printed(2.0), TRIED_HEADS[1]: printed(0.5)})
+    assert text.index("shoulders-outside") < text.index("shoulders-inside")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seat", NEAREST_HEADS)
+def test_the_nearest_head_is_the_one_that_the_search_finds(seat: float, run_cli: Run) -> None:
+    document = json.loads(run_cli("tables", "--seat", f"{seat:g}", "--heads", "--json").stdout)
+    assert len(document["heads"]) == len(TRIED_HEADS)
+    first = min(document["heads"], key=lambda head: head["distance"])
+    nearest = NEAREST_HEADS[seat]
+    assert (first["radius_mm"], first["shoulder_mm"], first["shoulders"]) == (
+        nearest.radius_mm,
+        nearest.shoulder_mm,
+        nearest.shoulders,
+    )
 
 
 @pytest.mark.slow

@@ -153,6 +153,7 @@ CALIBRATIONS = {
     "record": ("record", "-o", "s.json", "--head", "/dev/nothing", "--size-calibration", "s.json", "--force"),
     "replay": ("replay", "scan.mcap", "-o", "s.json", "--size-calibration", "s.json", "--force"),
     "estimate": ("estimate", "map.nc", "--size-calibration", "s.json", "-o", "s.json", "--force"),
+    "tradeoff map": ("tradeoff", "estimate", "m.nc", "--size-calibration", "s.json", "--figure", "link.png", "--force"),
     "tradeoff": ("tradeoff", "forward", "--size-calibration", "s.json", "--figure", "link.png", "--force"),
 }
 

@@ -167,7 +167,7 @@ TEXTS: dict[str, tuple[str, tuple[Read, ...], str]] = {
     "half a character": (
         '{"schema": "tactile-bayes/estimate/1", "x": "\\ud800"}',
         JSON_READERS,
-        "x holds half a character",
+        "x holds a broken character",
     ),
     "NUL": ('{"schema": "tactile-bayes/estimate/1", "x": "a\\u0000b"}', JSON_READERS, r"x holds the character U\+0000"),
     "NUL in TOML": ('checkpoint = "a\\u0000b"', TOML_READERS, r"checkpoint holds the character U\+0000"),

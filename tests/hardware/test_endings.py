@@ -233,4 +233,4 @@ def test_a_tracker_on_the_heads_port_is_told(tmp_path, run_cli):
         url = emulator._link.url
         done = run_cli("record", "-o", "a.mcap", "--head", url, "--like", "scan.mcap", cwd=tmp_path)
     assert done.returncode == 4
-    assert done.stderr == f"error: head {url}: 'emulated tracker' is there, without taxels; give a head's port\n"
+    assert done.stderr == f"error: head {url}: 'emulated tracker' is a device without taxels; give a head's port\n"

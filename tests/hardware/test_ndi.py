@@ -126,7 +126,7 @@ def test_a_tracker_that_stops_answering_is_told():
     tracker = NdiTracker(FakeLibrary([7] * 10), "/dev/ttyUSB0")
     for _ in range(4):
         assert tracker.pose() is None
-    with pytest.raises(DeviceError, match=r"BX was not done \(error 7\)"):
+    with pytest.raises(DeviceError, match=r"BX failed \(error 7\)"):
         tracker.pose()
 
 
@@ -135,8 +135,8 @@ def test_a_tracker_that_stops_answering_is_told():
     [
         (FakeLibrary(device=None), None, "cannot be opened; check its cable"),
         (FakeLibrary(enabled=()), None, "it has no tool; plug one in, or give --tracker-rom"),
-        (FakeLibrary(refuse={"TSTART": 0x2A}), None, r"TSTART was not done \(error 42\)"),
-        (FakeLibrary(), "tool.txt", "description .*tool.txt was not taken"),
+        (FakeLibrary(refuse={"TSTART": 0x2A}), None, r"TSTART failed \(error 42\)"),
+        (FakeLibrary(), "tool.txt", "description .*tool.txt was refused"),
     ],
     ids=["closed", "no tool", "refused", "no description"],
 )

@@ -212,5 +212,5 @@ def test_options_that_mean_nothing_are_refused():
         instrument_of(scan, normalise="gain")
     with pytest.raises(BadDataError, match=r"cell_mm is -1; it must be positive"):
         MapGrid(np.eye(4), -1)
-    with pytest.raises(BadDataError, match="one pose a frame"):
+    with pytest.raises(BadDataError, match="one pose per frame"):
         fed(scan, []).add(scan.frames.counts[:3], poses_of(scan).part(slice(2)))

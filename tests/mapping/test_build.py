@@ -293,7 +293,10 @@ REFUSED = {
         too_few_taxels,
         r"no frame has 90 % of its taxels valid \(the best has 89.1 %\); repair the array",
     ),
-    "turned all round": (lambda: stroke_scan(yaw_deg=3.0 * np.arange(120)), "turned all round .*keep its direction"),
+    "turned all round": (
+        lambda: stroke_scan(yaw_deg=3.0 * np.arange(120)),
+        "turned in all directions .*keep its direction",
+    ),
     "at right angles": (on_edge, "degrees apart; check the quaternion order"),
 }
 

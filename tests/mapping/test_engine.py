@@ -96,7 +96,7 @@ def test_a_long_job_is_compiled_and_a_short_one_is_not(monkeypatch):
     assert isinstance(choose_engine("auto", readings=1_440_000 * 416), NumpyEngine)
     with pytest.raises(UsageError, match="pip install 'tactile-bayes"):
         choose_engine("fast", readings=1)
-    with pytest.raises(UsageError, match="'gpu'; choose one of auto, numpy, fast"):
+    with pytest.raises(UsageError, match="'gpu'; give one of auto, numpy, fast"):
         choose_engine("gpu", readings=1)
 
 

@@ -12,7 +12,6 @@ from tactile_bayes.abstention import CODES
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.posterior import estimate, search
 from tactile_bayes.posterior.abstention import extend_advice, fault_code, missing_strokes, shape_fault
-from tactile_bayes.posterior.assessment import ModalBump
 from tactile_bayes.posterior.correlated import draw as methods
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.bump import BumpPrior
@@ -25,9 +24,9 @@ FIELD = FitOptions(background="free", noise="field")
 WHITE = 0.01 * np.random.default_rng(4).standard_normal((51, 51))
 
 
-def run(values: np.ndarray, **options: object) -> Estimate:
+def run(values: np.ndarray, *, count: np.ndarray | int = 40, **options: object) -> Estimate:
     settings = EstimateOptions(fit=FIELD, **options)  # type: ignore[arg-type]
-    return estimate_map(grid_map(values), calibration=None, options=settings, rng=np.random.default_rng(1))
+    return estimate_map(grid_map(values, count=count), calibration=None, options=settings, rng=np.random.default_rng(1))
 
 
 def cut(*, right: int) -> np.ndarray:
@@ -95,6 +94,17 @@ def test_rises_at_the_rim_of_an_empty_map_do_not_ask_for_strokes() -> None:
     assert found.code == "undetected"
     assert found.reason.startswith("no lump found on the 26 cm2")
     assert "strokes" not in found.advice
+
+
+def test_a_spot_that_a_few_frames_made_is_no_lump() -> None:
+    """In cells of 3 readings for 29, as at the corner of an empty scan; the control has 15 there."""
+    values = bump_values(x=18.0, y=-18.0, sigma_x=2.0, sigma_y=2.0) + WHITE
+    x = np.arange(51) - 25.0
+    corner = (x[None, :] > 12.0) & (x[:, None] < -12.0)
+    few, enough = (run(values, count=np.where(corner, readings, 29)) for readings in (3, 15))
+    assert few.status == "no_estimate"
+    assert any("its cells hold 3 readings, where 29 are typical" in one.fault for one in few.candidates)
+    assert enough.status == "estimate"
 
 
 @pytest.mark.parametrize("centre", [(26.0, 0.0), (0.0, -300.0), (float("nan"), 0.0)])
@@ -172,8 +182,8 @@ def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
         fit, detection, fault, scene = seen.fit, seen.detection, "", seen.scene
         drawings = 0
 
-        def bump(self) -> ModalBump:
-            return ModalBump(0.3, 0.0, 0.0, *widths)
+        def widths_mm(self) -> tuple[float, float]:
+            return widths
 
         def draw(self, *given: object, **named: object) -> object:
             Odd.drawings += 1

@@ -10,6 +10,7 @@ import pytest
 from in_process import run_here
 from posterior_maps import bump_values, correlated_field, grid_map
 
+from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import estimate_map
@@ -69,6 +70,18 @@ def test_a_larger_lump_far_away_is_no_rib_under_a_small_one() -> None:
     found, _ = looked(values(second=0.1) + level, SMALL)
     assert found.scene is not None
     assert found.scene.fit.scene.extra != "rib"
+
+
+def test_a_place_without_a_mode_is_no_rise(monkeypatch: pytest.MonkeyPatch) -> None:
+    tactile_map = grid_map(values(second=0.1))
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    found = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
+
+    def no_mode(*_: object, **__: object) -> None:
+        raise NotConvergedError("no mode")
+
+    monkeypatch.setattr("tactile_bayes.posterior.correlated.estimate.look", no_mode)
+    assert other_rises(tactile_map, found, options) == ()
 
 
 @pytest.fixture(scope="module")

@@ -128,6 +128,18 @@ def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show(
     assert whole.count("Another rise stands at") == 9
 
 
+def test_a_calibration_is_named_whole_whatever_its_name_holds() -> None:
+    """A file "size (2).json" was called "size": the name was cut at the first bracket."""
+    full, quantities = crowded()
+    assert full.diagnostics is not None
+    words = {"calibration": "calibration size (2).json", "size_calibration": "Sizes by the calibration size (2).json"}
+    named = replace(full, diagnostics=replace(full.diagnostics, **words))
+    assert "Quality: sizes by the calibration size (2).json; method" in estimate_summary(
+        named, quantities, probability=0.9
+    )
+    assert "sizes by" not in estimate_summary(full, quantities, probability=0.9)  # the control: no calibration
+
+
 def test_no_report_says_that_something_changed_by_nothing(folder: Path) -> None:
     """The control is the number that was printed so: minus 0.04 SD."""
     assert f"{-0.04:+.1f}" == "-0.0"

@@ -349,6 +349,9 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
     for module, _ in COMMANDS.values():
         top = importlib.import_module(f"tactile_bayes.commands.{module}").command
         for command in commands(top):
-            found += [one.type for one in command.params if one.name in ("figure", "map_figure")]
-    assert len(found) == 6  # map, two of estimate, sbc, tradeoff estimate and forward
+            found += [
+                one.type for one in command.params if one.name in ("figure", "map_figure", "trace", "rank", "corner")
+            ]
+    # map, calibrate size, two of estimate, three of diagnose, head design, compare-model, sbc, and three of tradeoff
+    assert len(found) == 13
     assert all(isinstance(one, FigurePath) for one in found)

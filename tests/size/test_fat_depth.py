@@ -103,13 +103,13 @@ def test_the_spread_between_bodies_is_what_the_depth_leaves(learned) -> None:
 def test_profiles_of_other_bodies_are_worth_nothing() -> None:
     """The control: the depth must not seem to help where it says nothing."""
     shuffled = learn_log_quadratic(table(known_fat=False), recipe=RECIPE)
-    assert shuffled.fat_cubic is not None
-    with_depth, without = (one.fit["left_out_sd"] for one in (shuffled.fat_cubic, shuffled))
+    assert shuffled.with_fat is not None
+    with_depth, without = (one.fit["left_out_sd"] for one in (shuffled.with_fat, shuffled))
     assert with_depth > 0.95 * without
 
 
 def test_one_depth_is_the_cubic_there(learned) -> None:
-    cubic, w = learned.fat_cubic, 0.3
+    cubic, w = learned.with_fat, 0.3
     u, v = np.random.default_rng(2).normal(size=(2, 9))
     whole = cubic_terms(u, v, np.full(9, w)) @ cubic.mean[:-3]
     at_one = monomials((u, v), powers(3)) @ (cubic.contraction(w + cubic.centre[2]) @ cubic.mean[:-3])
@@ -136,7 +136,7 @@ def test_a_map_that_does_not_tell_is_sized_without_and_says_so(learned) -> None:
 
 
 def test_a_depth_beyond_the_tables_is_not_used(learned) -> None:
-    narrow = replace(learned, fat_cubic=replace(learned.fat_cubic, fat_mm=(12.0, 13.0)))
+    narrow = replace(learned, with_fat=replace(learned.with_fat, fat_mm=(12.0, 13.0)))
     assert narrow.at_fat([one_profile(np.log(12.5))]).fat_mm == pytest.approx(12.5, rel=0.02)
     assert "table: 12 to 13 mm" in narrow.at_fat([one_profile(np.log(20.0))]).fat_note
 
@@ -159,7 +159,7 @@ def test_maps_of_a_mass_share_one_depth(learned) -> None:
 
 
 def test_maps_whose_fat_is_of_different_depth_are_doubted_to_be_of_one_body(learned) -> None:
-    noisy = replace(learned.fat_cubic, depth=replace(learned.fat_cubic.depth, log_sd=0.04))
+    noisy = replace(learned.with_fat, depth=replace(learned.with_fat.depth, log_sd=0.04))
     assert noisy.depths_apart([one_profile(2.6), None, one_profile(2.7)]) is None  # 0.10 within 3 x sqrt(2) x 0.04
     assert noisy.depths_apart([one_profile(2.6), None, one_profile(2.8)]) == pytest.approx(np.exp([2.6, 2.8]), rel=0.02)
     assert noisy.depths_apart([one_profile(2.6)]) is None
@@ -180,8 +180,8 @@ def test_maps_without_a_profile_are_left_out_of_the_cubic_only() -> None:
     some[::5] = np.nan
     learned = learn_log_quadratic(replace(full, profile=some), recipe=RECIPE)
     assert learned.fit["maps"] == 500
-    assert learned.fat_cubic is not None
-    assert learned.fat_cubic.fit["maps"] == 400
+    assert learned.with_fat is not None
+    assert learned.with_fat.fit["maps"] == 400
 
 
 def test_figures_that_are_missing_or_cannot_be_are_no_profile() -> None:

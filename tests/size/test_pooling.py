@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 
 from tactile_bayes.errors import UsageError
+from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
 from tactile_bayes.size.elongation import ShapePrior, elongation, turned
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import (
-    BetweenMaps,
-    ShapeDraws,
-    SizePriors,
-    outlying_maps,
-    pool_maps,
-    pooled_size,
-)
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
 
 BODY_SD = 0.08
 
@@ -73,12 +67,55 @@ def test_three_maps_average_what_differs_between_them_and_not_what_they_share():
 
 def test_the_spread_between_maps_is_learned_from_them():
     prior = BetweenMaps()
-    alike = pooled([shape(2.7 + 0.005 * i, seed=i) for i in range(5)])
-    apart = pooled([shape(2.7 + 0.3 * (i - 2), seed=i) for i in range(5)])
-    alone = pooled([shape(2.7)])
-    assert alike.figures["between_map_sd"] < 0.6 * prior.median
-    assert apart.figures["between_map_sd"] > 2 * prior.median
-    assert alone.figures["between_map_sd"] == pytest.approx(prior.median, rel=0.1)
+    priors = SizePriors(between_maps=prior)
+    alike = pooled([shape(2.7 + 0.005 * i, seed=i) for i in range(5)], priors=priors)
+    apart = pooled([shape(2.7 + 0.3 * (i - 2), seed=i) for i in range(5)], priors=priors)
+    alone = pooled([shape(2.7)], priors=priors)
+    assert alike.figures["between_map_sd"] < 0.6 * prior.sd
+    assert apart.figures["between_map_sd"] > 1.5 * prior.sd
+    assert alone.figures["between_map_sd"] == pytest.approx(prior.sd, rel=0.05)
+
+
+def test_one_exam_has_the_spread_of_simulated_exams_and_another_one_that_of_the_papers_maps():
+    """In the mean square once: 2 % of the calibration here, 15 % of Wellman & Howe (1999), section 4."""
+    size = pooled([shape(2.7)])
+    assert size.another_exam is not None
+    this, another = (np.log(one.max_size_mm) for one in (size, size.another_exam))
+    assert this.std() == pytest.approx(np.sqrt(BODY_SD**2 + 0.02**2 + 0.01**2), rel=0.03)
+    assert another.std() == pytest.approx(np.sqrt(BODY_SD**2 + 0.15**2 + 0.01**2), rel=0.05)
+    assert np.median(another) == pytest.approx(np.median(this), abs=0.01)
+    assert size.figures["between_map_sd"] == pytest.approx(0.02, rel=0.05)
+    assert size.another_exam.figures["between_map_sd"] == pytest.approx(0.15, rel=0.05)
+
+
+def test_a_spread_that_is_stated_leaves_one_interval():
+    size = pooled([shape(2.7)], priors=SizePriors(between_maps=BetweenMaps(0.05, 0.0), another_exam=None))
+    assert size.another_exam is None
+    assert size.figures["between_map_sd"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("maps", [1, 3])
+def test_both_intervals_hold_what_they_say(maps):
+    """Nominal 95 %: exams as alike as the calibration's for the one, as far apart as the paper's for the other."""
+    rng, trials = np.random.default_rng(11), 400
+    held = {"this": 0, "another": 0, "this where exams differ by 15 %": 0}
+    for _ in range(trials):
+        true, body, apart = 2.7, rng.normal(0, BODY_SD), rng.standard_normal(maps)
+        for tau in (0.02, 0.15):
+            seeds = rng.integers(1 << 30, size=maps)
+            draws = [shape(float(true - body + tau * z), seed=int(s)) for z, s in zip(apart, seeds, strict=True)]
+            size = pooled_size(draws, calibration=calibration(), priors=SizePriors(), rng=rng, number=500)
+            assert size.another_exam is not None
+            one = size if tau < 0.1 else size.another_exam
+            low, high = np.quantile(np.log(one.max_size_mm), [0.025, 0.975])
+            held["this" if tau < 0.1 else "another"] += low <= true <= high
+            low, high = np.quantile(np.log(size.max_size_mm), [0.025, 0.975])
+            held["this where exams differ by 15 %"] += tau > 0.1 and low <= true <= high
+    share = {name: count / trials for name, count in held.items()}
+    assert 0.92 < share["this"] < 0.98
+    assert 0.92 < share["another"] < 0.98
+    # the negative control: the narrower interval where exams differ as the paper's
+    assert share["this where exams differ by 15 %"] < 0.90
 
 
 @pytest.mark.parametrize(("tau", "maps"), [(0.05, 3), (0.15, 3), (0.3, 5)])
@@ -91,7 +128,7 @@ def test_intervals_of_pooled_masses_cover(tau, maps):
         true, body = 2.7, rng.normal(0, BODY_SD)
         centres = true - body + rng.normal(0, tau, maps)
         draws = [shape(float(c), seed=int(rng.integers(1 << 30))) for c in centres]
-        for name, priors in (("learned", SizePriors()), ("left out", KNOWN_0)):
+        for name, priors in (("learned", SizePriors(between_maps=BetweenMaps())), ("left out", KNOWN_0)):
             size = pooled_size(draws, calibration=calibration(), priors=priors, rng=rng, number=1500)
             low, high = np.quantile(np.log(size.max_size_mm), [0.05, 0.95])
             inside[name] += low <= true <= high
@@ -169,7 +206,7 @@ def test_what_is_known_of_the_body_is_used_and_what_the_calibration_does_not_kno
     assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.004)
     left = 1 - 0.024**2 / 0.12 / BODY_SD**2
     assert known.std() == pytest.approx(np.hypot(BODY_SD * np.sqrt(left), 0.01), rel=0.04)
-    with pytest.raises(UsageError, match="nothing of weather"):
+    with pytest.raises(UsageError, match="no property weather"):
         pooled([shape(2.7)], priors=SizePriors(known={"weather": 1.0}), use=use)
 
 

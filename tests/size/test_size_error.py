@@ -22,8 +22,9 @@ from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.posterior import drawn
 from tactile_bayes.posterior.assessment import MapDraws
 from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
-from tactile_bayes.size.pooling import BetweenMaps, ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.posterior import push_sizes
 
 SEEDS = 24
@@ -163,7 +164,7 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
         return drawn.Drawn(MapDraws(None, None, draws, None, {}), size, None, None)
 
     monkeypatch.setattr(drawn, "_drawn", once)
-    for options in (EstimateOptions(), EstimateOptions(accuracy_sd=0.01), EstimateOptions(accuracy_mm=0.02)):
+    for options in (EstimateOptions(), EstimateOptions(accuracy_sd=0.01), EstimateOptions(accuracy_mm=0.005)):
         asked.clear()
         found = drawn.draw_sized(None, None, None, options, rng=np.random.default_rng(2), progress=None)
         size = found.size.summarise("max_size_mm", probability=PROBABILITY)

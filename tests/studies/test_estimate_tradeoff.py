@@ -1,9 +1,12 @@
-"""`tradeoff estimate`: the ladder's rows, its advice, and what it says of a map without a lump."""
+"""`tradeoff estimate`: its reference, what it finds wrong, and what it says of maps at the extremes."""
 
 from __future__ import annotations
 
 import itertools
 import json
+import math
+import re
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -12,109 +15,298 @@ from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
-from posterior_maps import bump_map, correlated_field, grid_map
+from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.report.tradeoff_estimate import advice, draw_tradeoff, tradeoff_document, tradeoff_text
-from tactile_bayes.studies import estimate_tradeoff as tradeoff
-from tactile_bayes.studies.estimate_tradeoff import Measured, Tradeoff, measure
+from tactile_bayes.files.schema import check_document
+from tactile_bayes.inference import importance as importance_module
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.pipeline.one_map import estimate_inputs
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.report.ladder_advice import advice
+from tactile_bayes.report.ladder_document import ladder_document
+from tactile_bayes.report.ladder_figure import draw_ladder
+from tactile_bayes.report.ladder_text import ladder_text
+from tactile_bayes.size.calibration import Calibration
+from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.studies import estimate_tradeoff as study
+from tactile_bayes.studies.cost_ladder import Ladder, PooledRow, Priced, Reference, priced
+from tactile_bayes.studies.estimate_tradeoff import Estimator, measure
+from tactile_bayes.studies.size_answers import SIZE, SizeAnswer, deviation
 
 Run = Callable[..., "CompletedProcess[str]"]
 
 
-def errors() -> np.ndarray:
-    rng = np.random.default_rng(3)
-    return 0.005 * rng.standard_normal((51, 51)) + 0.01 * correlated_field(rng, 51, length_cells=4.0)
+def field_map(*, seed: int = 3, half_mm: float = 25.0, **bump: float) -> TactileMap:
+    """A bump under errors that correlate over 4 mm, as a scan's do."""
+    rng, n = np.random.default_rng(seed), 2 * round(half_mm) + 1
+    errors = 0.005 * rng.standard_normal((n, n)) + 0.01 * correlated_field(rng, n, length_cells=4.0)
+    return grid_map(bump_values(half_mm=half_mm, **bump) + errors, normalise="gain")
+
+
+def inputs_of(tactile_map: TactileMap) -> tuple[Calibration | None, EstimateOptions]:
+    calibration, options, _ = estimate_inputs(Settings(), tactile_map)
+    return calibration, options
+
+
+def estimator_of(tactile_map: TactileMap, calibration: Calibration | None = None) -> Estimator:
+    return Estimator(tactile_map, calibration or inputs_of(tactile_map)[0], 1, time.process_time)
+
+
+def ladder_of(tactile_map: TactileMap, **chosen: object) -> Ladder:
+    """A ladder of few settings, each run once, under a clock that ticks once a look."""
+    ticks = itertools.count()
+    calibration, options = inputs_of(tactile_map)
+    with pytest.MonkeyPatch.context() as patch:
+        few = {"FIELDS": (8, 24), "RADII_MM": (8.0,), "ACCURACIES_SD": (0.01,), "CHAIN_ACCURACIES_SD": ()} | chosen
+        few |= {"LONG_RUNS": (("importance", 0.01),), "LAPLACE_DRAWS": (400,)}
+        for name, value in few.items():
+            patch.setattr(study, name, value)
+        return measure(
+            tactile_map,
+            calibration=calibration,
+            options=options,
+            clock=lambda: float(next(ticks)),
+            tolerance_mm=0.2,
+            runs=1,
+        )
 
 
 @cache
-def report() -> Tradeoff:
-    ticks = itertools.count()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tradeoff, "STEPS", (150,))
-        patch.setattr(tradeoff, "REFERENCE_POINTS", 4096)
-        patch.setattr(tradeoff, "FIELDS", (8, 18, 24))
-        found = measure(
-            bump_map(noise=errors()), radius_mm=20.0, prior=BumpPrior(), clock=lambda: float(next(ticks)), runs=2
-        )
-    assert isinstance(found, Tradeoff)
+def ladder() -> Ladder:
+    return ladder_of(field_map())
+
+
+def row(label: str) -> Priced:
+    (found,) = (one for one in ladder().rows if one.label == label)
     return found
 
 
-def test_every_method_is_measured() -> None:
-    rows = report().measured
-    assert [one.method for one in rows] == ["optimise", "laplace", *["importance"] * 4, "ensemble"]
-    assert all(not one.failed and one.cpu_s == 1.0 for one in rows)
-    by = {(one.method, one.setting): one for one in rows}
-    fine, coarse = by["importance", "--accuracy-sd 0.01"], by["importance", "--accuracy-sd 0.05"]
-    assert fine.evaluations > coarse.evaluations > 0
-    assert fine.error_sd < 0.04
-    assert by["laplace", ""].error_sd < 0.3
-    # least squares with judged errors is another model: it is not the field's posterior
-    assert by["optimise", ""].error_sd > 2 * fine.error_sd
+def exact_eq6() -> SizeCalibration:
+    """Eq 6 without uncertainty: d = 2 sigma + 1 along both axes."""
+    draws = np.tile([2.0, 1.0, 1.0, 0.0, 1e-9, 0.0], (16, 1))
+    axis = AxisCalibration(draws, 0.3, {"amplitude": (0.01, 3.0), "sigma_mm": (1.0, 20.0), "d_mm": (1.0, 60.0)})
+    return SizeCalibration(axis, axis, 0.0, Recipe("mean", "fixed", 20.0))
 
 
-def test_finer_noise_fields_move_the_ends_less_and_less() -> None:
-    coarse, default, finest = report().fields
-    assert coarse.change_sd > 0.3 > default.change_sd > finest.change_sd == 0.0
-    assert coarse.change_mm == pytest.approx(coarse.change_sd * np.mean(report().sd_mm), rel=0.5)
+def test_the_reference_has_the_interval_that_theory_gives(monkeypatch: pytest.MonkeyPatch):
+    """Least squares of a Gaussian in white noise: SD(ln sigma) = sqrt(2/pi) s h / (a sqrt(sigma_x sigma_y)), from the
+    Fisher information integrated by hand; Eq 6 without uncertainty makes a size of 2 sigma + 1 of it."""
+    monkeypatch.setattr(study, "LONG_RUNS", (("importance", 0.02),))
+    rng, s, a, wide, narrow = np.random.default_rng(5), 0.005, 0.3, 6.0, 3.0
+    values = bump_values(amplitude=a, sigma_x=wide, sigma_y=narrow) + s * rng.standard_normal((51, 51))
+    options = EstimateOptions(fit=FitOptions("fixed", 20.0, "off"))
+    found = estimator_of(grid_map(values), exact_eq6()).reference(options)
+    assert found.answer is not None
+    size = found.answer.quantities[SIZE]
+    half = 1.96 * 2 * wide * math.sqrt(2 / math.pi) * s / (a * math.sqrt(wide * narrow))
+    assert found.answer.half_width_mm == pytest.approx(half, rel=0.12)
+    assert size.median == pytest.approx(2 * wide + 1, abs=2 * half)
+    assert found.error_mm < 0.05 * half
 
 
-def test_errors_in_mm_are_those_in_sd_times_the_sd() -> None:
-    found = report()
-    for one in found.measured:
-        if one.method == "importance":
-            assert one.error_mm == pytest.approx(one.error_sd * np.mean(found.sd_mm), rel=0.6)
+def test_the_reference_agrees_with_markov_chains():
+    """Chains are another algorithm: their ends lie within their Monte-Carlo error of the reference's."""
+    found = row("--method ensemble")
+    assert found.answer.method == "ensemble"
+    assert ladder().reference.answer.method == "importance"
+    assert ladder().reference.error_mm < 0.02
+    size = found.answer.quantities[SIZE]
+    assert found.off.ends < 4 * np.hypot(size.mc_error, ladder().reference.error_mm)
 
 
-def row(method: str, setting: str, cpu: float, error: float) -> Measured:
-    return Measured(method, setting, cpu, 1000.0, error, error)
+def test_chains_are_the_reference_where_weights_cannot_be_trusted(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(study, "LONG_RUNS", (("importance", 0.001), ("ensemble", 0.1)))
+    monkeypatch.setattr(importance_module, "HEAVY_POINTS", 1)
+    monkeypatch.setattr(importance_module, "TRUSTED_SHAPE", -5.0)
+    given = field_map(half_mm=18.0, amplitude=0.2)
+    found = estimator_of(given).reference(inputs_of(given)[1])
+    assert found.words.startswith("MCMC")
+    assert found.answer is not None
+    assert found.answer.method == "ensemble"
 
 
-def test_the_advice_is_the_cheapest_within_the_tolerance() -> None:
+def test_wrong_settings_come_out_as_wrong():
+    """The negative control: a noise field too coarse for the errors, and a window that holds nothing but the bump."""
+    right = [row(label) for label in ("--method importance", "--method laplace", "--accuracy-sd 0.01")]
+    assert row("field_cosines 8").off.ends > 3 * max(one.off.ends for one in right)
+    assert row("fit_radius_mm 8").answer.reported is None
+    assert ladder().enough() in right
+    said = " ".join(advice(ladder()))
+    assert "more than 0.2 mm: field_cosines 8 0.4 mm." in said
+    assert "No size by fit_radius_mm 8." in said
+
+
+def test_an_answer_is_compared_with_one_of_its_kind_only():
+    some = row("--method laplace").answer
+    assert deviation([some], some).ends == 0.0
+    assert math.isnan(deviation([some], None).ends)
+    assert math.isnan(deviation([SizeAnswer("no lump", 0.1)], some).ends)
+    widths = replace(some, quantities={name: q for name, q in some.quantities.items() if name != SIZE})
+    assert math.isnan(deviation([widths], some).ends)
+
+
+def made(label: str, seconds: float, off: float, *, default: bool = False, usable: bool = True) -> Priced:
+    """A row as if it had been measured."""
+    some = row("--method importance")
+    return replace(
+        some, label=label, cpu_s={"estimate": seconds}, off=replace(some.off, ends=off), default=default, usable=usable
+    )
+
+
+def test_the_frontier_and_what_is_enough():
     rows = (
-        row("laplace", "", 0.01, 0.2),
-        row("importance", "--accuracy-sd 0.02", 0.1, 0.02),
-        row("ensemble", "600 steps", 2.0, 0.03),
+        made("default", 1.0, 0.05, default=True),
+        made("quick", 0.3, 0.15),
+        made("quick and wrong", 0.1, 2.0),
+        made("slow", 5.0, 0.01),
+        made("slow and no better", 6.0, 0.03),
+        made("another model", 0.01, 0.1, usable=False),
     )
-    found = Tradeoff(rows, 0.003, 0.2, (0.1, 0.1), 4)
-    assert "--method importance --accuracy-sd 0.02: the cheapest" in advice(found, tolerance_sd=0.05)
-    assert "--method laplace: " in advice(found, tolerance_sd=0.5)
-    assert "nothing here is within 0.001 SD" in advice(found, tolerance_sd=0.001)
-    failed = replace(rows[1], failed="not converged", error_sd=float("nan"))
-    assert "--method ensemble (600 steps)" in advice(
-        replace(found, measured=(rows[0], failed, rows[2])), tolerance_sd=0.05
-    )
+    found = Ladder(rows, ladder().reference, 0.2)
+    assert [one.label for one in found.frontier()] == ["another model", "default", "slow"]
+    assert found.enough().label == "quick"
+    hardly_quicker = replace(found, rows=(rows[0], made("quick", 0.9, 0.15)))
+    assert hardly_quicker.enough().label == "default"
+    strict = replace(found, tolerance_mm=0.001)
+    assert strict.enough() is None
+    assert "no setting has its interval ends within 0.001 mm" in advice(strict)[0]
 
 
-def test_it_can_be_read_printed_and_drawn(tmp_path: Path) -> None:
-    text = tradeoff_text(report(), tolerance_sd=0.05)
-    assert text.count("importance") >= 4
-    assert "Advice: --method" in text
-    document = json.loads(json.dumps(tradeoff_document(report(), tolerance_sd=0.05)))
-    assert len(document["measured"]) == len(report().measured)
+def test_least_time_counts_and_a_slow_setting_is_run_twice():
+    spent = iter([5.0, 4.0, 1.0])
+    some = row("--method laplace").answer
+    found = priced("a", "b", lambda _: ({"estimate": next(spent)}, some), Reference("", some, 0.0), runs=3)
+    assert (found.seconds, len(found.answers)) == (4.0, 2)
+
+
+def test_it_can_be_read_printed_and_drawn(tmp_path: Path):
+    pooled = (PooledRow(1, 0.2, row("--method laplace").answer, 5.0), PooledRow(2, 0.4, SizeAnswer("1 of 2")))
+    found = replace(ladder(), pooled=pooled, shared_cpu_s={"start": 0.2})
+    text = ladder_text(found)
+    assert "* --method importance" in text
+    assert "5.00 if exams differ as in the paper" in text
+    assert text.splitlines()[-1] == "Research use only: not a diagnostic device."
+    assert sum(line.startswith("Advice: ") for line in text.splitlines()) == 1
+    document = json.loads(json.dumps(ladder_document(found, what="estimate", provenance={})))
+    check_document(document, "tradeoff.schema.json", path=tmp_path)
+    assert [one["default"] for one in document["settings"]].count(True) == 1
     for name in ("a.png", "b.png"):
-        draw_tradeoff(report(), tmp_path / name, tolerance_sd=0.05)
+        draw_ladder(found, tmp_path / name, title="a map")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-def test_without_a_bump_there_is_nothing_to_compare() -> None:
-    found = measure(grid_map(np.ones((31, 31))), radius_mm=20.0, prior=BumpPrior(), clock=lambda: 0.0)
-    assert found == "nothing rises above the background"
+NO_SIZE = {
+    "empty": (lambda: grid_map(np.ones((31, 31)), normalise="gain"), "nothing rises above the background"),
+    "faint": (lambda: field_map(half_mm=13.0, amplitude=0.01), "no lump found|probability"),
+    "one cell wide": (lambda: field_map(half_mm=10.0, amplitude=0.5, sigma_x=0.4, sigma_y=0.4), "cell|no lump found"),
+    "no cell": (lambda: grid_map(np.full((9, 9), np.nan), normalise="gain"), "no covered cell"),
+}
+
+
+@pytest.mark.parametrize("case", NO_SIZE)
+def test_without_a_size_it_says_what_each_setting_answers(case: str, tmp_path: Path):
+    make, why = NO_SIZE[case]
+    found = ladder_of(make(), FIELDS=(), RADII_MM=(10.0,))
+    assert found.reference.answer is None
+    text = ladder_text(found)
+    assert "Advice: " in text
+    default = next(line for line in text.splitlines() if line.startswith("* --method importance"))
+    assert re.search(why, default), default
+    check_document(ladder_document(found, what="estimate", provenance={}), "tradeoff.schema.json", path=tmp_path)
+    draw_ladder(found, tmp_path / "f.png", title=case)
+
+
+def test_a_row_says_that_chains_took_over():
+    taken_over = replace(row("--method importance"), answers=(row("--method ensemble").answer,))
+    said = ladder_text(replace(ladder(), rows=(taken_over, row("--method ensemble"))))
+    assert said.count("(by MCMC: importance sampling failed)") == 1
+
+
+def test_beside_chains_other_models_are_tried_by_laplace():
+    settings = study.settings_of(EstimateOptions(fit=FitOptions("free", noise="field")), level_known=True)
+    chains, weights = row("--method ensemble").answer, row("--method importance").answer
+    assert study.worth_trying(settings, weights) == settings
+    tried = study.worth_trying(settings, chains)
+    assert [one.axis for one in tried] == [one.axis for one in settings]
+    others = [one for one in tried if one.axis in (study.FIELD, study.WINDOW)]
+    assert {one.options.method for one in others} == {"laplace"}
+    assert all(one.label.endswith(", laplace") and not one.options.step_up for one in others)
+    assert sum(one.weight for one in tried) < 0.2 * sum(one.weight for one in settings)
+    silent = study.worth_trying(settings, SizeAnswer("no lump", 0.1, code="undetected"))
+    assert {one.axis for one in silent} == {study.METHOD, study.FIELD, study.WINDOW}
+
+
+def test_settings_that_disagree_are_not_believed():
+    none = replace(made("none", 1.0, math.nan, default=True), answers=(SizeAnswer("no lump", 0.9),))
+    some = replace(made("some", 1.0, math.nan), answers=(replace(row("--method laplace").answer, probability=0.96),))
+    said = advice(Ladder((none, some), Reference("none: no lump", None, 1.0), 0.2))
+    assert said == [
+        "Advice: the default gives no size, 1 of 2 settings do (some) (probability of one 0.9 to 0.96): the map is at "
+        "the limit of what can be sized. Believe none of them; scan the place again."
+    ]
+
+
+def test_a_large_map_costs_what_its_window_costs():
+    """200 x 200 cells: the fit has no more cells than the window, and the size is that of the bump alone."""
+    small, large = field_map(half_mm=25.0), field_map(half_mm=100.0)
+    assert large.mean.shape == (201, 201)
+    answers = [estimator_of(one).run(inputs_of(one)[1])(0)[1] for one in (small, large)]
+    sizes = [one.quantities[SIZE] for one in answers]
+    assert sizes[1].median == pytest.approx(sizes[0].median, rel=0.1)
+
+
+@pytest.mark.parametrize("case", ["cells without data", "one reading a cell"])
+def test_poor_maps_are_measured_too(case: str):
+    given = field_map(half_mm=20.0)
+    if case == "cells without data":
+        hidden = np.random.default_rng(0).random(given.mean.shape) < 0.2
+        given = grid_map(np.where(hidden, np.nan, given.mean), normalise="gain")
+    else:
+        given = grid_map(given.mean, normalise="gain", count=1)
+    reference = estimator_of(given).reference(inputs_of(given)[1])
+    assert reference.answer is not None
+    assert reference.answer.quantities[SIZE].median == pytest.approx(13.6, rel=0.15)
+
+
+def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: Run):
+    write_map(tmp_path / "empty.nc", grid_map(np.ones((15, 15)), normalise="gain"), provenance=Provenance("map", {}))
+    done = run_cli("tradeoff", "estimate", "empty.nc", "--runs", "1", "--figure", "f.png", cwd=tmp_path)
+    assert done.returncode == 6
+    assert "s of CPU to go" in done.stderr
+    assert "no setting gives a size" in done.stdout
+    assert (tmp_path / "f.png").stat().st_size > 1000
+    write_map(tmp_path / "other.nc", grid_map(np.ones((13, 15)), normalise="gain"), provenance=Provenance("map", {}))
+    both = run_cli("tradeoff", "estimate", "empty.nc", "other.nc", "--runs", "1", cwd=tmp_path)
+    assert (both.returncode, "a lump was found on 0 of 2 maps" in both.stdout) == (6, True)
+    twice = run_cli("tradeoff", "estimate", "empty.nc", "empty.nc", cwd=tmp_path)
+    assert (twice.returncode, twice.stdout) == (2, "")
+    (tmp_path / "s.toml").write_text('checkpoint = "c.npz"\n')
+    kept = run_cli("tradeoff", "estimate", "empty.nc", "--settings", "s.toml", cwd=tmp_path)
+    assert (kept.returncode, "leave checkpoint out" in kept.stderr) == (2, True)
+
+
+def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
+    from tactile_bayes.pipeline.tradeoff import pooled_rows
+
+    paths = []
+    for seed in (1, 2, 3):
+        paths.append(tmp_path / f"{seed}.nc")
+        write_map(paths[-1], field_map(seed=seed, half_mm=20.0), provenance=Provenance("map", {}))
+    rows = pooled_rows(paths, Settings(method="laplace"), clock=time.process_time)
+    assert [one.maps for one in rows] == [1, 2, 3]
+    assert rows[2].answer.half_width_mm < rows[0].answer.half_width_mm
+    assert rows[2].another_half_mm < 0.85 * rows[0].another_half_mm
+    assert rows[2].cpu_s > rows[0].cpu_s
 
 
 @pytest.mark.slow
-def test_the_command_runs(run_cli: Run, tmp_path: Path) -> None:
-    write_map(tmp_path / "m.nc", bump_map(noise=errors()), provenance=Provenance("map", {}))
-    done = run_cli("tradeoff", "estimate", "m.nc", "--runs", "1", "--figure", "f.png", cwd=tmp_path)
+def test_the_whole_command_runs(run_cli: Run, tmp_path: Path):
+    write_map(tmp_path / "m.nc", field_map(), provenance=Provenance("map", {}))
+    done = run_cli("tradeoff", "estimate", "m.nc", "--runs", "1", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "Advice" in done.stdout
-    assert (tmp_path / "f.png").stat().st_size > 1000
-
-
-def test_the_command_says_why_not(run_cli: Run, tmp_path: Path) -> None:
-    write_map(tmp_path / "m.nc", grid_map(np.ones((31, 31))), provenance=Provenance("map", {}))
-    done = run_cli("tradeoff", "estimate", "m.nc", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (6, "Nothing to compare: nothing rises above the background.\n")
+    document = json.loads(done.stdout)
+    assert document["reference"]["mc_error_mm"] < 0.05
+    assert document["shared_cpu_s"]

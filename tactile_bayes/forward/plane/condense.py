@@ -1,4 +1,4 @@
-r"""How a lump changes the skin's response: static condensation onto the surface and the lump's boundary.
+r"""Static condensation of a body with a lump onto its surface and the lump's boundary.
 
 The skin of the layered body without a lump answers exactly (`layers.surface_compliance`). The lump adds a matrix
 of low rank. With H the compliance of the body *with a hole* on the hole's boundary (and from there to the skin), and
@@ -38,7 +38,7 @@ _FAINT = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceCompliance:
-    """Mean vertical displacement of each surface cell per unit of pressure on each, for one geometry.
+    """Mean vertical displacement of each surface cell per unit pressure on each cell, for one geometry.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def condense(
 
 
 def _is_layered(body: Body) -> bool:
-    """Whether the fat-gland boundary crosses the lump."""
+    """Whether the fat-gland boundary cuts the lump."""
     return body.seat < 1.0 and body.gland_ratio != 1.0
 
 
@@ -141,7 +141,7 @@ def _tissue(mesh: QuadMesh, body: Body) -> FloatArray:
 
 
 def rim_nodes(body: Body, *, fineness: int) -> int:
-    """How many nodes lie on the lump's half circle, elements' middles included."""
+    """Number of nodes on the lump's half circle, mid-side nodes included."""
     return len(_rim(disc_mesh(body, fineness=fineness, layered=False), body))
 
 
@@ -153,7 +153,7 @@ def _rim(mesh: QuadMesh, body: Body) -> IntArray:
 
 
 def _held_on_axis(mesh: QuadMesh, *, even: bool) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """(2n,) True for the unknowns that symmetry holds at 0: u_x on the axis when even, u_z when odd."""
+    """(2n,) True for the unknowns that symmetry fixes at 0: u_x on the axis when even, u_z when odd."""
     axis = mesh.nodes[:, 0] < 1e-9 * np.abs(mesh.nodes).max()
     held = np.zeros((len(mesh.nodes), 2), dtype=bool)
     held[axis, 0 if even else 1] = True
@@ -199,7 +199,7 @@ def _rim_unknowns(mesh: QuadMesh, body: Body, held: np.ndarray[tuple[int, ...], 
 
 
 def _boundary_stiffness(mesh: QuadMesh, stiffness: csc_matrix, body: Body, *, even: bool) -> FloatArray:
-    """(g, g) stiffness of a disc on its rim, its inside eliminated."""
+    """(g, g) stiffness of a disc, condensed onto its rim."""
     held = _held_on_axis(mesh, even=even)
     rim = _rim_unknowns(mesh, body, held)
     inside = ~held
@@ -212,7 +212,7 @@ def _boundary_stiffness(mesh: QuadMesh, stiffness: csc_matrix, body: Body, *, ev
 
 
 def _fill(at_hole: FloatArray, to_skin: FloatArray, disc: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Shapes on the skin (c, r) and their values (r,) by which a disc of unit scale fills the hole."""
+    """Shapes on the skin (c, r) and their values (r,) that a disc of unit stiffness scale adds in the hole."""
     values, vectors = np.linalg.eigh(disc)
     kept = values > _RIGID * values[-1]
     factor = vectors[:, kept] * np.sqrt(values[kept])
@@ -224,6 +224,6 @@ def _fill(at_hole: FloatArray, to_skin: FloatArray, disc: FloatArray) -> tuple[F
 
 
 def _unfold(shapes: FloatArray, *, even: bool) -> FloatArray:
-    """Shapes on x > 0 continued to both sides; each half bears half of a load."""
+    """Continue shapes on x > 0 to both sides; each half carries half of a load."""
     mirrored = shapes[::-1] if even else -shapes[::-1]
     return np.asarray(np.sqrt(0.5) * np.concatenate([mirrored, shapes]))

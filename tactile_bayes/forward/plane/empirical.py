@@ -18,11 +18,34 @@ from tactile_bayes.geometry import FloatArray
 SHARE = 0.5
 """alpha: share of the homogeneous profile that is taken off the frame over the lump (P2 = P0 - alpha P1)."""
 
+DEEPEST_RATIO, LEAST_D_MM = 1.0, 10.0
+"""h/d up to which, and diameter in mm from which, the map of Eqs 1 to 4 has a lump about as high and wide as plane
+strain: amplitude -33 to +56 %, width -31 to +59 %, by record 0098."""
+LOST_RATIO = 1.5
+"""h/d from which the map of Eqs 1 to 4 has lost most lumps (record 0098)."""
+RANGE = f"it holds for cylinders of {LEAST_D_MM:g} mm and more down to h/d {DEEPEST_RATIO:g}"
+
+
+def outside_range(d_mm: float, depth_ratio: float) -> str | None:
+    """Warn in one line of a lump that the empirical model does not stand for; None inside its range.
+
+    Notes
+    -----
+    Below, the frame over the lump has no bump of its own: least squares of Eq 2 makes it as flat as the homogeneous
+    profile, and Eq 3's map has no lump, or too low a one. Smaller lumps get a bump two to three times too wide.
+    """
+    if depth_ratio > DEEPEST_RATIO:
+        what = "loses most lumps" if depth_ratio >= LOST_RATIO else "makes lumps too low and wide, or loses them"
+        return f"warning: h/d {depth_ratio:g}: the empirical model {what} at this depth; {RANGE} (use plane-strain)"
+    if d_mm < LEAST_D_MM:
+        return f"warning: d {d_mm:g} mm: the empirical model makes it too wide; {RANGE} (use plane-strain)"
+    return None
+
 
 def homogeneous_pressure(
     s_mm: FloatArray, *, peak_kpa: float, curvature_per_mm2: float, half_width_mm: float
 ) -> FloatArray:
-    r"""Pressure across the head far from the lump, P1.
+    r"""Pressure across the head far from the lump, P1 (Eq 1).
 
     Parameters
     ----------
@@ -52,7 +75,7 @@ def homogeneous_pressure(
 
 
 def lump_pressure(x_mm: FloatArray, *, height_kpa: float, width_mm: float) -> FloatArray:
-    r"""What the lump adds at a place of the skin, P2.
+    r"""Pressure that the lump adds at a point of the skin, P2 (Eq 2).
 
     Notes
     -----
@@ -77,7 +100,7 @@ def kappa(x_c_mm: FloatArray, *, d_mm: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class EmpiricalModel:
-    """The fitted numbers of one case.
+    """The fitted parameters of one case.
 
     Parameters
     ----------

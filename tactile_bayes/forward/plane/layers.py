@@ -1,4 +1,4 @@
-r"""Surface response of the layered body without a lump, exactly, by Fourier transform along the skin.
+r"""Exact surface response of the layered body without a lump, by Fourier transform along the skin.
 
 A pressure :math:`\cos kx` on the skin pushes it down by :math:`c(k) \cos kx`; :math:`c` comes from eight exponential
 solutions of plane strain (four a layer) and the conditions on skin, boundary and wall.
@@ -114,7 +114,7 @@ def _log_average(offset_mm: FloatArray, cell_mm: float, depth_mm: float) -> Floa
 
 
 def _log_primitive(x: FloatArray, b: float) -> FloatArray:
-    """Twice integrated ln(x^2 + b^2)."""
+    """Second antiderivative of ln(x^2 + b^2)."""
     square = x**2 + b**2
     log = np.log(np.where(square > 0, square, 1.0))
     angle = np.arctan(x / b) if b > 0 else 0.0

@@ -54,7 +54,7 @@ class LineFrames:
         return float(self.s_mm[1] - self.s_mm[0])
 
     def at(self, x_c_mm: float) -> FloatArray:
-        """(n,) the frame at the position nearest to `x_c_mm`."""
+        """(n,) frame at the position nearest to `x_c_mm`."""
         return np.asarray(self.pressure_kpa[int(np.argmin(np.abs(self.x_c_mm - x_c_mm)))])
 
     def as_taxels(self, pitch_mm: float) -> LineFrames:
@@ -71,7 +71,7 @@ class LineFrames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TactileLine:
-    """The two-dimensional counterpart of a tactile map.
+    """A one-dimensional tactile map: the counterpart of `TactileMap` for a line.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def press(
 def press_layers(
     layers: Layers, *, head: Head = _NOMINAL_HEAD, mean_kpa: float | FloatArray = MEAN_KPA, cell_mm: float = CELL_MM
 ) -> LineFrames:
-    """The frame of a body without a lump, the same wherever the head stands (at 0 here): P1, for each mean given."""
+    """Frames of a body without a lump, P1, one per mean pressure; they do not depend on the head's position."""
     level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
     senses = head.sensing_cells(cell_mm)
     pressure = _layers_contact(layers, head=head, mean_kpa=level, cell_mm=cell_mm).pressure_kpa[:, senses]
@@ -171,7 +171,7 @@ def _cell_centres(count: int, cell_mm: float) -> FloatArray:
 
 
 def _windows(matrix: FloatArray, first: FloatArray, n: int) -> FloatArray:
-    """(m, n, n) blocks on the diagonal that begin at `first`; between two cells, the weighted mean of both blocks."""
+    """(m, n, n) diagonal blocks that begin at `first`; between two cells, the weighted mean of both blocks."""
     blocks = np.lib.stride_tricks.sliding_window_view(matrix, (n, n))
     low = np.clip(np.floor(first + 1e-9).astype(np.intp), 0, len(matrix) - n)
     share = first - low
@@ -191,7 +191,7 @@ def slide(
     mean_kpa: float = MEAN_KPA,
     positions_mm: tuple[float, float, float] = POSITIONS_MM,
 ) -> LineFrames:
-    """Frames of a head that slides across the lump; positions that mirror each other are solved once."""
+    """Simulate frames of a head that slides across the lump; mirrored positions are solved once."""
     x_c = head_positions(positions_mm)
     if not np.allclose(x_c, -x_c[::-1], rtol=0, atol=1e-9):
         return press(surface, stiffness_ratio, x_c, head=head, mean_kpa=mean_kpa)
@@ -201,7 +201,7 @@ def slide(
 
 
 def build_line(frames: LineFrames, *, normalise: str = "mean") -> TactileLine:
-    """The map: each frame over its mean, then the mean of all readings in each cell.
+    """Average frames, each divided by its mean, in cells along the line.
 
     Parameters
     ----------

@@ -91,7 +91,7 @@ def rectangle_mesh(x_mm: FloatArray, z_mm: FloatArray) -> QuadMesh:
 
 
 def joined(meshes: Sequence[QuadMesh], *, scale_mm: float) -> QuadMesh:
-    """One mesh of several; nodes nearer than 1e-8 of `scale_mm` become one."""
+    """Merge several meshes into one; nodes nearer than 1e-8 of `scale_mm` become one."""
     offsets = np.cumsum([0] + [len(mesh.nodes) for mesh in meshes])
     points, number = _merged(np.concatenate([mesh.nodes for mesh in meshes]), scale_mm)
     elements = [number[mesh.elements + offset] for mesh, offset in zip(meshes, offsets, strict=False)]
@@ -133,7 +133,7 @@ class _Box:
 
     @classmethod
     def _above_gland(cls, body: Body, top: float, fineness: int) -> _Box:
-        """The box of a lump clear of the gland: its floor is the boundary, its side is fat all along."""
+        """Box of a lump clear of the gland: it ends at the fat-gland boundary, so that its side lies in fat."""
         h, d, layers = body.centre_mm, body.d_mm, body.layers
         half = 0.5 * (top + layers.fat_mm)
         side_up = np.linspace(top, half, 2 * _UP * fineness + 1)
@@ -216,7 +216,7 @@ def _grid(x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
 
 
 def _graded(begin_mm: float, end_mm: float, first_mm: float, fineness: int) -> FloatArray:
-    """Corners and middles of elements that grow from `first_mm` on, by a factor that shrinks with the fineness."""
+    """Corners and midpoints of elements that grow from `first_mm`, by a factor that shrinks with the fineness."""
     growth = _GROWTH ** (1.0 / fineness)
     length = end_mm - begin_mm
     count = int(np.ceil(np.log1p(length / first_mm * (growth - 1.0)) / np.log(growth)))
@@ -226,7 +226,7 @@ def _graded(begin_mm: float, end_mm: float, first_mm: float, fineness: int) -> F
 
 
 def _with_middles(corners: FloatArray) -> FloatArray:
-    """Corners with the middle of each pair between them."""
+    """Corners, with the midpoint of each pair between them."""
     points = np.empty(2 * len(corners) - 1)
     points[::2] = corners
     points[1::2] = 0.5 * (corners[1:] + corners[:-1])
@@ -234,7 +234,7 @@ def _with_middles(corners: FloatArray) -> FloatArray:
 
 
 def _join(blocks: Sequence[FloatArray], *, boundary_mm: float, scale_mm: float) -> QuadMesh:
-    """One mesh of several blocks; points that coincide become one node, elements without area go."""
+    """Merge blocks into one mesh; coinciding points become one node, elements without area are dropped."""
     nodes, number = _merged(np.concatenate([block.reshape(-1, 2) for block in blocks]), scale_mm)
     offsets = np.cumsum([0] + [block.shape[0] * block.shape[1] for block in blocks])
     elements = np.concatenate(
@@ -250,7 +250,7 @@ def _join(blocks: Sequence[FloatArray], *, boundary_mm: float, scale_mm: float) 
 
 
 def _merged(points: FloatArray, scale_mm: float) -> tuple[FloatArray, IntArray]:
-    """Distinct points, and for each point given the number of its own."""
+    """Distinct points, and the index of each given point among them."""
     key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
     _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return points[first], np.asarray(number.reshape(-1), dtype=np.intp)
@@ -264,6 +264,6 @@ def _elements(n: int, m: int) -> IntArray:
 
 
 def _compact(nodes: FloatArray, elements: IntArray, gland: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> QuadMesh:
-    """The mesh without nodes that no element has."""
+    """Remove the nodes that belong to no element."""
     used, numbers = np.unique(elements, return_inverse=True)
     return QuadMesh(nodes[used], numbers.reshape(elements.shape), gland)

@@ -1,4 +1,4 @@
-"""A scan of one lump of tissue in two dimensions: a cylinder along y under the head, solved or by Eqs 1 to 4.
+"""Two-dimensional scans of one lump of tissue: a cylinder along y under the head, solved or by Eqs 1 to 4.
 
 In two dimensions nothing changes along y. Each column of taxels feels what a head of the same section feels at that
 column's place across the lump: its profile is repeated along the head. The head stays level in this: tilts are in the
@@ -8,7 +8,7 @@ poses, not in the pressures, and how deep the head sinks is not followed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,7 @@ Progress = Callable[[int, int], None]
 Sections = Callable[[FloatArray, FloatArray], FloatArray]
 """Profiles (m, rows) in kPa of a head at (m,) places from the lump's axis, with (m,) mean pressures in kPa."""
 
-# Cells of the contact a taxel, and how far apart the places of neighbouring sections of one head may be.
+# Contact cells per taxel, and how far apart the places of neighbouring sections of one head may be.
 _CELLS_A_TAXEL = 6
 _APART_MM = 0.25
 _FRAMES_AT_ONCE = 100
@@ -103,13 +103,13 @@ class PlaneSection:
     reach_mm: float
 
     def surface(self) -> SurfaceCompliance:
-        """The skin over the lump."""
+        """Compliance of the skin over the lump."""
         assert self.lump is not None
         return condense(self.lump[0], reach_mm=self.reach_mm, cell_mm=self.cell_mm)
 
     @property
     def solved(self) -> Sections:
-        """Sections from the contact of the head with the body."""
+        """Sections from the contact problem."""
         if self.lump is None:
             return self._plain
         surface, ratio, head = self.surface(), self.lump[1], self.head
@@ -148,14 +148,14 @@ class PlaneSection:
         return model, s
 
     def _plain(self, x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
-        """The body without a lump is the same everywhere."""
+        """Section over the body without a lump, which is the same at every place."""
         del x_mm
         found = press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
         return _taxels(found.pressure_kpa)
 
 
 def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
-    """The section that a scene means.
+    """Prepare the section of a scene.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INS
     if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
         raise BadDataError(
             f"head.rim_mm is {scene.head.rim_mm:g}",
-            way_out=f"cut into the array of two dimensions it must be at most {width / 2:g} mm",
+            way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
         )
     head, cell_mm = scene.head.section(shoulders), scene.head.pitch_mm / _CELLS_A_TAXEL
     return PlaneSection(
@@ -218,7 +218,7 @@ def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) ->
 
 
 def _reach(scene: Scene, lump_x_mm: float, half_width_mm: float, thickness_mm: float) -> float:
-    """How far from the lump the head's edges get; refused where the mesh ends before."""
+    """Largest distance of the head's edges from the lump; an error where the mesh ends before."""
     along = scene.head.columns * scene.head.pitch_mm / 2
     wander = scene.strokes.half_length_mm + scene.strokes.wander_mm + along
     reach = wander + abs(lump_x_mm) + half_width_mm + 1.0
@@ -244,23 +244,90 @@ def plane_frames(
     """
     rotation, origin = head_positions(scene, time_s)
     level = level_kpa(scene.background, time_s)
+    return _frames_at(scene, rotation, origin, level, sections, lump_x_mm=lump_x_mm, progress=progress)
+
+
+def frames_at_poses(
+    scene: Scene,
+    rotation: FloatArray,
+    origin_mm: FloatArray,
+    *,
+    mean_kpa: FloatArray,
+    fidelity: str,
+    shoulders: str = SHOULDERS_INSIDE,
+    progress: Progress | None = None,
+) -> FloatArray:
+    """What the scene's head feels at given poses and levels, without noise.
+
+    Parameters
+    ----------
+    rotation : (n, 3, 3) array
+        From `scanhead` to the scene's `plane`; tilts are not followed.
+    origin_mm : (n, 3) array
+        Of the head's face; its depth is not used.
+    mean_kpa : (n,) array
+        Mean over the taxels.
+    fidelity, shoulders
+        As in `simulate_plane`.
+
+    Returns
+    -------
+    (n, rows, columns) array of kPa
+
+    Raises
+    ------
+    BadDataError
+        When the scene is not one of two dimensions, or a pose lies beyond the skin that can be solved for.
+    """
+    section = plane_section(scene, fidelity, shoulders=shoulders)
+    half_face = 0.5 * section.cell_mm * len(section.head.sensing_cells(section.cell_mm))
+    place = _column_places(scene, rotation, origin_mm) - section.x_mm
+    reach, most = float(np.abs(place).max()) + half_face + 1.0, REACH_MM + section.layers.thickness_mm
+    if reach > most:
+        raise BadDataError(
+            f"the head gets {reach:.4g} mm from the lump", way_out=f"the {fidelity} model reaches {most:g} mm"
+        )
+    section = replace(section, reach_mm=reach)
+    sections = section.empirical if fidelity == "empirical" else section.solved
+    return _frames_at(scene, rotation, origin_mm, mean_kpa, sections, lump_x_mm=section.x_mm, progress=progress)
+
+
+def _column_places(scene: Scene, rotation: FloatArray, origin_mm: FloatArray) -> FloatArray:
+    """(n, columns) place of each column of taxels across the scene's `plane`."""
     along = (np.arange(scene.head.columns) - (scene.head.columns - 1) / 2) * scene.head.pitch_mm
-    place = origin[:, :1] - lump_x_mm + rotation[:, 0, 1, None] * along
-    pressure = np.zeros((len(time_s), scene.head.rows, scene.head.columns))
-    pressed = np.flatnonzero(level > 0)
+    return np.asarray(origin_mm[:, :1] + rotation[:, 0, 1, None] * along)
+
+
+def _frames_at(
+    scene: Scene,
+    rotation: FloatArray,
+    origin_mm: FloatArray,
+    level_kpa: FloatArray,
+    sections: Sections,
+    *,
+    lump_x_mm: float,
+    progress: Progress | None,
+) -> FloatArray:
+    """(n, rows, columns) kPa from sections at the places of the head's columns."""
+    place = _column_places(scene, rotation, origin_mm) - lump_x_mm
+    count = len(level_kpa)
+    pressure = np.zeros((count, scene.head.rows, scene.head.columns))
+    pressed = np.flatnonzero(level_kpa > 0)
     for chunk in np.array_split(pressed, max(1, len(pressed) // _FRAMES_AT_ONCE)):
         across = [_places(place[i]) for i in chunk]
         many = [len(x) for x in across]
-        profile = sections(np.concatenate(across), np.repeat(level[chunk], many)) if len(chunk) else np.zeros((0, 0))
+        profile = (
+            sections(np.concatenate(across), np.repeat(level_kpa[chunk], many)) if len(chunk) else np.zeros((0, 0))
+        )
         for i, x, mine in zip(chunk, across, np.split(profile, np.cumsum(many)[:-1]), strict=bool(len(chunk))):
             pressure[i] = _interpolated(x, mine, place[i]).T
         if progress is not None and len(chunk):
-            progress(int(chunk[-1]) + 1, len(time_s))
+            progress(int(chunk[-1]) + 1, count)
     return pressure
 
 
 def _places(place_mm: FloatArray) -> FloatArray:
-    """(m,) places of sections that span those of the columns, in equal steps."""
+    """(m,) equally spaced places of sections that span those of the columns."""
     low, high = float(place_mm.min()), float(place_mm.max())
     return np.linspace(low, high, 1 + int(np.ceil((high - low) / _APART_MM - 1e-9)))
 
@@ -276,5 +343,5 @@ def _interpolated(x_mm: FloatArray, profile: FloatArray, place_mm: FloatArray) -
 
 
 def _taxels(cells: FloatArray) -> FloatArray:
-    """(m, rows) means over whole taxels of (m, rows x cells) values."""
+    """(m, rows) means over whole taxels from (m, rows x cells) values."""
     return np.asarray(cells.reshape(len(cells), -1, _CELLS_A_TAXEL).mean(axis=2))

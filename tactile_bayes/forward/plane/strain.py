@@ -1,4 +1,4 @@
-r"""Nearly incompressible elasticity in plane strain: stiffness of nine-node quadrilaterals that do not lock.
+r"""Nearly incompressible plane strain: stiffness of nine-node quadrilaterals without volumetric locking.
 
 The volume change of an element is represented by a linear function of position (the Q2/P1 pair, discontinuous), which
 is stable up to the incompressible limit and of optimal order. The pressure is eliminated in the element, so that only
@@ -27,7 +27,7 @@ def lame(young: FloatArray | float, poisson: float) -> tuple[FloatArray, FloatAr
 
 
 def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_matrix:
-    """Stiffness matrix of a mesh, a unit thickness deep.
+    """Assemble the stiffness matrix of a mesh of unit thickness.
 
     Parameters
     ----------

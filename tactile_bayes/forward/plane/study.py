@@ -25,7 +25,7 @@ HARD_RATIO = 100.0
 
 @dataclass(frozen=True, slots=True)
 class StudySettings:
-    """All that a study's table depends on besides its cases.
+    """Settings of a study: everything but its cases that the table depends on.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class StudySettings:
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Cases that share one factorisation: one body, several stiffnesses of its lump.
+    """Cases with the same geometry, which share one factorisation: one body, several stiffnesses of its lump.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Geometry:
 
 @dataclass(frozen=True, slots=True)
 class LineFit:
-    """Eq 5 fitted to a line.
+    """The fit of Eq 5 to a line.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> li
 
 @dataclass(frozen=True, slots=True)
 class PrintedEq6:
-    """Eq 6 as the paper learns it, in two stages, without uncertainty.
+    """Eq 6 learned in two stages as in the paper, without uncertainty.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def hard_cases(rows: Sequence[StudyRow]) -> list[StudyRow]:
 
 
 def widths(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
-    """(n,) widths across (``"x"``) or along the head (``"y"``; NaN where a row has none)."""
+    """(n,) widths across (``"x"``) or along the head (``"y"``; NaN in rows without one)."""
     if axis == "x":
         return np.array([row.sigma_x_mm for row in rows])
     return np.array([np.nan if row.sigma_y_mm is None else row.sigma_y_mm for row in rows])
@@ -256,6 +256,21 @@ def width_changes(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
     level = [abs(row.depth_ratio - 1.0) < 1e-9 for row in rows]
     reference = {key: width for key, width, at in zip(lump, sigma, level, strict=True) if at}
     return np.array([width / reference.get(key, np.nan) for key, width in zip(lump, sigma, strict=True)])
+
+
+def stiffness_changes(rows: Sequence[StudyRow], *, least_ratio: float = 8.0) -> dict[float, float]:
+    """By diameter: largest change of the width at one diameter depth from `least_ratio` on, as a share (Fig 7b).
+
+    The reference is the width at E2/E1 = 100; diameters without two detectable cases have no entry.
+    """
+    level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
+    changes = {}
+    for d in sorted({row.d_mm for row in level}):
+        sigma = {row.stiffness_ratio: row.sigma_x_mm for row in level if row.d_mm == d}
+        others = [value for ratio, value in sigma.items() if least_ratio <= ratio != HARD_RATIO]
+        if HARD_RATIO in sigma and others:
+            changes[d] = max(abs(value / sigma[HARD_RATIO] - 1.0) for value in others)
+    return changes
 
 
 def learn_as_printed(rows: Sequence[StudyRow], *, axis: str = "x") -> PrintedEq6 | None:

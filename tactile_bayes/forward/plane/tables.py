@@ -10,16 +10,18 @@ The first hides a bump under the background of 1 (decision record 0007); the sec
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.plane.condense import SurfaceCompliance
 from tactile_bayes.forward.plane.empirical import EmpiricalModel, fit_empirical
 from tactile_bayes.forward.plane.line import LineFrames, TactileLine, build_line, press_layers
 from tactile_bayes.forward.plane.study import HARD_RATIO, Fit, LineFit, StudySettings
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import HEAD_PITCH_MM
+from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 
 TABLE_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 TABLE_DEPTH_RATIOS = (0.6, 1.8)
@@ -46,11 +48,23 @@ PHANTOMS = {
     "phantom 18.75 mm": (18.75, 1.2),
 }
 """The silicone models of section 2.3: diameter in mm and h/d, with a rigid lump."""
+TRIED_HEADS = tuple(
+    Head(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
+    for radius in (13.0, 16.0, 20.0, 25.0, 35.0, 70.0)
+    for kind, shoulder in ((SHOULDERS_INSIDE, 3.0), (SHOULDERS_OUTSIDE, 3.0), (SHOULDERS_OUTSIDE, 15.0))
+    if shoulder < radius
+)
+"""Heads that the tables are computed for with ``tables --heads``."""
+NEAREST_HEADS = {
+    0.0: Head(radius_mm=13.0, shoulder_mm=3.0, shoulders=SHOULDERS_INSIDE),
+    1.0: Head(radius_mm=70.0, shoulder_mm=3.0, shoulders=SHOULDERS_OUTSIDE),
+}
+"""By seat: of `TRIED_HEADS` the one whose tables lie nearest to the printed ones (`table_distance`; record 0096)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A lump that both models are asked about.
+    """A lump for which both models are compared.
 
     Parameters
     ----------
@@ -71,7 +85,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curves:
-    """Both models of one scene.
+    """Frames and maps of both models for one scene.
 
     Parameters
     ----------
@@ -130,9 +144,16 @@ def phantom_scenes(seat: float) -> list[Scene]:
     return [Scene(name, d, h, seat) for name, (d, h) in PHANTOMS.items()]
 
 
-def scene_curves(scene: Scene, settings: StudySettings) -> Curves:
-    """Frames and maps of both models; the empirical one is fitted to what the taxels see far from and over the lump."""
-    surface = settings.surface(settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat))
+def scene_curves(scene: Scene, settings: StudySettings, *, surface: SurfaceCompliance | None = None) -> Curves:
+    """Frames and maps of both models; the empirical one is fitted to what the taxels see far from and over the lump.
+
+    Parameters
+    ----------
+    surface
+        The scene's body condensed onto its skin, where it is at hand.
+    """
+    if surface is None:
+        surface = settings.surface(settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat))
     elastic = settings.frames(surface, scene.stiffness_ratio)
     far = press_layers(surface.body.layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
     seen = elastic.as_taxels(HEAD_PITCH_MM)
@@ -147,9 +168,9 @@ def scene_curves(scene: Scene, settings: StudySettings) -> Curves:
     return Curves(elastic, empirical, build_line(elastic), build_line(empirical), model)
 
 
-def compare(scene: Scene, *, settings: StudySettings, fit: Fit) -> Agreement:
-    """One scene's figures."""
-    curves = scene_curves(scene, settings)
+def compare(scene: Scene, *, settings: StudySettings, fit: Fit, surface: SurfaceCompliance | None = None) -> Agreement:
+    """One scene's figures; `surface` as in `scene_curves`."""
+    curves = scene_curves(scene, settings, surface=surface)
     inside = np.abs(curves.elastic_map.x_mm) <= settings.fit_radius_mm
     ours, theirs = curves.empirical_map.mean[inside], curves.elastic_map.mean[inside]
     fitted, seen = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
@@ -168,6 +189,24 @@ def compare(scene: Scene, *, settings: StudySettings, fit: Fit) -> Agreement:
     )
 
 
+def compare_heads(scene: Scene, *, settings: StudySettings, heads: Sequence[Head], fit: Fit) -> list[Agreement]:
+    """One scene's figures under each of several heads; the body is condensed once."""
+    widest = max(heads, key=lambda head: head.half_face_mm)
+    body = settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat)
+    surface = replace(settings, head=widest).surface(body)
+    return [compare(scene, settings=replace(settings, head=head), fit=fit, surface=surface) for head in heads]
+
+
+def table_distance(found: Sequence[Agreement]) -> float:
+    """Root mean square difference from the printed cells of Tables 1 and 2, in percentage points."""
+    gaps = []
+    for one in found:
+        column = TABLE_DIAMETERS_MM.index(one.scene.d_mm)
+        gaps.append(100 * one.centred_frame - PRINTED_FRAMES[one.scene.depth_ratio][column])
+        gaps.append(100 * one.map - PRINTED_MAPS[one.scene.depth_ratio][column])
+    return float(np.sqrt(np.mean(np.square(gaps))))
+
+
 def mean_squared_difference(values: FloatArray, reference: FloatArray) -> float:
-    """Sum of squared differences over the sum of squares of the reference."""
+    """Sum of squared differences over the reference's sum of squares."""
     return float(np.sum((values - reference) ** 2) / np.sum(reference**2))

@@ -1,4 +1,4 @@
-"""What a stiff or soft spheroid in a layered body changes at the skin, by finite elements in Fourier modes.
+"""Change of the skin's compliance by a spheroidal lump in a layered body: finite elements in Fourier modes.
 
 The body is axisymmetric about the vertical axis through the lump, so a load of angular order m gives displacements of
 order m: ``u_r, u_z ~ cos(m theta)`` and ``u_theta ~ sin(m theta)``, and each order is a two-dimensional problem. The
@@ -37,7 +37,7 @@ _LEAST_SHARE: Final = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Tissue:
-    """The two layers: fat over gland, both and the lump with one Poisson's ratio below 0.5."""
+    """Moduli of the two layers, fat over gland, with one Poisson's ratio below 0.5 for both and the lump."""
 
     fat_kpa: float = FAT_KPA
     gland_ratio: float = GLAND_RATIO
@@ -53,7 +53,7 @@ class Tissue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModePerturbation:
-    """Order m of the perturbation.
+    """Perturbation of Fourier order m.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class ModePerturbation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CondensedMode:
-    """One order of the body around the lump, seen from the lump's boundary.
+    """One Fourier order of the body around the lump, condensed onto the lump's boundary.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class CondensedMode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CondensedLump:
-    """All orders of one geometry; a perturbation for each stiffness comes from it in milliseconds.
+    """All Fourier orders of one geometry; the perturbation for a stiffness takes milliseconds.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ class CondensedLump:
     modes: tuple[CondensedMode, ...]
 
     def perturbation(self, lump_kpa: float) -> tuple[ModePerturbation, ...]:
-        """Every order, for a lump of modulus `lump_kpa`."""
+        """Perturbations of all orders, for a lump of modulus `lump_kpa`."""
         if not lump_kpa > 0:
             raise BadDataError(f"the lump's modulus is {lump_kpa} kPa", way_out="it must be above 0")
         return tuple(mode.perturbation(lump_kpa) for mode in self.modes)
@@ -251,7 +251,7 @@ def _strains(shape: FloatArray, gradient: FloatArray, r_mm: FloatArray) -> Float
 
 
 def _skin(mesh: LumpMesh) -> IntArray:
-    """Skin nodes off the axis and off the far rim.
+    """Nodes of the skin off the axis and off the outer rim.
 
     On the axis the ring that a node stands for has no length, and the displacement there is off by several per cent
     where its neighbours' are off by a few in a thousand: symmetry gives the axis better.
@@ -260,7 +260,7 @@ def _skin(mesh: LumpMesh) -> IntArray:
 
 
 def _unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
-    """Reduced unknown (-1: fixed) and sign of each of the (n, 3) displacements of one order.
+    """Index (-1: fixed) and sign of the reduced unknown for each of the (n, 3) displacements of one order.
 
     The base and the far rim do not move. On the axis, displacements must be single-valued: order 0 keeps u_z, order 1
     a sideways motion with u_theta = -u_r, higher orders nothing. Order 0 has no torsion.
@@ -321,7 +321,7 @@ def _assemble(
     number: IntArray,
     sign: FloatArray,
 ) -> tuple[csc_array, IntArray]:
-    """Sparse stiffness of the chosen elements, and the unknowns it is for."""
+    """Sparse stiffness of the chosen elements, and the indices of its unknowns."""
     from scipy.sparse import coo_array
 
     element = mesh.element[chosen]
@@ -345,7 +345,7 @@ def _condensed_core(
     sign: FloatArray,
     boundary: IntArray,
 ) -> FloatArray:
-    """Stiffness of what lies inside the lump's boundary, condensed onto it (Guyan 1965: exact in statics)."""
+    """Stiffness of the lump's inside, condensed onto its boundary (Guyan 1965: exact in statics)."""
     matrix, used = _assemble(mesh, stiffness, modulus_kpa, inside, number, sign)
     dense = matrix.toarray()
     on = np.isin(used, boundary)

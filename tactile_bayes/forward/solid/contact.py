@@ -1,4 +1,4 @@
-"""A rigid head pressed without friction on an elastic body by a given force: which taxels bear, and how much.
+"""Frictionless contact of a rigid head with an elastic body under a given force: pressures on the taxels.
 
 Pressure is constant over each taxel. A taxel bears pressure where it touches, and is free where there is a gap:
 ``p >= 0``, ``gap >= 0``, ``p gap = 0``. The depth to which the head sinks is what makes the pressures add up to the
@@ -26,7 +26,7 @@ _PATIENCE: Final = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """A head at rest on the body.
+    """The solved contact of a head.
 
     Parameters
     ----------
@@ -64,17 +64,19 @@ class ContactStiffness:
 
     @classmethod
     def of(cls, compliance: FloatArray) -> ContactStiffness:
-        """Of a plain compliance: (n, n) in mm / kPa, symmetric positive definite."""
+        """Invert a plain compliance: (n, n) in mm / kPa, symmetric positive definite."""
         try:
             np.linalg.cholesky(compliance)
         except np.linalg.LinAlgError:
-            raise BadDataError("the compliance is not positive definite", way_out="give a body that resists") from None
+            raise BadDataError(
+                "the compliance is not positive definite", way_out="give a body with positive stiffness"
+            ) from None
         empty = np.zeros((len(compliance), 0))
         inverse = np.linalg.inv(compliance)
         return cls((inverse + inverse.T) / 2, empty, np.zeros((0, 0)))
 
     def changed(self, vectors: FloatArray, signs: FloatArray) -> ContactStiffness:
-        r"""The stiffness when ``vectors @ diag(signs) @ vectors.T`` is added to the compliance.
+        r"""Stiffness after ``vectors @ diag(signs) @ vectors.T`` is added to the compliance.
 
         Parameters
         ----------
@@ -94,13 +96,13 @@ class ContactStiffness:
         bracket = np.diag(signs) + vectors.T @ factor
         if np.count_nonzero(np.linalg.eigvalsh(bracket) < 0) != np.count_nonzero(signs < 0):
             raise BadDataError(
-                "the lumps together take more compliance from the skin than it has",
-                way_out="keep lumps further apart: their changes are added as if each were alone",
+                "the lumps lie too close together for this model",
+                way_out="move them apart: the effects of several lumps are added as if each were alone",
             )
         return ContactStiffness(self.plain, factor, np.asarray(-np.linalg.inv(bracket), dtype=np.float64))
 
     def times(self, right: FloatArray) -> FloatArray:
-        """The stiffness times an (n, c) array."""
+        """Product of the stiffness with an (n, c) array."""
         product: FloatArray = self.plain @ right + self.factor @ (self.core @ (self.factor.T @ right))
         return product
 
@@ -168,7 +170,9 @@ def press(
             now[last] = not now[last]
         if not (now & (share > 0)).any():
             now[int(np.argmin(np.where(share > 0, height_mm, np.inf)))] = True
-    raise NotConvergedError("the contact of the head was not found", diagnostics={"wrong_signs": float(fewest)})
+    raise NotConvergedError(
+        "the contact between head and skin did not converge", diagnostics={"wrong_signs": float(fewest)}
+    )
 
 
 def _solve(
@@ -180,9 +184,9 @@ def _solve(
     share: FloatArray,
     mean_kpa: float,
 ) -> tuple[Contact, BoolArray]:
-    """The contact if exactly `touching` touched, and where pressure or gap then has the wrong sign."""
+    """Solve the contact for exactly the `touching` squares, and find where pressure or gap has the wrong sign."""
     off = np.flatnonzero(~touching)
-    # one column a unit of depth, one for the head's shape
+    # one column for a unit of depth, one for the head's shape
     pressure = np.stack([level, -shaped], axis=-1)
     gap = np.zeros((len(level), 2))
     if len(off):

@@ -34,7 +34,7 @@ _DIRECTIONS: Final = 24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinPerturbation:
-    r"""What one lump changes in the skin's compliance, as a short sum.
+    r"""Low-rank change of the skin's compliance by one lump.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class SkinPerturbation:
 
     @property
     def reach_mm(self) -> float:
-        """Distance beyond which the change is taken as none."""
+        """Distance beyond which the change is neglected."""
         return (len(self.table) - 1) * _STEP_MM
 
     def vectors(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -84,7 +84,7 @@ def skin_perturbation(
     square_mm: float = HEAD_PITCH_MM,
     tolerance: float = RANK_TOLERANCE,
 ) -> SkinPerturbation:
-    """Condense a lump's perturbation to the functions that matter.
+    """Condense a lump's perturbation to its leading functions.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class PlacedLump:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolidFrame:
-    """The head at rest on the body.
+    """The solved frame of a head at one pose.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ class SolidFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolidHead:
-    """A head on a layered body; made by `solid_head`.
+    """A rigid head on a layered body; made by `solid_head`.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ class SolidHead:
         return SolidFrame(self.face.taxel_frame(contact.pressure_kpa), contact.depth_mm, contact)
 
     def _vectors(self, lump: PlacedLump, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What one lump changes under the face, per unit pressure on a square, without what is too small to matter."""
+        """Change by one lump under the face, per unit pressure on a square; negligible parts are dropped."""
         values, signs = lump.perturbation.vectors(x_mm - lump.x_mm, y_mm - lump.y_mm)
         values = values * self.face.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
         weight = np.einsum("nk,nk->k", values, values)

@@ -1,4 +1,4 @@
-"""How far the skin of a layered body sinks under a normal load: its exact Green's function, and means over taxels.
+"""Sinking of a layered body's skin under normal loads: its exact Green's function, and means over taxels.
 
 The body is a stack of elastic layers, bonded to each other, on a rigid base to which the lowest is bonded, or with a
 half-space as its lowest layer. z runs into the body; a displacement is positive downwards, a pressure into the skin.
@@ -17,9 +17,9 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import POISSON
 from tactile_bayes.geometry import FloatArray
 
-# Beyond this wave number times the top layer's thickness the layers below are not felt: exp(-2 x 18) = 2e-16.
+# Beyond this wave number times the top layer's thickness the layers below have no effect: exp(-2 x 18) = 2e-16.
 _DEEPEST: Final = 18.0
-# Gauss points a panel, and panels a decade of wave numbers; the remainder is smooth on a logarithmic scale.
+# Gauss points per panel, and panels per decade of wave numbers; the remainder is smooth on a logarithmic scale.
 _POINTS: Final = 24
 # Below this thickness in wave lengths the layer matrices lose digits, and the integrand is as good as constant.
 _LEAST: Final = 1e-3
@@ -163,7 +163,7 @@ def layering_compliance(r_mm: FloatArray, body: LayeredBody) -> FloatArray:
 
 
 def _wave_numbers(body: LayeredBody, *, reach_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Legendre points and weights over the wave numbers that matter, fine enough for J0 at `reach_mm`."""
+    """Gauss-Legendre points and weights over wave numbers, fine enough for J0 at `reach_mm`."""
     top = _DEEPEST / body.thickness_mm[0]
     slowest = 0.05 / sum(body.thickness_mm)
     edges = np.concatenate([[0.0], np.geomspace(slowest, top, 1 + int(np.ceil(4 * np.log10(top / slowest))))])

@@ -125,7 +125,7 @@ class LumpMesh:
 
 @dataclass(slots=True)
 class _Patches:
-    """Lattices of nodes, gathered before equal nodes are merged."""
+    """Lattices of nodes before equal nodes are merged."""
 
     lattices: list[tuple[FloatArray, int]] = field(default_factory=list)
 
@@ -134,7 +134,7 @@ class _Patches:
 
 
 def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> LumpMesh:
-    """Mesh a lump in its body; see the module for the layout."""
+    """Mesh a lump in its body; the module describes the layout."""
     size = size or MeshSize()
     g, boundary = geometry, geometry.boundary_mm()
     corner_r, top, bottom = _box(g, boundary)
@@ -166,7 +166,7 @@ def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
 
 
 class _Fan:
-    """Where the rays from the lump meet the box: up to four sectors, split at its corners and at the layer boundary."""
+    """Intersections of rays from the lump with the box: up to four sectors, split at corners and layer boundary."""
 
     def __init__(
         self, g: LumpGeometry, boundary: float, corner_r: float, top: float, bottom: float, elements: int
@@ -244,7 +244,7 @@ def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def _graded_line(start: float, stop: float, *, first: float, grade: float) -> FloatArray:
-    """Nodes of elements that grow from about `first` by at most `grade` until `stop`."""
+    """Nodes of elements whose length grows from about `first` by at most `grade` until `stop`."""
     length = stop - start
     count = max(1, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
     line = start + length * _graded_share(count, grade)
@@ -253,7 +253,7 @@ def _graded_line(start: float, stop: float, *, first: float, grade: float) -> Fl
 
 
 def _beyond_box(patches: _Patches, fan: _Fan, g: LumpGeometry, boundary: float, size: MeshSize) -> None:
-    """The lattices right of, below and above the box."""
+    """The lattices outside, below and above the box."""
     reach = max(size.reach_mm, 2.0 * fan.corner_r, 4.0 * g.depth_mm)
     side = fan.side_mm()
     element_r = float(fan.corner_r - fan.across_mm(0)[-3])
@@ -267,7 +267,7 @@ def _beyond_box(patches: _Patches, fan: _Fan, g: LumpGeometry, boundary: float, 
 
 
 def _down_from(start: float, stop: float, boundary: float, *, first: float, grade: float) -> FloatArray:
-    """Nodes down a line that has a node where the layers meet; empty when the line has no length."""
+    """Nodes down a line, one of them at the layer boundary; empty when the line has no length."""
     if not stop > start:
         return np.zeros(0)
     if not start < boundary < stop:
@@ -278,7 +278,7 @@ def _down_from(start: float, stop: float, boundary: float, *, first: float, grad
 
 
 def _lattice(patches: _Patches, r: FloatArray, z: FloatArray, boundary: float) -> None:
-    """A rectangle of elements, cut where the layers meet."""
+    """A rectangle of elements, split at the layer boundary."""
     cuts = [0, *np.flatnonzero(z == boundary), len(z) - 1]
     for a, b in pairwise(cuts):
         if b > a:

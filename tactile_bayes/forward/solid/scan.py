@@ -1,4 +1,4 @@
-"""A scan of lumps of tissue in a layered body, solved frame by frame in three dimensions."""
+"""Three-dimensional scans of lumps of tissue in a layered body, solved frame by frame."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def simulate_solid(scene: Scene, *, rng: np.random.Generator, progress: Progress
 def solid_frames(
     scene: Scene, time_s: FloatArray, *, progress: Progress | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """What the head feels at (n,) times, without noise.
+    """Pressures on the head at (n,) times, without noise.
 
     Returns
     -------
@@ -61,40 +61,63 @@ def solid_frames(
     depth_mm : (n,) array
         z of the head's apex in the scene's `plane`.
     """
-    body = scene.body or SceneBody()
-    head, lumps = _head(scene.head, body, fat_thickness(body, scene.solid_lumps)), _placed(scene)
     rotation, origin = head_positions(scene, time_s)
     level = level_kpa(scene.background, time_s)
-    pressure = np.empty((len(time_s), scene.head.rows, scene.head.columns))
-    depth, touching = np.empty(len(time_s)), None
-    for i in range(len(time_s)):
+    return frames_at_poses(scene, rotation, origin, mean_kpa=level, progress=progress)
+
+
+def frames_at_poses(
+    scene: Scene,
+    rotation: FloatArray,
+    origin_mm: FloatArray,
+    *,
+    mean_kpa: FloatArray,
+    progress: Progress | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """What the scene's head feels at given poses and levels, without noise; returns as `solid_frames`.
+
+    Parameters
+    ----------
+    rotation : (n, 3, 3) array
+        From `scanhead` to the scene's `plane`.
+    origin_mm : (n, 3) array
+        Of the head's face; its depth is not used, the level decides it.
+    mean_kpa : (n,) array
+        Mean over the taxels.
+    """
+    body = scene.body or SceneBody()
+    head, lumps = _head(scene.head, body, fat_thickness(body, scene.solid_lumps)), _placed(scene)
+    count = len(mean_kpa)
+    pressure = np.empty((count, scene.head.rows, scene.head.columns))
+    depth, touching = np.empty(count), None
+    for i in range(count):
         frame = head.frame(
             lumps,
             rotation=rotation[i],
-            x_mm=float(origin[i, 0]),
-            y_mm=float(origin[i, 1]),
-            mean_kpa=float(level[i]),
+            x_mm=float(origin_mm[i, 0]),
+            y_mm=float(origin_mm[i, 1]),
+            mean_kpa=float(mean_kpa[i]),
             touching=touching,
         )
         pressure[i], depth[i], touching = frame.pressure_kpa, frame.depth_mm, frame.contact.touching
         if progress is not None:
-            progress(i + 1, len(time_s))
+            progress(i + 1, count)
     return pressure, depth
 
 
 def face_of(head: Head) -> HeadFace:
-    """The face that can touch; shoulders inside the array leave no room for a rim around it."""
+    """Face of the head that can touch the skin; shoulders inside the array leave no room for a rim."""
     rim = 0.0 if head.shoulder_mm > 0 else head.rim_mm
     return head_face(head.surface_mm(), pitch_mm=head.pitch_mm, radius_mm=head.radius_mm, rim_mm=rim)
 
 
 def layers_of(body: SceneBody, fat_mm: float) -> LayeredBody:
-    """The body without lumps."""
+    """The layered body without lumps."""
     return LayeredBody((body.fat_kpa, body.fat_kpa * body.gland_ratio), (fat_mm, body.thickness_mm - fat_mm), body.nu)
 
 
 def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> CondensedLump:
-    """What surrounds a lump, condensed; its stiffness and place do not matter here."""
+    """Condense the body around a lump; the lump's stiffness and place do not matter here."""
     geometry = LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, fat_mm, body.thickness_mm)
     return condense_lump(geometry, Tissue(body.fat_kpa, body.gland_ratio, body.nu))
 
@@ -104,7 +127,7 @@ def _head(head: Head, body: SceneBody, fat_mm: float) -> SolidHead:
 
 
 def _placed(scene: Scene) -> list[PlacedLump]:
-    """The scene's lumps; those of one size and depth are condensed once."""
+    """The scene's lumps with their places; lumps of equal size and depth are condensed once."""
     body = scene.body or SceneBody()
     fat = fat_thickness(body, scene.solid_lumps)
 

@@ -33,7 +33,7 @@ _LEVEL = np.eye(3)
 
 @dataclass(frozen=True, slots=True)
 class SolidSettings:
-    """All that a solid study's table depends on besides its cases.
+    """Settings of a solid study: everything but its cases that the table depends on.
 
     Parameters
     ----------
@@ -99,17 +99,17 @@ class SolidSettings:
         return LumpGeometry(radius, radius, body.centre_mm, layers.fat_mm, layers.thickness_mm)
 
     def condensed(self, body: Body) -> CondensedLump:
-        """What surrounds the ball, condensed."""
+        """The body around the ball, condensed."""
         tissue = Tissue(body.fat_kpa, body.gland_ratio, body.poisson)
         return condense_lump(self.geometry(body), tissue, size=self.mesh_size)
 
     @property
     def mesh_size(self) -> MeshSize:
-        """Of the fineness and the reach."""
+        """Mesh size for the fineness and the reach."""
         return mesh_size(self.fineness, reach_mm=self.mesh_reach_mm)
 
     def on(self, body: Body) -> SolidHead:
-        """The head on the body without its lump."""
+        """The head on the body without a lump."""
         layers = body.layers
         moduli = (body.fat_kpa, body.fat_kpa * body.gland_ratio)
         thicknesses = (layers.fat_mm, layers.thickness_mm - layers.fat_mm)
@@ -127,7 +127,7 @@ class SolidSettings:
 
 
 def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSize:
-    """The mesh of a fineness; 2 is the default one, and twice the fineness has half the element everywhere."""
+    """Mesh size of a fineness; 2 is the default, and doubling it halves every element."""
     default = MeshSize()
     share = fineness / FINENESS
     return MeshSize(
@@ -141,7 +141,7 @@ def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RasterFrames:
-    """Frames of a level head at many places.
+    """Frames of a level head on a raster of places.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ class RasterFrames:
 
 @dataclass(frozen=True, slots=True)
 class RasterFit:
-    """Eq 7 fitted to a raster's map.
+    """The fit of Eq 7 to a raster's map.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]
 
 
 def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSettings) -> RasterFrames:
-    """Frames of the whole raster about a lump, or about nothing.
+    """Frames of the raster over a lump, or over the plain body.
 
     Notes
     -----

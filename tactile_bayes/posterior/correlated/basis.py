@@ -1,4 +1,4 @@
-r"""Inner products of many bumps from those of a few that span them.
+r"""Low-rank basis shared by many bumps, for fast inner products.
 
 Points about one mode have nearly the same bump. Along each axis their profiles are sums of about ten, told by a
 singular value decomposition of the points' own, and every bump is a sum of products of two. What a posterior needs of a
@@ -24,7 +24,7 @@ MOST_PRODUCTS = 200
 
 
 class Spanned:
-    """Bumps along the grid's axes as sums of products of two profiles.
+    """Bumps along the grid's axes in a shared basis: sums of products of two profiles.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Spanned:
 
     @classmethod
     def of(cls, bumps: Profiles, window: Window, weighted_plain: FloatArray) -> Spanned | None:
-        """Of products of profiles; None where a basis does not pay."""
+        """Find the basis for products of profiles; None where it would not save time."""
         rows, columns = bumps.rows, bumps.columns
         assert rows is not None
         assert columns is not None
@@ -58,7 +58,7 @@ class Spanned:
         return cls(by_row[:, i] * by_column[:, j], products, _gram(window, along, across)[i[:, None], i, j[:, None], j])
 
     def inner(self, columns: FieldColumns) -> Inner:
-        """Under one length's field."""
+        """Inner products under the noise fields of one length."""
         basis = Inner.of(self._products, columns)
         c = self._coefficients
         m, (r, h, plain) = len(c), basis.plain.shape
@@ -80,13 +80,13 @@ def _basis(profiles: FloatArray, least: float) -> FloatArray:
 
 
 def _gram(window: Window, along: FloatArray, across: FloatArray) -> FloatArray:
-    """(ry, ry, rx, rx) weighted products of products of profiles."""
+    """(ry, ry, rx, rx) weighted inner products of pairs of profile products."""
     rows, columns = ((one[:, None] * one).reshape(len(one) ** 2, -1) for one in (along, across))
     return np.asarray(rows @ window.weight @ columns.T).reshape(len(along), len(along), len(across), len(across))
 
 
 def _kept(size: FloatArray, least: float) -> tuple[IntArray, IntArray]:
-    """Rows and columns of (ry, rx) norms squared, without the smallest, which come to `DROPPED` at most."""
+    """Rows and columns kept of (ry, rx) squared norms; the dropped ones sum to `DROPPED` at most."""
     order = np.argsort(size, axis=None)
     kept = order[np.sqrt(np.cumsum(size.ravel()[order])) > DROPPED * least]
     return kept // size.shape[1], kept % size.shape[1]

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
+from typing import Literal, assert_never
 
 import numpy as np
 
@@ -13,16 +14,18 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.cache import Solved, distinct_rows
 from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws
-from tactile_bayes.inference.importance import ImportanceOptions, importance
+from tactile_bayes.inference.importance import importance, importance_options
 from tactile_bayes.inference.pareto import TRUSTED_SHAPE, smooth_weights
-from tactile_bayes.posterior.correlated.fit import FieldFit, laplace_mixture
+from tactile_bayes.inference.proposal import Gaussians
+from tactile_bayes.posterior.correlated.fit import FieldFit, laplace_mixture, newton_mixture
+from tactile_bayes.posterior.correlated.marginal import NEGLIGIBLE
 from tactile_bayes.posterior.options import EstimateOptions
-from tactile_bayes.presets import Method
 from tactile_bayes.records import dataclass
 
-LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
+Sampler = Literal["laplace", "importance", "ensemble"]
+LADDER: tuple[Sampler, ...] = ("laplace", "importance", "ensemble")
 STEPS_UP = 1
-"""Methods that are tried after the one asked for: who asks for a quick one does not wait minutes for chains."""
+"""Methods tried after the requested one: a user who wants a quick one does not wait minutes for chains."""
 DISAGREEMENT = 5.0
 """Ends of intervals by two methods differ by more than this many of their joint Monte-Carlo errors: one is wrong."""
 START_ACCURACY_SD = 0.05
@@ -32,14 +35,14 @@ Progress = Callable[[int, int], None]
 
 
 def accuracy_in_sd(fit: FieldFit, options: EstimateOptions) -> float | None:
-    """The accuracy that the options ask for, in posterior SDs of this fit's widths; the finer of SD and mm holds."""
+    """Requested accuracy in posterior SDs of this fit's widths; the finer of SD and mm counts."""
     if options.accuracy_mm is None:
         return options.accuracy_sd
     return min(max(options.accuracy_mm / width_sd_mm(fit), 1e-3), options.accuracy_sd or 0.5)
 
 
 def width_sd_mm(fit: FieldFit) -> float:
-    """Posterior SD of the less certain of the two widths, by the Gaussians."""
+    """Posterior SD of the less certain width, from the Gaussian approximation."""
     names = [name for name in ("u", "v") if name in fit.scene.names]
     return max(fit.sd(name) * float(np.exp(fit.scene.column(fit.mode, name))) for name in names)
 
@@ -52,7 +55,7 @@ def draw_scene(
     progress: Progress | None = None,
     solved: Solved | None = None,
 ) -> tuple[ParameterDraws, tuple[str, ...]]:
-    """Draws by the method asked for, or by the next one where its diagnostics do not hold.
+    """Draw by the requested method, or by the next one if its diagnostics fail.
 
     Parameters
     ----------
@@ -73,7 +76,8 @@ def draw_scene(
     passed_over: list[str] = []
     figures: Mapping[str, float] = {}
     first = LADDER.index(options.method)
-    for name in LADDER[first : first + STEPS_UP + 1]:
+    steps = STEPS_UP if options.step_up else 0
+    for name in LADDER[first : first + steps + 1]:
         try:
             draws = _draw(fit, name, rng=rng, options=options, progress=progress, solved=solved)
         except NotConvergedError as error:
@@ -90,7 +94,7 @@ def draw_scene(
 
 def _draw(
     fit: FieldFit,
-    method: Method,
+    method: Sampler,
     *,
     rng: np.random.Generator,
     options: EstimateOptions,
@@ -101,15 +105,18 @@ def _draw(
         return judged_laplace(fit, rng=rng, draws=options.draws)
     accuracy = accuracy_in_sd(fit, options)
     density = Sampled.of(fit)
-    if method == "importance":
-        draws = importance_draws(density.keeping(solved), rng=rng, accuracy_sd=accuracy)
-    else:
-        draws = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
+    match method:
+        case "importance":
+            draws = importance_draws(density.keeping(solved), rng=rng, accuracy_sd=accuracy)
+        case "ensemble":
+            draws = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
+        case _:
+            assert_never(method)
     return density.finished(draws, rng)
 
 
 def judged_laplace(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDEPENDENT_DRAWS) -> ParameterDraws:
-    """The Gaussians' draws, with the Pareto shape of the weights that would make them exact."""
+    """Draw from the Gaussian mixture, with the Pareto shape of its importance weights."""
     drawn = laplace_mixture(fit, rng=rng, draws=draws)
     some = drawn.flat[:CHECKED]
     _, shape = smooth_weights(fit.target(some) - fit.mixture.log_density(some))
@@ -118,7 +125,7 @@ def judged_laplace(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDE
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sampled:
-    """The density that is sampled: the bump's parameters, those of a second structure held at their mode.
+    """Density to be sampled: the bump's parameters, with a second structure's fixed at their mode.
 
     A rib whose crest lies outside the window shows a flank only: its place and width trade against each other along a
     curve that no sampler follows cheaply and that hardly concerns the bump. What that costs the bump in certainty is
@@ -132,6 +139,10 @@ class Sampled:
         The second structure's parameters.
     spread : (k, k) array
         Root of the covariance that the second structure's uncertainty adds.
+    parts
+        A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
+        correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the
+        posterior, and all of its tails. None where one of them has no maximum.
     solved
         Where solutions are kept; None keeps none.
     """
@@ -141,20 +152,23 @@ class Sampled:
     covariance: FloatArray
     beside: FloatArray
     spread: FloatArray
+    parts: Gaussians | None = None
     solved: Solved | None = None
 
     @classmethod
     def of(cls, fit: FieldFit) -> Sampled:
-        """From a fit; without a second structure the density is the fit's own."""
+        """Prepare from a fit; without a second structure the density is the fit's own."""
         mean, covariance = fit.mixture.moments()
         k = len(fit.scene.alone().names)
+        parts = newton_mixture(fit.target, fit.mode, fit.covariance, least_share=NEGLIGIBLE)
         if k == len(mean):
-            return cls(fit, mean, covariance, np.zeros(0), np.zeros((k, k)))
+            return cls(fit, mean, covariance, np.zeros(0), np.zeros((k, k)), parts)
         across = covariance[:k, k:]
         added = across @ np.linalg.solve(covariance[k:, k:], across.T)
         values, vectors = np.linalg.eigh(0.5 * (added + added.T))
         spread = vectors * np.sqrt(np.clip(values, 0.0, None))
-        return cls(fit, fit.mode[:k], covariance[:k, :k] - added, fit.mode[k:], spread)
+        given = None if parts is None else parts.given(fit.mode[k:])
+        return cls(fit, fit.mode[:k], covariance[:k, :k] - added, fit.mode[k:], spread, given)
 
     def __call__(self, theta: FloatArray) -> FloatArray:
         """(m,) log density of (m, k) parameters of the bump."""
@@ -163,27 +177,27 @@ class Sampled:
         return self.fit.target.solved_density(theta, self.solved)
 
     def keeping(self, solved: Solved | None) -> Sampled:
-        """The same density, which leaves its solutions in `solved` if draws will be points where it was evaluated."""
+        """The same density, storing its solutions in `solved` if draws will be evaluated points."""
         return self if len(self.beside) else replace(self, solved=solved)
 
     def whole(self, theta: FloatArray) -> FloatArray:
-        """(..., p) parameters of the scene."""
+        """(..., p) parameters of the whole scene."""
         return np.concatenate([theta, np.broadcast_to(self.beside, (*theta.shape[:-1], len(self.beside)))], axis=-1)
 
     def finished(self, draws: ParameterDraws, rng: np.random.Generator) -> ParameterDraws:
-        """Draws of the whole scene from draws of the density."""
+        """Draws of the whole scene, from draws of the sampled density."""
         if not len(self.beside):
             return draws
-        # a point that was resampled several times moves as one: each new point costs a solution of what is linear
+        # copies of a resampled point move together: each new point costs a linear solution
         points, back = distinct_rows(draws.flat)
         moved = (points + rng.standard_normal(points.shape) @ self.spread.T)[back]
         return replace(draws, theta=self.whole(moved).reshape(*draws.theta.shape[:2], -1))
 
 
 def importance_draws(density: Sampled, *, rng: np.random.Generator, accuracy_sd: float | None = None) -> ParameterDraws:
-    """Weighted draws about the Gaussians' common mean and covariance."""
-    options = ImportanceOptions() if accuracy_sd is None else ImportanceOptions(accuracy_sd=accuracy_sd)
-    return importance(density, density.mean, density.covariance, rng=rng, options=options)
+    """Draw by importance sampling from the Gaussians' common mean and covariance, or from each of them."""
+    options = importance_options(accuracy_sd)
+    return importance(density, density.mean, density.covariance, rng=rng, options=options, parts=density.parts)
 
 
 def ensemble_draws(
@@ -194,7 +208,7 @@ def ensemble_draws(
     accuracy_sd: float | None = None,
     progress: Progress | None = None,
 ) -> ParameterDraws:
-    """MCMC from importance draws, compared with them.
+    """Draw by MCMC, starting from importance draws and compared with them.
 
     Raises
     ------
@@ -250,14 +264,14 @@ def disagreement(chains: ParameterDraws, weighted: ParameterDraws) -> float:
 
 
 def with_end_error(fit: FieldFit, draws: ParameterDraws) -> ParameterDraws:
-    """The draws with their interval ends' Monte-Carlo error in SDs and mm (of the Gaussians: not their bias)."""
+    """Add the Monte-Carlo error of interval ends in SDs and mm (of the Gaussians: their bias is not included)."""
     found = dict(draws.diagnostics)
     found.setdefault("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
     return replace(draws, diagnostics=found | {"end_error_mm": found["end_error_sd"] * width_sd_mm(fit)})
 
 
 def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> str:
-    """Hash of everything that a chain depends on: cells, scene, priors, fields, settings and the random numbers."""
+    """Hash of everything that a chain depends on: cells, scene, priors, fields, settings and seed."""
     target = fit.target
     digest = hashlib.sha256()
     cells = target.window.cells

@@ -1,4 +1,4 @@
-"""A bump under correlated errors: detection, scene and draws from its least-squares fit."""
+"""Estimation under correlated errors: detection, scene and draws from a least-squares fit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.paired import MOST_PAIRED, paired_points
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.correlated.draw import draw_scene
-from tactile_bayes.posterior.correlated.fit import FieldFit, field_window, shape_draws, start_vector
+from tactile_bayes.posterior.correlated.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector
 from tactile_bayes.posterior.correlated.neighbour import WANTED, add_beside, rising_ribs
 from tactile_bayes.posterior.correlated.noise import cosines_for
 from tactile_bayes.posterior.correlated.peakedness import ask_departure
@@ -25,7 +25,6 @@ from tactile_bayes.posterior.correlated.ridge import ridge_instead, ridge_text
 from tactile_bayes.posterior.correlated.scene import Scene
 from tactile_bayes.posterior.correlated.selection import ASKING, SceneChoice, choose_shape
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
-from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import trusted
 from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
@@ -42,7 +41,7 @@ LEAST_VARIANCE = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldAnswer:
-    """What the map says under correlated errors.
+    """Detection and scene of a map under correlated errors.
 
     Parameters
     ----------
@@ -58,32 +57,18 @@ class FieldAnswer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldDraws:
-    """Draws under correlated errors: of the scene's parameters, by name, and figures of the fit and the noise."""
+    """Draws under correlated errors: of the scene's parameters, by name, and figures of fit and noise."""
 
     detection: Detection
-    choice: SceneChoice
     draws: ParameterDraws
     posterior: MapPosterior
     figures: NoiseFigures
 
 
-def look(
-    tactile_map: TactileMap,
-    fit: BumpFit,
-    *,
-    prior: BumpPrior,
-    radius_mm: float,
-    scene: SceneAsked = "auto",
-    least_odds: float,
-    cosines: int | None = None,
-) -> FieldAnswer:
-    """Fit the bump under correlated errors and weigh it against none.
+def look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> FieldAnswer:
+    """Fit the bump under correlated errors, and compare it with no bump.
 
-    Parameters
-    ----------
-    cosines
-        As `FitOptions.field_cosines`. Without a number a bump that may be a lump and is narrow is fitted once more,
-        with a finer field.
+    Where the options give no `field_cosines`, a narrow bump that may be a lump is fitted once more, with a finer field.
 
     Raises
     ------
@@ -92,11 +77,11 @@ def look(
     """
 
     def under(number: int, start: FloatArray) -> FieldAnswer:
-        problem = Problem(field_window(fit, cosines=number), prior, radius_mm, fit.bump.scale)
-        choice = choose_shape(problem, start, scene=scene, least_odds=least_odds)
+        problem = Problem(field_window(fit, cosines=number), options.prior, options.fit.radius_mm, fit.bump.scale)
+        choice = choose_shape(problem, start, scene=scene_asked(options))
         return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
 
-    full = Scene("rotated")
+    full, cosines = Scene("rotated"), options.fit.field_cosines
     answer = under(cosines or FIELD_COSINES, start_vector(fit, full))
     if cosines is not None or not answer.detection.log_bayes_factor > 0:
         return answer
@@ -107,10 +92,9 @@ def look(
 
 
 def _called_for(plain: FieldFit) -> int:
-    """Cosines that the fitted bump's narrower width calls for."""
-    sigma_x, sigma_y, _ = (float(values[0]) for values in shape_draws(plain, plain.mode[None]))
-    window = plain.target.window
-    return max(cosines_for(min(sigma_x, sigma_y), axis) for axis in (window.x_mm, window.y_mm))
+    """Number of cosines for the narrower width of the fitted bump."""
+    narrower, window = min(modal_widths(plain)), plain.target.window
+    return max(cosines_for(narrower, axis) for axis in (window.x_mm, window.y_mm))
 
 
 def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: float) -> Detection:
@@ -122,15 +106,15 @@ def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: floa
 
 
 def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
-    """Log of how many windows the map has."""
+    """Log number of windows in the map's area."""
     area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2
     return float(np.log(max(area / (np.pi * plain.target.problem.radius_mm**2), 1.0)))
 
 
 def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: SceneAsked = "auto") -> FieldAnswer:
-    """The same with a second structure where the map asks for one, the lump weighed against a ridge where one rises.
+    """Add a second structure where the evidence supports it, and compare the lump with a ridge where one rises.
 
-    A bump alone is asked whether it is a Gaussian. Only scenes that ask what lies beside the lump are weighed so:
+    A bump alone is tested for a departure from a Gaussian. Only scenes in `ASKING` are compared with a ridge:
     without a rib in the model a lump beside one would lose to it.
     """
     if scene not in ASKING:
@@ -154,12 +138,12 @@ def draw(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> FieldDraws:
-    """Draws of what was found.
+    """Draw from the posterior of an answer.
 
     Raises
     ------
     NotConvergedError
-        When no method converges, or the neighbour that the scene asks for was not found.
+        When no method converges, or the scene's neighbour was not found.
     """
     scene = scene_asked(options)
     choice, wanted = answer.choice, WANTED.get(scene, "")
@@ -172,13 +156,13 @@ def draw(
         detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
     places = pose_covariance(choice.fit)
     figures = _figures(choice, _places_share(choice.fit, places), passed_over)
-    return FieldDraws(detection, choice, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
+    return FieldDraws(detection, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
 
 
 def _posterior(
     fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved, places: FloatArray
 ) -> MapPosterior:
-    """Draws by name, with what errors of the frames' places add to them."""
+    """Draws by name, with tracker position error added."""
     shape = draws.theta.shape[:2]
     theta = draws.theta + _displaced(fit, draws, places, rng).reshape(draws.theta.shape)
     sigma_x, sigma_y, angle = shape_draws(fit, theta)
@@ -196,7 +180,7 @@ def _posterior(
 
 
 def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(chain * draw, p) normal draws of a covariance, spread evenly over the draws in order of their mean width."""
+    """(chain * draw, p) normal draws with a covariance, spread evenly over the draws in order of mean width."""
     values, vectors = np.linalg.eigh(places)
     kept = np.flatnonzero(values > LEAST_VARIANCE * values[-1])[-MOST_PAIRED:]
     if not values[-1] > 0:
@@ -207,7 +191,7 @@ def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np
 
 
 def _places_share(fit: FieldFit, places: FloatArray) -> float | None:
-    """Share of the variance of the log widths that errors of the frames' places make; None where they are not told."""
+    """Share of the log widths' variance from tracker position error; None where that is not known."""
     if fit.target.window.cells.pose_noise is None:
         return None
     widths = [fit.scene.names.index(name) for name in ("u", "v") if name in fit.scene.names]

@@ -1,4 +1,4 @@
-"""The posterior of a scene under correlated errors: its mode, a Gaussian for each field, and draws."""
+"""Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.derivatives import finite_differences, stencil
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
 from tactile_bayes.inference.laplace import find_mode, mode_and_covariance
+from tactile_bayes.inference.proposal import Gaussians
 from tactile_bayes.posterior.correlated.marginal import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene
@@ -22,48 +23,27 @@ MOST_SETTLINGS = 6
 ROUGH, FINE = 0.3, 1e-3
 """Of the last Newton step, in `Scene.steps`: under the start's fields, which are not the mode's; then under those."""
 LEAST_SHARE = 1e-2
-"""Fields with a smaller share of the posterior have no Gaussian of their own."""
+"""Fields with a smaller share of the density at the mode have no Gaussian of their own in what `laplace` draws."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mixture:
+class Mixture(Gaussians):
     """One Gaussian for each noise field that matters: what `laplace` draws from.
 
     Parameters
     ----------
-    weight : (h,) array
-        Sum 1.
-    mean, covariance : (h, p), (h, p, p) arrays
+    weight, mean, covariance
+        As in `Gaussians`.
     log_evidence
         Log of the integral of the density that the mixture stands for.
     """
 
-    weight: FloatArray
-    mean: FloatArray
-    covariance: FloatArray
     log_evidence: float
-
-    def log_density(self, theta: FloatArray) -> FloatArray:
-        """(m,) log density of the Gaussians, normalised."""
-        parts = []
-        for weight, mean, covariance in zip(self.weight, self.mean, self.covariance, strict=True):
-            z = np.linalg.solve(np.linalg.cholesky(covariance), (theta - mean).T)
-            volume = float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
-            parts.append(np.log(weight) - 0.5 * np.sum(z**2, axis=0) - 0.5 * volume)
-        return np.asarray(np.logaddexp.reduce(parts, axis=0))
-
-    def moments(self) -> tuple[FloatArray, FloatArray]:
-        """(p,) mean and (p, p) covariance of the whole."""
-        mean = self.weight @ self.mean
-        off = self.mean - mean
-        return mean, np.asarray(
-            np.einsum("h,hpq->pq", self.weight, self.covariance) + (self.weight[:, None] * off).T @ off
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFit:
-    """Mode of a collapsed posterior.
+    """A scene fitted at the mode of its marginal posterior.
 
     Parameters
     ----------
@@ -72,7 +52,7 @@ class FieldFit:
     mode, covariance : (p,), (p, p) arrays
         Of the scene's parameters; the covariance is the mixture's, not the curvature at the mode.
     mixture
-        A Gaussian a field.
+        One Gaussian per noise field.
     """
 
     target: CollapsedTarget
@@ -82,12 +62,12 @@ class FieldFit:
 
     @property
     def scene(self) -> Scene:
-        """What the model has."""
+        """Structures in the model."""
         return self.target.scene
 
     @property
     def rotated(self) -> bool:
-        """Whether the ellipse may turn."""
+        """Whether the ellipse may be rotated."""
         return self.target.rotated
 
     @property
@@ -97,7 +77,7 @@ class FieldFit:
 
     @property
     def log_evidence(self) -> float:
-        """Log evidence of the scene by the Gaussians' volumes."""
+        """Log evidence of the scene, from the Gaussians' volumes."""
         return self.mixture.log_evidence
 
     def sd(self, name: str) -> float:
@@ -107,12 +87,12 @@ class FieldFit:
 
 
 def field_window(least_squares: BumpFit, *, cosines: int = FIELD_COSINES) -> Window:
-    """The window of a least-squares bump."""
+    """Window of a least-squares bump, with its noise basis."""
     return Window(least_squares.cells, independent_variance(least_squares.cells), cosines=cosines)
 
 
 def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:
-    """Where the search for a scene's mode begins: the least-squares bump."""
+    """Start of the search for a scene's mode, from the least-squares bump."""
     p, q, r = (float(v) for v in least_squares.bump.shape_parameters(least_squares.theta))
     turned = np.array([p + q, p - q, least_squares.theta[1], least_squares.theta[2], r])
     return Scene("rotated").carried(turned, scene)
@@ -123,7 +103,7 @@ def fit_scene(
     scene: Scene,
     start: FloatArray,
 ) -> FieldFit:
-    """Find the mode; the fields that matter and the mode are settled in turn, because each depends on the other.
+    """Find the mode, alternating with the choice of noise fields that matter there.
 
     Parameters
     ----------
@@ -144,13 +124,13 @@ def fit_scene(
         if not target.settle_fields(mode):
             break
     if not np.isfinite(target(mode[None])[0]):
-        raise NotConvergedError("the posterior has no density at the fitted bump: there is no rise under this noise")
+        raise NotConvergedError("no posterior mode: the fitted bump does not rise above the correlated noise")
     mixture = gaussian_mixture(target, mode, covariance)
     return FieldFit(target, mode, mixture.moments()[1], mixture)
 
 
 def gaussian_mixture(target: CollapsedTarget, mode: FloatArray, covariance: FloatArray) -> Mixture:
-    """One Gaussian a field about a common mode; the one common Gaussian where a field has none of its own.
+    """One Gaussian per field about a common mode; a single one where a field has no Gaussian of its own.
 
     The common curvature is sharper than the mixture is wide where fields with modes of their own share the evidence.
     """
@@ -161,15 +141,27 @@ def gaussian_mixture(target: CollapsedTarget, mode: FloatArray, covariance: Floa
     return Mixture(np.ones(1), mode[None], covariance[None], float(target(mode[None])[0]) + volume)
 
 
-def newton_mixture(target: CollapsedTarget, start: FloatArray, covariance: FloatArray) -> Mixture | None:
-    """One Gaussian a field, each by one Newton step from a common start; None where one of them is no maximum."""
+def newton_mixture(
+    target: CollapsedTarget, start: FloatArray, covariance: FloatArray, *, least_share: float = LEAST_SHARE
+) -> Mixture | None:
+    """One Gaussian per field, each by one Newton step from a common start; None where one of them is no maximum.
+
+    Parameters
+    ----------
+    start : (p,) array
+        Near the mode of all of them.
+    covariance : (p, p) array
+        About theirs: it scales the finite differences and limits the step.
+    least_share
+        Of the density at the start, for a field to have a Gaussian.
+    """
     scale = np.sqrt(np.diag(covariance))
     points = stencil(start, step=0.3 * scale)
     by_field = target.by_field(points) + target.log_prior(points)[:, None]
     whole = float(np.logaddexp.reduce(by_field[0]))
     share = np.exp(by_field[0] - whole) if np.isfinite(whole) else np.zeros(by_field.shape[1])
     means, covariances, masses = [], [], []
-    for h in np.flatnonzero(share > LEAST_SHARE):
+    for h in np.flatnonzero(share > least_share):
         if not np.isfinite(by_field[:, h]).all():
             return None
         gradient, hessian = finite_differences(by_field[:, h], step=0.3 * scale)
@@ -184,14 +176,14 @@ def newton_mixture(target: CollapsedTarget, start: FloatArray, covariance: Float
         return None
     mass = np.array(masses)
     total = float(np.logaddexp.reduce(mass))
-    left_out = float(np.log(share[share > LEAST_SHARE].sum()))
+    left_out = float(np.log(share[share > least_share].sum()))
     return Mixture(np.exp(mass - total), np.array(means), np.array(covariances), total - left_out)
 
 
 def _newton_gaussian(
     gradient: FloatArray, hessian: FloatArray, scale: FloatArray, *, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Step to a field's own mode, its covariance and what the step gains; None where that is no maximum nearby."""
+    """Newton step to a field's mode, its covariance and the gain; None without a maximum nearby."""
     values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
     if not values[0] > 0.05:
         return None
@@ -203,7 +195,7 @@ def _newton_gaussian(
 
 
 def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDEPENDENT_DRAWS) -> ParameterDraws:
-    """Draws from the Gaussians of the fields, with the t tails of an estimated noise scale.
+    """Draw from the fields' Gaussians, with t tails for the estimated noise scale.
 
     Where several fields share the evidence one Gaussian was up to 25 % too narrow; a Gaussian for each is within a
     few per cent.
@@ -221,3 +213,9 @@ def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = IND
 def shape_draws(fit: FieldFit, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """sigma_x_mm, sigma_y_mm and angle_rad of (..., p) draws."""
     return principal_widths(*fit.scene.widths(theta))
+
+
+def modal_widths(fit: FieldFit) -> tuple[float, float]:
+    """sigma_x_mm and sigma_y_mm at the mode."""
+    sigma_x, sigma_y, _ = shape_draws(fit, fit.mode[None])
+    return float(sigma_x[0]), float(sigma_y[0])

@@ -1,4 +1,4 @@
-"""Conditional solutions for the linear parameters (amplitudes, level, tilt), batched over shapes and noise fields."""
+"""Solutions for the linear parameters (amplitudes, level, tilt) given the shape, for many shapes and noise fields."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class LinearSolution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldColumns:
-    """Fixed columns and data under one length's field and its shares: what does not depend on the shape.
+    """Fixed columns and data under the noise fields of one length: the part that does not depend on the shape.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class FieldColumns:
     def of(
         cls, field: Whitening, shares: FloatArray, *, log_prior: float, plain_low: FloatArray, plain_gram: FloatArray
     ) -> FieldColumns:
-        """From (c + 1, cosines^2) projections and (c + 1, c + 1) products of the fixed columns and the data."""
+        """Prepare from (c + 1, cosines^2) projections and (c + 1, c + 1) products of the fixed columns and the data."""
         low = plain_low @ field.turn
         weight = field.shrinkage(shares)
         weighted = low * weight[:, None, :]
@@ -97,20 +97,20 @@ class FieldColumns:
         return cls(field, shares, log_prior, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor)
 
     def rest(self) -> FloatArray:
-        """(h,) sum of squares that the fixed columns leave."""
+        """(h,) residual sum of squares of the fixed columns alone."""
         c = self.inverse.shape[1]
         right = self.gram[:, :c, c]
         return np.asarray(self.gram[:, c, c] - np.einsum("hc,hcd,hd->h", right, self.inverse, right))
 
     def null_evidence(self, *, dof: int) -> FloatArray:
-        """(h,) log of the prior times the evidence of the fixed columns alone."""
+        """(h,) log prior plus log evidence of the fixed columns alone."""
         squares = np.maximum(self.rest(), 0.0) + self.floor
         return self.log_prior - 0.5 * self.log_det + lgamma(dof / 2) - 0.5 * dof * np.log(pi * squares)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inner:
-    """Inner products of m templates under one length's field and its h shares.
+    """Inner products of m templates under the noise fields of one length with h shares.
 
     Parameters
     ----------
@@ -128,24 +128,24 @@ class Inner:
 
     @classmethod
     def of(cls, projected: Projected, columns: FieldColumns) -> Inner:
-        """From products that know no field."""
+        """Inner products from those without a field."""
         low = projected.low @ columns.field.turn
         taken = (low @ columns.plain).reshape(len(low), len(columns.shares), -1)
         return cls(projected.plain[:, None, :] - taken, projected.square[:, None] - low**2 @ columns.weight, low)
 
     def repeated(self, number: int) -> Inner:
-        """The same templates so many times each."""
+        """Each template's inner products, repeated."""
         return Inner(*(np.repeat(one, number, axis=0) for one in (self.plain, self.square, self.low)))
 
     def product(self, other: Inner, product: FloatArray, columns: FieldColumns) -> FloatArray:
-        """(m, h) with other templates, from their (m,) products without the field."""
+        """(m, h) inner products with other templates, from their (m,) products without the field."""
         return np.asarray(product[:, None] - (self.low * other.low) @ columns.weight)
 
 
 def solve(
     inner: list[Inner], cross: FloatArray | None, columns: FieldColumns, *, dof: int, amplitude_sd: float
 ) -> tuple[FloatArray, LinearSolution]:
-    """Log of the fields' prior times the evidence (m, h), and the solutions of one or two structures, under one length.
+    """Log of the fields' prior times evidence (m, h), and solutions for one or two structures, under one length.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def solve(
         return np.asarray(product - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
 
     rest, floor = columns.rest(), columns.floor
-    # a template that the window hardly has, beyond its rim or between its cells, leaves the prior as it is
+    # a template with hardly any weight in the window, beyond its rim or between its cells, leaves the prior unchanged
     least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / amplitude_sd**2
     diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(inner)]
     if cross is None:
@@ -186,7 +186,7 @@ def solve(
 
 
 def joined(solutions: list[LinearSolution]) -> LinearSolution:
-    """The fields of several lengths one after another."""
+    """Concatenate the fields of several lengths."""
     by_field = {"level", "level_covariance"}
     return LinearSolution(
         *(
@@ -199,7 +199,7 @@ def joined(solutions: list[LinearSolution]) -> LinearSolution:
 def _one(
     along: FloatArray, power: FloatArray, rest: FloatArray, floor: float, *, dof: int, amplitude_sd: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Log factor, amplitudes, their precision and sum of squares for one structure."""
+    """Log factor, amplitudes, precision and sum of squares for one structure."""
     amplitude = along / power
     squares = np.maximum(rest - along * amplitude, 0.0) + floor
     variance = amplitude_sd**2 + squares / dof / power
@@ -217,7 +217,7 @@ def _two(
     dof: int,
     amplitude_sd: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """As `_one` for two structures: two by two matrices written out."""
+    """As `_one` for two structures, with the two by two matrices written out."""
     one, two = diagonal
     det = np.maximum(one * two - off**2, 1e-12 * one * two)
     first, second = (two * along[0] - off * along[1]) / det, (one * along[1] - off * along[0]) / det

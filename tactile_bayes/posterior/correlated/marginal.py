@@ -72,7 +72,7 @@ class CollapsedTarget:
         self.dof = self._count_dof()
 
     def of_scene(self, scene: Scene) -> CollapsedTarget:
-        """The same window and priors with another scene, fields not settled."""
+        """Copy for another scene in the same window with the same priors; its fields are not settled."""
         if scene.tilt == self.scene.tilt:
             other = copy(self)
             other.scene, other._fields, other._made_up = scene, None, 0.0
@@ -87,12 +87,12 @@ class CollapsedTarget:
 
     @property
     def rotated(self) -> bool:
-        """Whether the ellipse may turn."""
+        """Whether the ellipse may be rotated."""
         return self.scene.shape == "rotated"
 
     @property
     def structures(self) -> int:
-        """Amplitudes: the bump's, and that of what lies beside it."""
+        """Number of amplitudes: the bump's, and that of a second structure."""
         return 2 if self.scene.extra else 1
 
     def _count_dof(self) -> int:
@@ -101,7 +101,7 @@ class CollapsedTarget:
 
     @property
     def fields(self) -> list[FieldColumns]:
-        """The noise fields of the mixture, a length each with its shares; all of them until they are settled."""
+        """Noise fields of the mixture by length, each with its shares; all of them until settled."""
         if self._fields is None:
             self._fields = list(self._from_the_longest())
         return self._fields
@@ -111,7 +111,7 @@ class CollapsedTarget:
         return self._mixed(theta, self.by_field(theta))
 
     def solved_density(self, theta: FloatArray, solved: Solved) -> FloatArray:
-        """The same, with what `draw_linear` needs at these points kept in `solved`."""
+        """As the density, storing in `solved` what `draw_linear` needs at these points."""
         solution = self.conditional(theta)
         solved.add(theta, solution)
         return self._mixed(theta, solution[0] + self._made_up)
@@ -121,7 +121,7 @@ class CollapsedTarget:
         return np.where(np.isfinite(total), total, -np.inf)
 
     def by_field(self, theta: FloatArray) -> FloatArray:
-        """(m, fields) log of each field's prior times its evidence; the shape's prior left out."""
+        """(m, fields) log of each field's prior times its evidence, without the shape's prior."""
         parts = [np.concatenate([one for one, _ in part], axis=1) for part in self._parts(theta)]
         return np.concatenate(parts) + self._made_up
 
@@ -130,7 +130,7 @@ class CollapsedTarget:
         return self.scene.log_prior(theta, self.problem)
 
     def settle_fields(self, theta: FloatArray) -> bool:
-        """Keep, of all fields, those that carry the evidence at one shape; the others cost time and say nothing.
+        """Keep only the noise fields with evidence at one shape; the others cost time and add nothing.
 
         Returns
         -------
@@ -156,7 +156,7 @@ class CollapsedTarget:
         return before != self.chosen_fields()
 
     def chosen_fields(self) -> list[tuple[float, tuple[float, ...]]]:
-        """Lengths in the mixture, each with its shares."""
+        """Correlation lengths in the mixture, each with its shares."""
         return [(columns.field.length_mm, tuple(columns.shares)) for columns in self._fields or ()]
 
     def null_log_evidence(self) -> float:
@@ -166,7 +166,7 @@ class CollapsedTarget:
         return float(np.logaddexp.reduce(np.concatenate([one for _, one in found])))
 
     def _walk(self, evidence: Callable[[FieldColumns], FloatArray]) -> list[tuple[FieldColumns, FloatArray]]:
-        """Evidence of no field, then of the lengths from the longest down, until they have faded."""
+        """Evidence without a field, then from the longest length down, until it has vanished."""
         found: list[tuple[FieldColumns, FloatArray]] = []
         best = before = -np.inf
         for columns in self._from_the_longest():
@@ -179,7 +179,7 @@ class CollapsedTarget:
         return found
 
     def _from_the_longest(self) -> Iterator[FieldColumns]:
-        """No field, and each length with every share; a length is worked out when it is come to."""
+        """No field, then each length with all shares, computed when reached."""
         shares = np.array(SHARES)
         for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
             chosen = shares[(shares > 0) == (length > 0)]
@@ -199,7 +199,7 @@ class CollapsedTarget:
         return {"field_length_mm": float(weight @ length), "field_share": float(weight @ (share / (1.0 + share)))}
 
     def conditional(self, theta: FloatArray) -> Solution:
-        """What is linear at (m, p) vectors under each of h fields.
+        """Linear solutions at (m, p) vectors under each of h fields.
 
         Returns
         -------
@@ -216,7 +216,7 @@ class CollapsedTarget:
     def draw_linear(
         self, theta: FloatArray, rng: np.random.Generator, *, solved: Solved | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Amplitudes (m, v), level (m,) and noise scale (m,) for draws of the shape: exact, field drawn first.
+        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape: exact, field first.
 
         Points that `solved` knows are not solved again.
         """
@@ -239,7 +239,7 @@ class CollapsedTarget:
     def _draw_amplitudes(
         self, centre: FloatArray, power: FloatArray, tau2: FloatArray, rng: np.random.Generator
     ) -> FloatArray:
-        """(m, v) draws given the noise scale: the flat prior's normal times the amplitudes' own."""
+        """(m, v) draws given the noise scale: the normal under a flat prior times the amplitudes' prior."""
         data = power / tau2[:, None, None]
         normal = rng.standard_normal((*centre.shape, 1))
         if self.structures == 1:
@@ -264,7 +264,7 @@ class CollapsedTarget:
         return float(prior - np.logaddexp.reduce(weight + at_zero))
 
     def amplitude_at(self, theta: FloatArray) -> float:
-        """Mean amplitude of the bump at one shape."""
+        """Posterior mean of the bump's amplitude at one shape."""
         evidence, solution = self._solve(theta[None])
         weight = np.exp(evidence[0] - np.logaddexp.reduce(evidence[0]))
         return float(weight @ solution.amplitude[0, :, 0])
@@ -281,7 +281,7 @@ class CollapsedTarget:
         return np.asarray((one / self.window.variance) @ other.T - (first * columns.weight[:, share]) @ second.T)
 
     def gains(self, templates: Profiles, theta: FloatArray) -> FloatArray:
-        """(m,) log evidence of the scene at `theta` with each template added, over that without; -inf for a dent.
+        """(m,) log evidence gained at `theta` by adding each template; -inf for a dent.
 
         Fields are those settled; the scene has one structure.
         """
@@ -300,7 +300,7 @@ class CollapsedTarget:
         return np.asarray(gained - np.logaddexp.reduce(np.concatenate(base)))
 
     def _columns(self, field: Whitening, shares: FloatArray) -> FieldColumns:
-        """Level, tilt and data under shares of one length's field; without a field the lengths are one."""
+        """Level, tilt and data under the fields of one length; without a field, all lengths are one."""
         log_prior = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
         if not shares.any():
             log_prior += float(np.log(len(LENGTHS_MM)))
@@ -313,7 +313,7 @@ class CollapsedTarget:
         return projected, self.window.product(*templates) if len(templates) == 2 else None
 
     def _parts(self, theta: FloatArray) -> Iterator[list[WithEvidence]]:
-        """Blocks of (m, p) vectors, each solved under every length; many at once where they share a basis."""
+        """Blocks of (m, p) vectors, each solved under every length; large where they share a basis."""
         size = SPANNED if self.scene.separable else BLOCK
         for i in range(0, len(theta), size):
             points = theta[i : i + size]
@@ -326,7 +326,7 @@ class CollapsedTarget:
                 yield [self._under(projected, cross, columns) for columns in self.fields]
 
     def _spanned(self, theta: FloatArray) -> Spanned | None:
-        """The basis that the points' bumps share; None where there is none, or where it does not pay."""
+        """Basis shared by the points' bumps; None where there is none, or where it does not save time."""
         if not self.scene.separable or len(theta) < LEAST_BUMPS:
             return None
         (bumps,) = self.scene.templates(theta, self.window)
@@ -340,13 +340,13 @@ class CollapsedTarget:
         return solve(inner, cross, columns, dof=self.dof, amplitude_sd=self.amplitude_sd)
 
     def _solve(self, theta: FloatArray) -> WithEvidence:
-        """All fields' evidence and solutions at a few vectors."""
+        """Evidence and solutions under all fields at a few vectors."""
         projected, cross = self._project(self.scene.templates(theta, self.window))
         return _side_by_side([self._under(projected, cross, columns) for columns in self.fields])
 
 
 def _side_by_side(found: list[WithEvidence]) -> WithEvidence:
-    """All fields, from those of each length."""
+    """Concatenate fields of all lengths."""
     return np.concatenate([one for one, _ in found], axis=1), joined([solution for _, solution in found])
 
 
@@ -357,7 +357,7 @@ def independent_variance(cells: FitCells) -> FloatArray:
 
 
 def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
-    """(c, n) level, and tilt across the window in units of its half width."""
+    """(c, n) columns of level and tilt across the window, in units of its half width."""
     ones = np.ones((1, len(cells)))
     if not tilt:
         return ones
@@ -367,7 +367,7 @@ def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
 
 
 def choose(evidence: FloatArray, rng: np.random.Generator) -> IntArray:
-    """(m,) one field for each draw, with its share of the evidence; the first where a draw has none."""
+    """(m,) random field for each draw by its share of the evidence; the first where a draw has none."""
     best = evidence.max(axis=1, keepdims=True)
     weight = np.exp(evidence - np.where(np.isfinite(best), best, 0.0))
     edges = np.cumsum(weight, axis=1)

@@ -1,4 +1,4 @@
-"""Structures beside the bump: a second lump or the edge of a rib, in or just beyond the window."""
+"""Structures beside the bump: a second lump or a rib, in or just beyond the window."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.correlated.fit import FieldFit
 from tactile_bayes.posterior.correlated.marginal import BLOCK
 from tactile_bayes.posterior.correlated.problem import Problem
-from tactile_bayes.posterior.correlated.scene import APART, REACH_IN_RADII, BoolArray, Extra
+from tactile_bayes.posterior.correlated.scene import (
+    APART,
+    REACH_IN_RADII,
+    BoolArray,
+    Neighbour,
+    neighbour_templates,
+)
 from tactile_bayes.posterior.correlated.selection import (
     ASKING,
     LEAST_ODDS,
@@ -22,7 +28,6 @@ from tactile_bayes.posterior.correlated.selection import (
     odds,
 )
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
-from tactile_bayes.posterior.correlated.window import Profiles
 from tactile_bayes.presets import SceneAsked
 
 SECOND_ODDS = 10.0
@@ -34,16 +39,16 @@ LONG = 1.5
 GRID_MM = 4.0
 GRID_WIDTHS_MM = (3.0, 5.0, 8.0)
 GRID_ANGLES = 12
-WANTED: dict[str, Extra] = {"second-lump": "second lump", "rib": "rib"}
+WANTED: dict[str, Neighbour] = {"second-lump": "second lump", "rib": "rib"}
 
 
 def add_beside(
     choice: SceneChoice, surroundings: Surroundings, *, ridges: FloatArray, scene: SceneAsked = "auto"
 ) -> SceneChoice:
-    """Ask for a second lump or a rib beside the bump; the draws have it where the map asks for it, or `scene` does.
+    """Test for a second lump or a rib beside the bump, and add it where the evidence or `scene` says so.
 
     `ridges` are where a rib can be: `rising_ribs`. What is found must stand out on the map by `LEAST_RISE` of the
-    bump's amplitude, see `Surroundings.rise`. What is not found is not in the fit, even if it was asked for.
+    bump's amplitude, see `Surroundings.rise`. What is not found is not in the fit, even if `scene` names it.
     """
     if scene not in ASKING:
         return choice
@@ -55,9 +60,9 @@ def add_beside(
 def _beside_questions(
     problem: Problem, plain: FieldFit, surroundings: Surroundings, ridges: FloatArray, scene: SceneAsked
 ) -> tuple[FieldFit, list[Structure]]:
-    """A second lump and a rib, each against the scene without; the likelier of those that the map asks for."""
+    """Test a second lump and a rib, each against the scene without; returns the better supported fit."""
     lumps = second_lumps(plain, problem)
-    places: dict[Extra, FloatArray] = {
+    places: dict[Neighbour, FloatArray] = {
         "second lump": lumps[rises(plain, surroundings, "second lump", lumps)],
         "rib": _apart(plain, ridges),
     }
@@ -66,7 +71,7 @@ def _beside_questions(
         for extra, rising in places.items()
     }
     asked = [extra for extra, (fit, log_odds, _) in fits.items() if fit is not None and log_odds > np.log(SECOND_ODDS)]
-    likeliest: Extra = max(asked, key=lambda extra: fits[extra][1]) if asked else ""
+    likeliest = max(asked, key=lambda extra: fits[extra][1], default=None)
     used = WANTED.get(scene, likeliest)
     chosen = fits[used][0] if used else plain
     answers = []
@@ -81,9 +86,9 @@ def _beside_questions(
 
 
 def _fit_beside(
-    problem: Problem, plain: FieldFit, surroundings: Surroundings, extra: Extra, rising: FloatArray, *, forced: bool
+    problem: Problem, plain: FieldFit, surroundings: Surroundings, extra: Neighbour, rising: FloatArray, *, forced: bool
 ) -> tuple[FieldFit | None, float, bool]:
-    """The fit with a second structure, its log odds, and whether these are only a bound (then there is no fit)."""
+    """Fit a second structure: the fit, its log odds, and whether these are only a bound (without a fit)."""
     scene = replace(plain.scene, extra=extra)
     starts, bound = _starts(plain, extra, rising)
     if not starts or (bound < np.log(LEAST_ODDS) and not forced):
@@ -96,8 +101,8 @@ def _fit_beside(
     return best, best.log_evidence - plain.log_evidence, False
 
 
-def _starts(plain: FieldFit, extra: Extra, rising: FloatArray) -> tuple[list[FloatArray], float]:
-    """Where to look for the mode with a second structure, and a bound on the log evidence gained there."""
+def _starts(plain: FieldFit, extra: Neighbour, rising: FloatArray) -> tuple[list[FloatArray], float]:
+    """Starts for the fit of a second structure, and a bound on the log evidence that it gains."""
     gains = _gains(plain, rising, extra)
     best = int(np.argmax(gains))
     starts, bound = [np.concatenate([plain.mode, one]) for one in rising[best : best + 1]], float(gains[best])
@@ -108,7 +113,7 @@ def _starts(plain: FieldFit, extra: Extra, rising: FloatArray) -> tuple[list[Flo
 
 
 def _split(plain: FieldFit) -> FloatArray | None:
-    """Two round lumps in the place of one long one; None where it is not long."""
+    """Start with two round lumps in place of one long bump; None where it is not long."""
     scene, mode = plain.scene, plain.mode
     p, q, r = (float(v) for v in scene.widths(mode))
     ratio = float(np.hypot(q, r))
@@ -123,7 +128,7 @@ def _split(plain: FieldFit) -> FloatArray | None:
     return np.array([*(halves[name] for name in scene.names), *beside])
 
 
-def rises(fit: FieldFit, surroundings: Surroundings, extra: Extra, places: FloatArray) -> BoolArray:
+def rises(fit: FieldFit, surroundings: Surroundings, extra: Neighbour, places: FloatArray) -> BoolArray:
     """(g,) whether the map rises by a share of the bump's amplitude at places of second lumps or ribs."""
     scene, target = fit.scene, fit.target
     amplitude = target.amplitude_at(fit.mode)
@@ -139,7 +144,7 @@ def rises(fit: FieldFit, surroundings: Surroundings, extra: Extra, places: Float
 
 
 def second_lumps(plain: FieldFit, problem: Problem) -> FloatArray:
-    """(g, 3) centres and log widths of the second lumps that are tried, apart from the first."""
+    """(g, 3) grid of second lumps to try, apart from the first: centres and log widths."""
     reach = REACH_IN_RADII * problem.radius_mm
     axis = np.arange(-reach, reach + 1e-9, GRID_MM)
     x, y, w = (v.ravel() for v in np.meshgrid(axis, axis, np.log(GRID_WIDTHS_MM), indexing="ij"))
@@ -152,7 +157,7 @@ def second_lumps(plain: FieldFit, problem: Problem) -> FloatArray:
 
 
 def ribs(problem: Problem) -> FloatArray:
-    """(g, 3) angles, offsets and log widths of the ridges that are tried."""
+    """(g, 3) grid of ridges to try: angles, offsets and log widths."""
     reach = REACH_IN_RADII * problem.radius_mm
     offsets = np.arange(-reach + 0.5 * GRID_MM, reach, GRID_MM)
     angles = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
@@ -161,29 +166,24 @@ def ribs(problem: Problem) -> FloatArray:
 
 
 def _apart(plain: FieldFit, ridges: FloatArray) -> FloatArray:
-    """Those of some ridges that a scene may hold with a bump, see `Scene.rib_apart`."""
+    """Ridges that a scene allows beside the bump, by `Scene.rib_apart`."""
     scene = replace(plain.scene, extra="rib")
     theta = np.column_stack([np.tile(plain.mode, (len(ridges), 1)), ridges])
     return np.asarray(ridges[scene.rib_apart(theta, plain.target.window.middle)])
 
 
 def rising_ribs(plain: FieldFit, surroundings: Surroundings) -> FloatArray:
-    """(g, 3) those of `ribs` along which the map rises beside a bump."""
+    """(g, 3) ridges of `ribs` along which the map rises beside a bump."""
     places = ribs(plain.target.problem)
     return np.asarray(places[rises(plain, surroundings, "rib", places)])
 
 
-def _gains(plain: FieldFit, grid: FloatArray, extra: Extra) -> FloatArray:
+def _gains(plain: FieldFit, grid: FloatArray, extra: Neighbour) -> FloatArray:
     """(g,) log evidence gained by each template beside the bump at its mode."""
     window = plain.target.window
     parts = []
     for i in range(0, len(grid), BLOCK):
-        one, two, width = grid[i : i + BLOCK].T
-        templates: Profiles = (
-            window.bumps(one, two, p=width, q=np.zeros_like(width), r=None)
-            if extra == "second lump"
-            else window.ridges(one, two, log_width=width)
-        )
+        templates = neighbour_templates(window, extra, *grid[i : i + BLOCK].T)
         parts.append(plain.target.gains(templates, plain.mode))
     return np.asarray(np.concatenate(parts)) if parts else np.array([-np.inf])
 

@@ -31,7 +31,7 @@ TOUCHED = 1e-2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Whitening:
-    """One length's field, ready for every share.
+    """The noise field of one correlation length, prepared for every share.
 
     Parameters
     ----------
@@ -48,12 +48,12 @@ class Whitening:
     eigenvalues: FloatArray
 
     def shrinkage(self, share: float | FloatArray) -> FloatArray:
-        """(..., k) weights of the squared projections that the field takes away: ``rho / (1 + rho lambda)``."""
+        """(..., k) weights of the squared projections that the field absorbs: ``rho / (1 + rho lambda)``."""
         rho = np.asarray(share)[..., None]
         return np.asarray(rho / (1.0 + rho * self.eigenvalues))
 
     def pruned(self, share: float) -> Whitening:
-        """Without the directions that the field hardly touches at this share or a smaller one."""
+        """Copy without the directions that matter little at this share or a smaller one."""
         keep = share * self.eigenvalues > TOUCHED
         return Whitening(self.length_mm, np.ascontiguousarray(self.turn[:, keep]), self.eigenvalues[keep])
 
@@ -63,12 +63,12 @@ class Whitening:
 
 
 def no_field(cosines: int) -> Whitening:
-    """The share of 0, which is the same for every length: no directions."""
+    """The share of 0, the same for every length: no directions."""
     return Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines**2, 0)), np.zeros(0))
 
 
 def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tuple[FloatArray, FloatArray]:
-    """Cosines along one axis, and their squared angular frequencies.
+    """Cosines along one axis, with their squared angular frequencies.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tup
 
 
 def cosines_for(width_mm: float, axis_mm: FloatArray) -> int:
-    """Cosines along an axis that a bump of this width calls for, from `FIELD_COSINES` to `FINE_FIELD_COSINES`.
+    """Number of cosines along an axis for a bump's width, from `FIELD_COSINES` to `FINE_FIELD_COSINES`.
 
     Errors shorter than the shortest half wave count as independent. For a narrow bump they are not: they have its
     shape.
@@ -122,7 +122,7 @@ def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
 
 
 def whitening(gram: FloatArray, frequency2: FloatArray, *, length_mm: float) -> Whitening:
-    """Prepare the field of one length.
+    """Prepare the noise field of one length.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ SETTLINGS = 2
 
 
 def ask_departure(choice: SceneChoice) -> SceneChoice:
-    """Ask whether the bump is a Gaussian; the draws have the column where the map asks for it.
+    """Test whether the bump is a Gaussian; add the regressor where the evidence supports it.
 
     A bump with something beside it is not asked: what is left of the neighbour would answer.
     """
@@ -52,7 +52,7 @@ def ask_departure(choice: SceneChoice) -> SceneChoice:
 
 
 def _fitted(fit: FieldFit, column: FloatArray) -> FieldFit | None:
-    """The fit with the column, made orthogonal anew under the noise that is left; None where there is no mode."""
+    """Refit with the regressor, made orthogonal under the new noise; None where there is no mode."""
     found: FieldFit | None = fit
     for left in reversed(range(SETTLINGS)):
         assert found is not None
@@ -64,7 +64,7 @@ def _fitted(fit: FieldFit, column: FloatArray) -> FieldFit | None:
 
 
 def _departure(fit: FieldFit) -> tuple[FloatArray, float, float]:
-    """The column at a fit's mode, e - 1 by least squares under the noise, and the log odds of its not being 0."""
+    """Regressor at a fit's mode, e - 1 by least squares under the noise, and the log odds against 0."""
     cells = fit.target.window.cells
     known, raw = tangent_columns(fit), _raw_column(fit)
     value = cells.value - cells.value.mean()
@@ -83,13 +83,13 @@ def _departure(fit: FieldFit) -> tuple[FloatArray, float, float]:
 
 
 def _log_odds(exponent: float, variance: float) -> float:
-    """Savage-Dickey ratio at 0 of a normal likelihood under the normal prior."""
+    """Log Bayes factor against 0 (Savage-Dickey) for a normal likelihood and the normal prior."""
     prior = EXPONENT_SD**2
     return float(0.5 * (exponent**2 / variance * prior / (prior + variance) - np.log1p(prior / variance)))
 
 
 def _raw_column(fit: FieldFit) -> FloatArray:
-    """(n,) change of the bump with its exponent, at the cells' centres."""
+    """(n,) derivative of the bump by its exponent, at the cells' centres."""
     scene, mode, cells = fit.scene, fit.mode, fit.target.window.cells
     p, q, r = scene.widths(mode)
     away = np.stack([cells.x_mm - scene.column(mode, "x"), cells.y_mm - scene.column(mode, "y")], axis=-1)
@@ -99,5 +99,5 @@ def _raw_column(fit: FieldFit) -> FloatArray:
 
 
 def _likeness(exponent: float) -> str:
-    """What a bump with this e - 1 is like."""
+    """Description of a bump with this e - 1."""
     return f"({'flatter' if exponent > 0 else 'sharper'} in the middle, exponent about {2 * (1 + exponent):.1f} for 2)"

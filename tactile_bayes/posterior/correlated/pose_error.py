@@ -22,7 +22,7 @@ LEAST_EIGENVALUE = 3e-3
 
 
 def pose_covariance(fit: FieldFit) -> FloatArray:
-    """(p, p) covariance that the frames' places add to the scene's parameters; zeros where they are not known.
+    """(p, p) covariance of the scene's parameters from tracker position error; zeros where it is not known.
 
     What lies beside the bump is taken as it is.
     """
@@ -42,14 +42,14 @@ def pose_covariance(fit: FieldFit) -> FloatArray:
 
 
 def _error_columns(window: Window, noise: PoseNoise, slopes: list[FloatArray]) -> FloatArray:
-    """(k, n) independent parts of the cells' errors, for the slopes of a bump of unit height along x and y."""
+    """(k, n) independent parts of the cells' errors, from slopes of a unit bump along x and y."""
     frames = np.maximum(window.cells.count * noise.frames_per_reading, 1.0)
     shared = _shared_frames(window, noise) / np.sqrt(frames)
     return np.concatenate([sd * slope * shared for sd, slope in zip(noise.sd_mm, slopes, strict=True)])
 
 
 def _shared_frames(window: Window, noise: PoseNoise) -> FloatArray:
-    """(k, n) columns whose products sum to the share of frames that two cells have in common."""
+    """(k, n) columns whose products sum to the share of frames that two cells share."""
     across, along = (_roots(axis, side) for axis, side in zip((window.x_mm, window.y_mm), noise.side_mm, strict=True))
     power = np.outer(np.sum(along**2, axis=1), np.sum(across**2, axis=1))
     i, j = np.nonzero(power > LEAST_EIGENVALUE * power.max())
@@ -57,6 +57,6 @@ def _shared_frames(window: Window, noise: PoseNoise) -> FloatArray:
 
 
 def _roots(axis_mm: FloatArray, side_mm: float) -> FloatArray:
-    """(n, n) rows whose products sum to the overlap of two intervals of one side about points of an axis."""
+    """(n, n) rows whose products sum to the overlap of two equal intervals about points of an axis."""
     values, vectors = np.linalg.eigh(overlap(axis_mm, side_mm))
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T)

@@ -11,7 +11,7 @@ from tactile_bayes.records import dataclass
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """A window with its cells, and what is assumed of a bump in it.
+    """A window with its cells, and the assumptions about a bump in it.
 
     Parameters
     ----------
@@ -35,5 +35,5 @@ class Problem:
 
     @property
     def widest_mm(self) -> float:
-        """Bound of the widths."""
+        """Upper bound of the widths."""
         return WIDEST_IN_RADII * self.radius_mm

@@ -1,4 +1,4 @@
-"""Lump or ridge: the evidence for a lump against a rib-like ridge, where the map rises along a line."""
+"""Lump or ridge: evidence for a lump against a rib-like ridge, where the map rises along a line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tactile_bayes.posterior.correlated.selection import SceneChoice, fit_or_non
 
 
 def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
-    """The likeliest scene with a ridge in the bump's place, alone or beside what the choice has there.
+    """Best scene with a ridge in place of the bump, alone or with the neighbour that the choice has.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def ridge_instead(choice: SceneChoice, ridges: FloatArray) -> FieldFit | None:
 
 
 def _starts(choice: SceneChoice, problem: Problem, places: FloatArray) -> Iterator[tuple[Scene, FloatArray]]:
-    """A ridge where the map rises most like one; and with a neighbour one through the bump."""
+    """Starts: the ridge along which the map rises most; with a neighbour, also one through the bump."""
     alone = Scene("ridge")
     yield alone, _best(choice, alone, places[:, [2, 0, 1]])
     extra = choice.fit.scene.extra
@@ -47,7 +47,7 @@ def _starts(choice: SceneChoice, problem: Problem, places: FloatArray) -> Iterat
 
 
 def _through_bump(fit: FieldFit, problem: Problem) -> FloatArray:
-    """(g, 3) ridges as wide as the bump through its centre, in all directions."""
+    """(g, 3) ridges of the bump's width through its centre, in all directions."""
     angle = np.pi * np.arange(GRID_ANGLES) / GRID_ANGLES
     x, y = (float(fit.scene.column(fit.mode, name)) - m for name, m in zip("xy", problem.window.middle, strict=True))
     width = np.full(GRID_ANGLES, float(fit.scene.widths(fit.mode)[0]))
@@ -55,12 +55,12 @@ def _through_bump(fit: FieldFit, problem: Problem) -> FloatArray:
 
 
 def _best(choice: SceneChoice, scene: Scene, starts: FloatArray) -> FloatArray:
-    """The likeliest of some vectors of a scene."""
+    """The vector of a scene with the highest density."""
     density = choice.plain.target.of_scene(scene)(starts)
     return np.asarray(starts[int(np.argmax(density))])
 
 
 def ridge_text(fit: FieldFit) -> str:
-    """A ridge's direction and width."""
+    """Direction and width of a ridge in words."""
     angle = float(np.degrees(fit.scene.column(fit.mode, "along")) + 90.0) % 180.0
     return f"a ridge along {angle:.0f} deg, sigma {float(np.exp(fit.scene.widths(fit.mode)[0])):.1f} mm"

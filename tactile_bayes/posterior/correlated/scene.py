@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Final, Literal, assert_never
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from tactile_bayes.records import dataclass
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 Shape = Literal["round", "ellipse", "rotated", "ridge"]
-Extra = Literal["", "second lump", "rib"]
+Neighbour = Literal["second lump", "rib"]
+Extra = Literal[Neighbour, ""]
 REACH_IN_RADII = 1.5
 """How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
 APART = 2.0
@@ -55,7 +56,7 @@ _NEIGHBOUR_NAMES: Final[Mapping[Extra, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Which structures a model has.
+    """Structures in a model.
 
     The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a
     round bump, with r for a turned one; then ``x2, y2, w2`` (centre and log width of a second round lump) or
@@ -82,11 +83,11 @@ class Scene:
 
     @property
     def steps(self) -> FloatArray:
-        """(p,) size of a small change of each parameter."""
+        """(p,) typical small step of each parameter."""
         return np.array([STEP[name] for name in self.names])
 
     def alone(self) -> Scene:
-        """Without the second structure."""
+        """Copy without the second structure."""
         return replace(self, extra="")
 
     def column(self, theta: FloatArray, name: str) -> FloatArray:
@@ -101,7 +102,7 @@ class Scene:
         return (u + v) / 2.0, (u - v) / 2.0, self.column(theta, "r")
 
     def carried(self, theta: FloatArray, other: Scene) -> FloatArray:
-        """A vector of another scene with this one's values where it has them; the other's own values are 0."""
+        """Convert a vector to another scene: shared parameters keep their values, others are 0."""
         p, _, _ = self.widths(theta)
         values = {name: self.column(theta, name) for name in other.names}
         if other.shape == "round":
@@ -110,24 +111,23 @@ class Scene:
 
     @property
     def separable(self) -> bool:
-        """Whether there is only a bump along the grid's axes: the product of a profile along each."""
+        """Whether the scene is only a bump along the grid's axes: the product of a profile along each."""
         return self.shape in ("round", "ellipse") and not self.extra
 
     def templates(self, theta: FloatArray, window: Window) -> list[Profiles]:
-        """The bump, and the second structure if there is one, of (m, p) vectors."""
+        """Templates of the bump, and of the second structure if there is one, for (m, p) vectors."""
         p, q, r = self.widths(theta)
         if self.shape == "ridge":
             found = [window.ridges(self.column(theta, "along"), self.column(theta, "across"), log_width=p)]
         else:
             x, y = self.column(theta, "x"), self.column(theta, "y")
             found = [window.bumps(x, y, p=p, q=q, r=r if self.shape == "rotated" else None)]
-        w = self.column(theta, "w2")
-        if self.extra == "second lump":
-            x2, y2 = self.column(theta, "x2"), self.column(theta, "y2")
-            found.append(window.bumps(x2, y2, p=w, q=np.zeros_like(w), r=None))
-        elif self.extra == "rib":
-            angle, offset = self.column(theta, "angle"), self.column(theta, "offset")
-            found.append(window.ridges(angle, offset, log_width=w))
+        if self.extra:
+            found.append(
+                neighbour_templates(
+                    window, self.extra, *(self.column(theta, name) for name in _NEIGHBOUR_NAMES[self.extra])
+                )
+            )
         return found
 
     def log_prior(self, theta: FloatArray, problem: Problem) -> FloatArray:
@@ -153,7 +153,7 @@ class Scene:
         return np.where(inside, total, -np.inf)
 
     def _log_prior_beside(self, theta: FloatArray, problem: Problem) -> tuple[FloatArray, BoolArray]:
-        """Log prior of the second structure (its amplitude's is in the target), and where it may lie."""
+        """Log prior of the second structure (its amplitude's is in the target), and whether its place is allowed."""
         prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
         w, reach = self.column(theta, "w2"), REACH_IN_RADII * radius_mm
         total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
@@ -179,8 +179,20 @@ class Scene:
         return np.asarray((away >= APART * np.exp(np.maximum(p, w))) | (w - p <= np.log(APART)))
 
 
+def neighbour_templates(
+    window: Window, extra: Neighbour, one: FloatArray, two: FloatArray, log_width: FloatArray
+) -> Profiles:
+    """Templates of m second structures: lumps at ``x2, y2``, or ribs of ``angle, offset``, each an (m,) array."""
+    match extra:
+        case "second lump":
+            return window.bumps(one, two, p=log_width, q=np.zeros_like(log_width), r=None)
+        case "rib":
+            return window.ridges(one, two, log_width=log_width)
+    assert_never(extra)
+
+
 def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:
-    """(m,) whether ridges may lie so far from the window's middle, and the volume of their angles and offsets."""
+    """(m,) whether ridges may lie this far from the window's middle, and the volume of angles and offsets."""
     reach = REACH_IN_RADII * radius_mm
     return np.abs(offset) <= reach, float(np.pi * 2.0 * reach)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import field, replace
+from typing import assert_never
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.correlated.fit import FieldFit, Mixture, fit_scene, newton_mixture
 from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.scene import Scene, Shape
+from tactile_bayes.posterior.options import ROTATION_ODDS
 from tactile_bayes.presets import SceneAsked
 from tactile_bayes.records import dataclass
 
@@ -22,7 +24,7 @@ ASKING = ("auto", "second-lump", "rib")
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """One question about the scene, and its answer.
+    """A question about the scene, with its answer.
 
     Parameters
     ----------
@@ -32,7 +34,7 @@ class Structure:
     odds
         Bayes factor of the scene with it against the scene without; an upper bound where `bound`.
     supported
-        Whether the map asks for it.
+        Whether the evidence supports it: the odds exceed a threshold.
     used
         Whether the draws have it.
     bound
@@ -56,14 +58,14 @@ class Structure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneChoice:
-    """The scene whose posterior is drawn from, and how it came to be chosen.
+    """The scene chosen for the draws, and the evidence for it.
 
     Parameters
     ----------
     fit
         Its mode.
     plain
-        The fit without a second structure: what "is there a lump?" is asked of.
+        The fit without a second structure, by which a lump is detected.
     supported
         The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``.
     structures
@@ -76,14 +78,8 @@ class SceneChoice:
     structures: tuple[Structure, ...] = field(default_factory=tuple)
 
 
-def choose_shape(
-    problem: Problem,
-    start: FloatArray,
-    *,
-    scene: SceneAsked = "auto",
-    least_odds: float = LEAST_ODDS,
-) -> SceneChoice:
-    """Fit the bump, and ask whether it is round, turned, and on a slope.
+def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "auto") -> SceneChoice:
+    """Fit the bump, and test whether it is round, rotated and on a slope.
 
     Parameters
     ----------
@@ -98,18 +94,27 @@ def choose_shape(
     where the evidence does not ask for it costs coverage and gains little (docs/decisions/0055). What the evidence says
     of them is reported all the same.
     """
-    shapes: dict[str, Shape] = {"round": "round", "rotated": "rotated"}
-    wanted = Scene(shapes.get(scene, "ellipse"))
+    wanted = Scene(_shape_asked(scene))
     chosen = fit_scene(problem, wanted, Scene("rotated").carried(start, wanted))
     found = [_ellipse_question(chosen)] if wanted.shape == "ellipse" else []
     if scene in ASKING:
-        chosen, turned = _rotation_question(problem, chosen, start, least_odds)
+        chosen, turned = _rotation_question(problem, chosen, start)
         found.append(turned)
     return SceneChoice(chosen, chosen, _supported_shape(chosen, found), (*found, _tilt_question(chosen)))
 
 
+def _shape_asked(scene: SceneAsked) -> Shape:
+    """Shape of the bump in the first fit for a scene."""
+    match scene:
+        case "round" | "rotated":
+            return scene
+        case "auto" | "none" | "ellipse" | "second-lump" | "rib":
+            return "ellipse"
+    assert_never(scene)
+
+
 def asked_again(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
-    """The choice with another fit, of which is asked again whether the bump is an ellipse and on a slope.
+    """Copy the choice with another fit, and repeat the tests for an ellipse and a slope.
 
     The flank of what lies beside a bump looks like a slope to a model without it.
     """
@@ -122,7 +127,7 @@ def asked_again(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
 
 
 def fit_or_none(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit | None:
-    """As `fit_scene`; None where the density has no mode."""
+    """As `fit_scene`; None where there is no mode."""
     try:
         return fit_scene(problem, scene, start)
     except NotConvergedError:
@@ -130,7 +135,7 @@ def fit_or_none(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit |
 
 
 def near(fit: FieldFit, scene: Scene) -> Mixture | None:
-    """Another scene's Gaussians by one step from a fit's mode; None where they do not lie close together."""
+    """Gaussians of another scene by one Newton step from a fit's mode; None where they are not close together."""
     target = fit.target.of_scene(scene)
     start = fit.scene.carried(fit.mode, scene)
     target.settle_fields(start)
@@ -148,7 +153,7 @@ def _supported_shape(chosen: FieldFit, found: Sequence[Structure]) -> str:
 
 
 def _ellipse_question(fit: FieldFit) -> Structure:
-    """Ellipse against round: the Savage-Dickey ratio at q = 0, and the conditional means there."""
+    """Test ellipse against round by the Savage-Dickey ratio at q = 0, with the conditional means there."""
     direction = np.zeros(len(fit.mode))
     direction[:2] = 0.5, -0.5
     log_odds = savage_dickey(fit.mixture, direction, prior_sd=fit.target.problem.prior.log_ratio_sd)
@@ -159,10 +164,8 @@ def _ellipse_question(fit: FieldFit) -> Structure:
     return Structure("ellipse", odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), True, False, float(x), float(y))
 
 
-def _rotation_question(
-    problem: Problem, straight: FieldFit, start: FloatArray, least_odds: float
-) -> tuple[FieldFit, Structure]:
-    """Turned against straight: one step first, the mode only where that leaves it open."""
+def _rotation_question(problem: Problem, straight: FieldFit, start: FloatArray) -> tuple[FieldFit, Structure]:
+    """Test a rotated ellipse against a straight one: by one Newton step, or by its mode where that is not clear."""
     scene = replace(straight.scene, shape="rotated")
     mixture = near(straight, scene)
     axis = np.eye(5)[4]
@@ -177,7 +180,7 @@ def _rotation_question(
             log_odds = savage_dickey(mixture, axis, prior_sd=problem.prior.log_ratio_sd)
     if mixture is None:
         return straight, Structure("rotated", 0.0, False, False)
-    used = turned is not None and log_odds > np.log(least_odds)
+    used = turned is not None and log_odds > np.log(ROTATION_ODDS)
     x, y = change_in_sd(straight, mixture.moments()[0])
     if used and turned is not None:
         return turned, Structure("rotated", odds(log_odds), True, True, False, -x, -y)
@@ -192,7 +195,7 @@ def _tilt_question(fit: FieldFit) -> Structure:
 
 
 def change_in_sd(fit: FieldFit, other: FloatArray) -> tuple[float, float]:
-    """Other minus fit in ln sigma_x and ln sigma_y, over the fit's SDs; `other` begins with its own u and v."""
+    """Other minus fit in ln sigma_x and ln sigma_y, in the fit's SDs; `other` begins with its own u and v."""
     if fit.scene.shape == "round":
         change = float((other[0] - fit.mode[0]) / np.sqrt(fit.covariance[0, 0]))
         return change, change
@@ -209,5 +212,5 @@ def savage_dickey(mixture: Mixture, direction: FloatArray, *, prior_sd: float) -
 
 
 def odds(log_odds: float) -> float:
-    """A Bayes factor from its logarithm, finite."""
+    """Convert a log Bayes factor to a finite Bayes factor."""
     return float(np.exp(np.clip(log_odds, -700.0, 700.0)))

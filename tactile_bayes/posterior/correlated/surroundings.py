@@ -1,4 +1,4 @@
-"""Check of a structure at the window's rim against the map around it."""
+"""Check of structures at the window's rim against the map around it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.correlated.scene import Extra
+from tactile_bayes.posterior.correlated.scene import Neighbour
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, smoothed_excess
 from tactile_bayes.records import dataclass
 
@@ -21,7 +21,7 @@ LEAST_CELLS, LEAST_IN_PIECE = 4.0, 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """The smoothed map's excess over its level, not finite where the map has no data.
+    """Smoothed map less its level, not finite where the map has no data.
 
     Parameters
     ----------
@@ -36,12 +36,12 @@ class Surroundings:
 
     @classmethod
     def of(cls, tactile_map: TactileMap) -> Surroundings:
-        """From a map."""
+        """Prepare from a map."""
         return cls(tactile_map.x_mm, tactile_map.y_mm, smoothed_excess(tactile_map))
 
     def rise(
         self,
-        extra: Extra,
+        extra: Neighbour,
         places: FloatArray,
         *,
         bump_mm: tuple[float, float],
@@ -49,7 +49,7 @@ class Surroundings:
         amplitude: float,
         middle: tuple[float, float],
     ) -> FloatArray:
-        """(g,) excess under second lumps or ribs, the bump taken off; -inf where the map does not show the place.
+        """(g,) excess of the map, without the bump, under second lumps or ribs; -inf where the map has no data.
 
         Under a lump it is the mean. Along a rib it is the median over pieces of `PIECE_MM` if that is lower: a rib
         rises along its whole length, while another lump on its line lifts the mean and only a piece or two.
@@ -81,7 +81,7 @@ class Surroundings:
         return np.asarray(np.einsum("vgx,gx->vg", rows @ values, columns))
 
     def _along_ribs(self, places: FloatArray, values: FloatArray, middle: tuple[float, float]) -> FloatArray:
-        """(g,) medians over a ridge's pieces; ridges of one direction see the same strips of cells."""
+        """(g,) median excess over a ridge's pieces; ridges of one direction share strips of cells."""
         found, flat = np.empty(len(places)), values.reshape(2, -1)
         x, y = self.x_mm - middle[0], self.y_mm[:, None] - middle[1]
         for angle in np.unique(places[:, 0]):
@@ -102,12 +102,12 @@ class Surroundings:
 
 
 def _mean(number: FloatArray, total: FloatArray, least: float) -> FloatArray:
-    """Means where there is enough weight, else -inf."""
+    """Weighted means; -inf where the weight is too small."""
     return np.where(number > least, total / np.maximum(number, 1e-300), -np.inf)
 
 
 def _median_piece(number: FloatArray, total: FloatArray) -> FloatArray:
-    """(g,) median of the means of (g, pieces) that the map shows, the lower one of two; inf where it shows none."""
+    """(g,) lower median over (g, pieces) means where the map has data; inf where it has none."""
     shown = number > LEAST_IN_PIECE
     ordered = np.sort(np.where(shown, _mean(number, total, LEAST_IN_PIECE), np.inf), axis=1)
     middle = np.maximum(shown.sum(axis=1) - 1, 0) // 2

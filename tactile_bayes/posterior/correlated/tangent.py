@@ -1,4 +1,4 @@
-"""Derivatives of a window's cells by everything that a fitted scene leaves free."""
+"""Derivatives of a window's cells by all free parameters of a fitted scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _STEP = 1e-4
 
 
 def tangent_columns(fit: FieldFit) -> FloatArray:
-    """(v, n) the bump at unit height, its derivatives by its own parameters, which come first, level and tilt."""
+    """(v, n) the unit bump, its derivatives by its own parameters first, then level and tilt."""
     window, scene, mode = fit.target.window, fit.scene, fit.mode
     p = len(scene.alone().names)
     steps = _STEP * np.eye(p, len(mode))

@@ -21,7 +21,7 @@ RESOLVED = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projected:
-    """Inner products of m templates, every cell weighted by its inverse independent variance.
+    """Inner products of m templates, with cells weighted by their inverse independent variance.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Profiles:
 
 
 class Window:
-    """The grid of one window, its cosines, and the noise fields of several lengths (prepared when first asked for).
+    """Grid of one window with its cosines and the noise fields of several lengths (prepared on first use).
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class Window:
     def bumps(
         self, x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, r: FloatArray | None
     ) -> Profiles:
-        """Cell means of (m,) Gaussians of unit height, blurred; along the grid's axes when r is None."""
+        """Cell means of (m,) blurred Gaussians of unit height; along the grid's axes when r is None."""
         cell, noise = self.cells.cell_mm, self.cells.pose_noise
         blur_x, blur_y = (0.0, 0.0) if noise is None else noise.sd_mm
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -166,12 +166,12 @@ class Window:
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Mean of the cells' centres, mm."""
+        """Mean of the cells' centres, in mm."""
         return float(np.mean(self.cells.x_mm)), float(np.mean(self.cells.y_mm))
 
 
 def turned_gaussians(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: FloatArray, cell_mm: float) -> FloatArray:
-    """(m, ny, nx) cell means of turned Gaussians from (m, nx) and (m, ny) distances: `cell_mean_gaussian` on a grid.
+    """(m, ny, nx) cell means of rotated Gaussians, from (m, nx) and (m, ny) distances.
 
     Where every width is above `RESOLVED` cells the fourth cumulant of a cell is left out: below 3e-5 of the height.
     """
@@ -193,13 +193,13 @@ def turned_gaussians(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: Floa
 
 
 def blurred_profile(distance_mm: FloatArray, sigma_mm: FloatArray, *, blur_mm: float, cell_mm: float) -> FloatArray:
-    """`cell_mean_profile` of Gaussians that were of unit height before they were blurred with this SD."""
+    """As `cell_mean_profile`, for Gaussians of unit height before a blur of this SD."""
     wide = np.hypot(sigma_mm, blur_mm)
     return (sigma_mm / wide)[:, None] * cell_mean_profile(distance_mm, sigma_mm=wide, cell_mm=cell_mm)
 
 
 def cell_mean_profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> FloatArray:
-    """(m, k) means over cells of one-dimensional Gaussians of unit height, the factors of `cell_mean_gaussian`.
+    """(m, k) means over cells of one-dimensional unit Gaussians, the factors of `cell_mean_gaussian`.
 
     The two corrections of that function's series are multiplied here and added there: a difference of the order of
     the terms that both leave out.

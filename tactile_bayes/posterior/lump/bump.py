@@ -1,4 +1,4 @@
-"""The scene model of the paper: one Gaussian bump on a level background (Eq 7), with the priors on it."""
+"""The paper's model of a map: one Gaussian bump on a level background (Eq 7), with its priors."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 def block_size(cells: int) -> int:
-    """Parameter vectors to predict at a time for a window of so many cells."""
+    """Number of parameter vectors to predict at a time, for a window of this many cells."""
     return min(BLOCK, max(LEAST_BLOCK, BLOCK_VALUES // max(cells, 1)))
 
 
 @dataclass(frozen=True, slots=True)
 class BumpPrior:
-    """Proper, weak priors; every one is printed with the estimate.
+    """Proper, weak priors, all of them printed with the estimate.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class BumpPrior:
 
 @dataclass(frozen=True, slots=True)
 class Bump:
-    """Which parameters the model spends: rotation and a free background only where they are asked for.
+    """The parameters of the model: rotation and a free background are optional.
 
     The parameter vector is ``(amplitude, x, y, p, q[, r][, background])``: mm for the centre, p and q the log widths
     of `covariance_from_log_widths`.
@@ -88,12 +88,12 @@ class Bump:
 
     @property
     def step_scale(self) -> FloatArray:
-        """(p,) size over which the model bends in each parameter; steps of the fit are limited in these units."""
+        """(p,) typical length of each parameter; the fit's steps are limited in these units."""
         sizes = {"amplitude": self.scale, "background": self.scale, "x_mm": 2.0, "y_mm": 2.0}
         return np.array([sizes.get(name, 0.3) for name in self.names])
 
     def shape_parameters(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """p, q, r of (..., p) parameter vectors; r is 0 when the model has none."""
+        """p, q, r of (..., p) parameter vectors; r is 0 without rotation."""
         r = theta[..., 5] if self.rotated else np.zeros(theta.shape[:-1])
         return theta[..., 3], theta[..., 4], r
 
@@ -130,7 +130,7 @@ class Bump:
         return values
 
     def log_prior(self, theta: FloatArray, prior: BumpPrior) -> FloatArray:
-        """(m,) log density of the priors; flat in the background; the centre's is the window's."""
+        """(m,) log prior density, flat in the background; the centre's prior belongs to the window."""
         p, q, r = self.shape_parameters(theta)
         z = [
             (theta[..., 0] / self.scale / prior.amplitude_sd, prior.amplitude_sd * self.scale),
@@ -144,7 +144,7 @@ class Bump:
 
 
 def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, cells: FitCells) -> FloatArray:
-    """(m, k) cell means of Gaussians along the grid's axes: `cell_mean_gaussian` from profiles of rows and columns.
+    """(m, k) cell means of Gaussians along the grid's axes: products of row and column profiles.
 
     It is the same formula. Its exponential is a product and its fourth cumulant a sum of what rows and columns have.
     """
@@ -159,7 +159,7 @@ def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: Float
 
 @lru_cache(maxsize=2)
 def _lattice(cells: FitCells) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Places of the window's columns and rows, and where each cell lies in the grid of them; kept for the next call."""
+    """Coordinates of the window's columns and rows, and each cell's index in their grid; cached."""
     column, row = cells.column - cells.column.min(), cells.row - cells.row.min()
     x_axis, y_axis = np.zeros(int(column.max()) + 1), np.zeros(int(row.max()) + 1)
     x_axis[column], y_axis[row] = cells.x_mm, cells.y_mm
@@ -169,7 +169,7 @@ def _lattice(cells: FitCells) -> tuple[FloatArray, FloatArray, IntArray]:
 def _profile(
     axis_mm: FloatArray, *, centre_mm: FloatArray, sigma_mm: FloatArray, cell_mm: float
 ) -> tuple[FloatArray, FloatArray]:
-    """(m, n) Gaussians averaged over the cells of an axis to second order, and the share that the fourth takes off."""
+    """(m, n) cell means of Gaussians along an axis to second order, and their fourth-order correction."""
     wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
     square = (axis_mm - centre_mm[:, None]) ** 2 / wide
     gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)

@@ -1,4 +1,4 @@
-"""Which cells of a map are fitted: candidates for a lump, and the window about one of them."""
+"""Cells to be fitted: candidates for a lump, and the window about one of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAPS_AT_HAND = 4
 
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """Errors of the frames' places, one error a frame: `presets.POSE_NOISE` of a map.
+    """Tracker position error of a map, one error per frame: the figures `presets.POSE_NOISE`.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class PoseNoise:
 
     @classmethod
     def of(cls, tactile_map: TactileMap) -> PoseNoise | None:
-        """Of a map; None where it has not all the figures."""
+        """Read from a map; None where it lacks a figure."""
         figures = [float(tactile_map.quality.get(name, np.nan)) for name in POSE_NOISE]
         if not (np.isfinite(figures).all() and min(figures[:2]) >= 0 and min(figures[2:]) > 0):
             return None
@@ -82,7 +82,7 @@ class FitCells:
 
     @property
     def reading_variance(self) -> float:
-        """Variance of a reading within its cell, pooled over the cells that know theirs; 0 where none does."""
+        """Variance of a reading within its cell, pooled over the cells that have one; 0 without any."""
         known = np.isfinite(self.variance)
         readings = float(np.sum(self.count[known]))
         return float(np.sum(self.variance[known] * self.count[known])) / readings if readings > 0 else 0.0
@@ -129,14 +129,14 @@ def covered_share(tactile_map: TactileMap, centre_mm: tuple[float, float], *, ra
 
 
 def typical_level(tactile_map: TactileMap) -> float:
-    """Level away from the lump: the background that normalising defines, else the median of the covered cells."""
+    """Level away from the lump: fixed by normalising, else the median of the covered cells."""
     if tactile_map.background is not None:
         return tactile_map.background
     return float(np.median(tactile_map.mean[trusted(tactile_map)]))
 
 
 def value_scale(tactile_map: TactileMap) -> float:
-    """The size of an amplitude of order one: 1 for a normalised map, else the largest departure from its level."""
+    """Scale of amplitudes: 1 for a normalised map, else the largest departure from its level."""
     if tactile_map.background is not None:
         return 1.0
     covered = tactile_map.mean[tactile_map.covered]
@@ -145,7 +145,7 @@ def value_scale(tactile_map: TactileMap) -> float:
 
 
 def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: int = 8) -> list[tuple[float, float]]:
-    """Local maxima of the smoothed map, highest first: where a lump could be.
+    """Local maxima of the smoothed map, the candidates for a lump, highest first.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def smoothed_excess(tactile_map: TactileMap) -> FloatArray:
 
 @lru_cache(maxsize=MAPS_AT_HAND)
 def levelled(tactile_map: TactileMap) -> TactileMap:
-    """The map less its mean over the places of the array that feel a cell, as frames divided by their means show it.
+    """The map less its mean over the head's positions that cover a cell, as frame means would remove it.
 
     A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain per frame needs it. Worked
     out once per map.
@@ -220,7 +220,7 @@ def levelled(tactile_map: TactileMap) -> TactileMap:
 
 
 def overlap(axis_mm: FloatArray, side_mm: float) -> FloatArray:
-    """(n, n) share that two intervals of one side about points of an axis have in common."""
+    """(n, n) overlap of two equal intervals about points of an axis, as a share of one."""
     away: FloatArray = np.abs(np.subtract.outer(axis_mm, axis_mm))
     return np.clip(1.0 - away / side_mm, 0.0, None)
 
@@ -232,7 +232,7 @@ def _smooth(array: FloatArray, width_cells: float) -> FloatArray:
 
 
 def _kernel(n: int, width_cells: float) -> FloatArray:
-    """(n, n) Gaussian weights of the cells of a line for each of them, none beyond four widths."""
+    """(n, n) Gaussian weights between the cells of a line, zero beyond four widths."""
     away = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     weight = np.exp(-0.5 * (away / max(width_cells, 0.3)) ** 2)
     return np.where(away <= max(1, int(np.ceil(4 * width_cells))), weight, 0.0)

@@ -1,15 +1,16 @@
-"""Figures and flags of an estimate: of the fit, of the errors, of the method and of the size calibration."""
+"""Diagnostics of an estimate: of the fit, the errors, the method and the size calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import field
 
 from tactile_bayes.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFigures:
-    """What the errors were found to be, and what was decided under them.
+    """Figures of the errors, and the decisions made under them.
 
     Parameters
     ----------
@@ -37,7 +38,7 @@ class NoiseFigures:
     passed_over: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, object]:
-        """Plain data."""
+        """The figures as plain data."""
         decided: dict[str, object] = {"rotation_odds": self.rotation_odds, "rotated": self.rotated}
         if self.level_offset is not None:
             return {"noise": self.noise, **self.figures, "level_offset": self.level_offset, **decided}
@@ -47,7 +48,7 @@ class NoiseFigures:
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
-    """Figures and flags of an estimate.
+    """Diagnostics and flags of an estimate.
 
     Parameters
     ----------
@@ -63,8 +64,12 @@ class Diagnostics:
         The method that drew, and its own figures.
     noise
         Of the errors.
+    calibration
+        Name of the calibration that gave the size, in words; not in the JSON.
     size_calibration
         Which calibration gave the size and what it cannot know, in words.
+    convergence
+        Of chains: R-hat, effective draws and Monte-Carlo errors of each size and width, see `arviz_data.convergence`.
     """
 
     cells: int
@@ -75,11 +80,15 @@ class Diagnostics:
     method: str
     sampler: Mapping[str, float]
     noise: NoiseFigures
+    calibration: str = ""
     size_calibration: str = ""
+    convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """Plain data."""
-        words = {"size_calibration": self.size_calibration} if self.size_calibration else {}
+        """The diagnostics as plain data."""
+        words: dict[str, object] = {"size_calibration": self.size_calibration} if self.size_calibration else {}
+        if self.convergence:
+            words["convergence"] = {name: dict(one) for name, one in self.convergence.items()}
         return {
             "cells": self.cells,
             "covered_share": self.covered_share,

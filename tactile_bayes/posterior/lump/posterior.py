@@ -10,7 +10,7 @@ from tactile_bayes.records import dataclass
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPosterior:
-    """Joint draws of what Eq 7 describes, each (chain, draw)."""
+    """Joint draws of the quantities in Eq 7, each (chain, draw)."""
 
     amplitude: FloatArray
     sigma_x_mm: FloatArray
@@ -23,6 +23,6 @@ class MapPosterior:
 
     @property
     def medians(self) -> tuple[float, float, float]:
-        """Amplitude, sigma_x_mm and sigma_y_mm in the middle of the posterior."""
+        """Posterior medians of amplitude, sigma_x_mm and sigma_y_mm."""
         amplitude, x, y = (float(np.median(v)) for v in (self.amplitude, self.sigma_x_mm, self.sigma_y_mm))
         return amplitude, x, y

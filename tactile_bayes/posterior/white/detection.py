@@ -84,7 +84,7 @@ def detect(
 
 
 def detection_from_odds(log_bayes_factor: float, *, ridge: str = "") -> Detection:
-    """The probability that goes with a Bayes factor at even prior odds."""
+    """Convert a Bayes factor to a probability at even prior odds."""
     return Detection(float(1.0 / (1.0 + np.exp(-np.clip(log_bayes_factor, -700, 700)))), log_bayes_factor, ridge)
 
 

@@ -1,14 +1,15 @@
-"""A bump under independent errors, from its least-squares fit to rotation and draws."""
+"""Estimation under independent errors: rotation and draws from a least-squares fit."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import assert_never
 
 import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.cache import Solved
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
@@ -20,16 +21,13 @@ from tactile_bayes.posterior.white.fit import BumpFit, rotation_odds
 from tactile_bayes.posterior.white.residuals import level_offset
 from tactile_bayes.posterior.white.target import Target
 
-if TYPE_CHECKING:
-    from tactile_bayes.posterior.options import EstimateOptions
-
 Progress = Callable[[int, int], None]
 
 
 def chosen_rotation(
     tactile_map: TactileMap, fit: BumpFit, *, options: FitOptions, prior: BumpPrior
 ) -> tuple[BumpFit, float | None]:
-    """The fit, turned where the map asks for it, and the odds of that; None where it was not asked."""
+    """The fit, rotated where the odds favour it, and those odds; None where rotation was not tested."""
     if options.rotation != "auto":
         return fit, None
     odds, turned = rotation_odds(tactile_map, fit, options=options, prior=prior)
@@ -39,7 +37,7 @@ def chosen_rotation(
 def draw_independent(
     fit: BumpFit, options: EstimateOptions, *, rng: np.random.Generator, progress: Progress | None
 ) -> tuple[ParameterDraws, MapPosterior]:
-    """Draws by the method asked for, and the joint draws by name."""
+    """Draw by the requested method, and name the joint draws."""
     target = fit.target(options.prior)
     solved = Solved(lambda theta: (target.excess(theta),))
     draws = _draw(fit, target, solved, options, rng=rng, progress=progress)
@@ -69,24 +67,47 @@ def _draw(
     rng: np.random.Generator,
     progress: Progress | None,
 ) -> ParameterDraws:
-    if options.method == "optimise":
-        from tactile_bayes.inference.optimise import optimise
+    match options.method:
+        case "optimise":
+            from tactile_bayes.inference.optimise import optimise
 
-        return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
-    from tactile_bayes.inference.laplace import laplace, mode_and_covariance
+            return optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
+        case "laplace":
+            from tactile_bayes.inference.laplace import laplace
 
-    scale = np.sqrt(np.diag(fit.covariance))
-    if options.method == "laplace":
-        return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
-    mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=scale)
-    if options.method == "importance":
-        from tactile_bayes.inference.importance import importance, importance_options
+            scale = np.sqrt(np.diag(fit.covariance))
+            return laplace(target, fit.theta, scale=scale, dof=fit.errors.dof, rng=rng)
+        case "importance":
+            from tactile_bayes.inference.importance import importance, importance_options
 
-        try:
+            mode, covariance = _mode(fit, target)
             density = partial(target.solved_density, solved=solved)
-            return importance(density, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
-        except NotConvergedError:
-            pass  # its weights cannot be trusted here; chains need none
+            try:
+                return importance(density, mode, covariance, rng=rng, options=importance_options(options.accuracy_sd))
+            except NotConvergedError:  # its weights cannot be trusted here; chains need none
+                return _chains(target, mode, covariance, options, rng=rng, progress=progress)
+        case "ensemble":
+            return _chains(target, *_mode(fit, target), options, rng=rng, progress=progress)
+    assert_never(options.method)
+
+
+def _mode(fit: BumpFit, target: Target) -> tuple[FloatArray, FloatArray]:
+    """The posterior's mode and covariance, from least squares."""
+    from tactile_bayes.inference.laplace import mode_and_covariance
+
+    mode, covariance, _ = mode_and_covariance(target, fit.theta, scale=np.sqrt(np.diag(fit.covariance)))
+    return mode, covariance
+
+
+def _chains(
+    target: Target,
+    mode: FloatArray,
+    covariance: FloatArray,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None,
+) -> ParameterDraws:
     from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 
     settings = EnsembleOptions() if options.max_steps is None else EnsembleOptions(max_steps=options.max_steps)
@@ -94,7 +115,7 @@ def _draw(
 
 
 def judged_noise(fit: BumpFit, odds: float | None) -> NoiseFigures:
-    """What the errors were found to be, for the report."""
+    """Figures of the errors, for the report."""
     figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
     offset = level_offset(fit.fit.residual, weight=fit.weight)
     return NoiseFigures("independent", fit.bump.rotated, odds, figures, level_offset=offset)

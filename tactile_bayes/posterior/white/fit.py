@@ -1,4 +1,4 @@
-"""Least-squares fit of a bump: candidate, window, weights, error model."""
+"""Least-squares fit of a bump: candidates, window, weights, error model."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ JOINED = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BumpFit:
-    """A least-squares bump with what the methods need to know of it.
+    """A least-squares bump, with all that the methods need.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class BumpFit:
         return float(sigma_x), float(sigma_y), float(angle)
 
     def linear_excess(self, theta: FloatArray) -> FloatArray:
-        """(m,) `Target.excess` of a model linear about the fit: what a method by mode and curvature takes it for."""
+        """(m,) `Target.excess` for a model linearised about the fit, as mode-and-curvature methods assume."""
         information = self.fit.jacobian.T @ (self.weight[:, None] * self.fit.jacobian)
         off = theta - self.theta
         return np.asarray(np.einsum("mp,pq,mq->m", off, information, off) / self.errors.inflation)
@@ -98,7 +98,7 @@ class BumpFit:
         )
 
     def _log_prior(self, prior: BumpPrior) -> LogPrior:
-        """The bump's priors on what `lump_fault` lets pass: a rise, no wider than the window, its centre within it.
+        """Prior of the bumps that `lump_fault` accepts: a rise, no wider than the window, its centre within it.
 
         Without these bounds a background a little off its fixed level is "fitted" by a wide shallow dent.
         """
@@ -116,7 +116,7 @@ class BumpFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """One place looked at.
+    """A candidate place.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Candidate:
 
 
 def fitted_candidates(tactile_map: TactileMap, options: FitOptions) -> Iterator[Candidate]:
-    """The places where a lump could be, highest first, each fitted when it is asked for."""
+    """Candidate places, highest first, each fitted on demand."""
     centres = [options.centre_mm] if options.centre_mm is not None else candidate_centres(tactile_map)
     for centre in centres:
         yield Candidate(centre, *fit_bump(tactile_map, centre, options=options))
@@ -146,7 +146,7 @@ def fitted_candidates(tactile_map: TactileMap, options: FitOptions) -> Iterator[
 def fit_bump(
     tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: FitOptions
 ) -> tuple[BumpFit | None, str]:
-    """Fit one bump near `centre_mm`; the window follows the fitted centre.
+    """Fit a bump near `centre_mm`; the window follows the fitted centre.
 
     Returns
     -------
@@ -190,7 +190,7 @@ def fit_bump(
 def fit_close(
     tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: FitOptions
 ) -> tuple[BumpFit | None, str]:
-    """Where to begin beside something that pulls the bump away: least squares in a window of `CLOSE_IN_RADII`.
+    """Fit in a window of `CLOSE_IN_RADII`, where a neighbour would pull the bump away.
 
     The ellipse may turn, so that a ridge shows as one.
     """
@@ -199,7 +199,7 @@ def fit_close(
 
 
 def default_errors(tactile_map: TactileMap) -> tuple[Background, Noise]:
-    """Background and noise of `FitOptions` where neither an option nor a size calibration decides.
+    """Default background and noise, where neither an option nor a size calibration decides.
 
     As the paper printed it where the level is known. Without a level the background is free, under correlated errors,
     which also take a sloping level: least squares alone then takes a slope for errors and its intervals grow several
@@ -212,7 +212,7 @@ def default_errors(tactile_map: TactileMap) -> tuple[Background, Noise]:
 
 
 def check_background(tactile_map: TactileMap, options: FitOptions) -> None:
-    """Refuse to fix the background of a map whose level is not known: there is nothing to fix it at.
+    """Refuse a fixed background for a map whose level is not known.
 
     The map's median, which is the nearest guess, moves with the lump itself: nominal 90 % intervals of widths then
     cover 4 to 29 % (docs/coverage.md).
@@ -291,7 +291,7 @@ def _start(
 
 
 def lump_fault(result: BumpFit, options: FitOptions) -> str:
-    """Why a fitted bump cannot be measured as a lump, with the figure and the limit; empty when it can."""
+    """Reason why a fitted bump is not measured, with the figure and the limit; empty if it can be."""
     sigma_x, sigma_y, _ = result.widths()
     cell = result.cells.cell_mm
     wide, narrow = max(sigma_x, sigma_y), min(sigma_x, sigma_y)
@@ -313,7 +313,7 @@ def lump_fault(result: BumpFit, options: FitOptions) -> str:
 def rotation_odds(
     tactile_map: TactileMap, unrotated: BumpFit, *, options: FitOptions, prior: BumpPrior
 ) -> tuple[float, BumpFit | None]:
-    """Bayes factor of a turned ellipse against one along the head's axes, and the turned fit.
+    """Bayes factor of a rotated ellipse against one along the head's axes, and the rotated fit.
 
     The Savage-Dickey ratio at r = 0 of the larger model: prior over posterior density there.
     """

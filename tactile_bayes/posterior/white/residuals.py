@@ -1,4 +1,4 @@
-"""Error model from a fit's residuals: variance, weights by count, and correlation."""
+"""Error model from a fit's residuals: variance, weights by count, correlation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tactile_bayes.records import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """Size and correlation of a map's errors, as a fit's residuals show them.
+    """Size and correlation of a map's errors, from a fit's residuals.
 
     Parameters
     ----------
@@ -59,14 +59,14 @@ def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
 
 
 def independent_errors(*, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
-    """The size of errors taken as independent, for fits to a model that itself has their correlation."""
+    """Error model without correlation, for fits whose model contains the correlation itself."""
     k, p = jacobian.shape
     dof = max(k - p, 1)
     return ErrorModel(float(np.sqrt(weight @ residual**2 / dof)), 1.0, float(dof))
 
 
 def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
-    r"""Judge the errors from a fit's residuals.
+    r"""Estimate the error model from a fit's residuals.
 
     Neighbouring cells share frames and the model's misfit, so their errors correlate. The least-squares estimate stays
     what it is; its covariance becomes the sandwich :math:`H^{-1} J^T W C W J H^{-1}` with C from the residuals'
@@ -100,7 +100,7 @@ def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, 
 
 
 def fitted_tilt(cells: FitCells, residual: FloatArray, *, weight: FloatArray) -> FloatArray:
-    """(k,) weighted least-squares plane through the residuals; zeros where there are too few cells for one."""
+    """(k,) weighted least-squares plane through the residuals; zeros where there are too few cells."""
     if len(cells) < 12:
         return np.zeros(len(cells))
     design = np.stack([np.ones(len(cells)), cells.x_mm - cells.x_mm.mean(), cells.y_mm - cells.y_mm.mean()], axis=1)
@@ -110,12 +110,12 @@ def fitted_tilt(cells: FitCells, residual: FloatArray, *, weight: FloatArray) ->
 
 
 def level_offset(residual: FloatArray, *, weight: FloatArray) -> float:
-    """Mean residual of the window: how far the map's level lies from the background that the fit assumed."""
+    """Mean residual of the window: distance of the map's level from the assumed background."""
     return float(weight @ residual / weight.sum())
 
 
 def _on_grid(cells: FitCells, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Values on the smallest grid that holds the cells, and a mask of where they are."""
+    """Values on the smallest grid that contains the cells, and a mask of the cells."""
     row, column = cells.row - cells.row.min(), cells.column - cells.column.min()
     grid = np.zeros((int(row.max()) + 1, int(column.max()) + 1))
     mask = np.zeros_like(grid)
@@ -125,7 +125,7 @@ def _on_grid(cells: FitCells, values: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def residual_autocorrelation(grid: FloatArray, mask: FloatArray) -> tuple[FloatArray, int]:
-    """Radial autocorrelation of whitened residuals out to where it first falls below its own noise.
+    """Radial autocorrelation of whitened residuals, up to where it first falls below its noise.
 
     Returns
     -------

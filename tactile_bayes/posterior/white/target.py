@@ -72,7 +72,7 @@ class Target:
         return self._at(theta, self.excess(theta))
 
     def solved_density(self, theta: FloatArray, solved: Solved) -> FloatArray:
-        """The same, with the `excess` at these points kept in `solved` for `draw_noise_sd`."""
+        """As the density, storing the `excess` at these points in `solved` for `draw_noise_sd`."""
         excess = self.excess(theta)
         solved.add(theta, (excess,))
         return self._at(theta, excess)
@@ -85,6 +85,6 @@ class Target:
         return np.where(np.isfinite(total), total, -np.inf)
 
     def draw_noise_sd(self, excess: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """(m,) noise scale given the draws' (m,) `excess`: a scaled inverse chi, exact under this model."""
+        """(m,) draws of the noise scale given `excess` (m,): a scaled inverse chi, exact under this model."""
         chi2 = rng.chisquare(self.errors.dof + self.dimension, size=len(excess))
         return np.sqrt((self.errors.dof * self.errors.noise_sd**2 + excess) / chi2)

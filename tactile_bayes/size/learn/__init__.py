@@ -1,1 +1,1 @@
-"""Learn a size calibration from known lumps."""
+"""Learning of size calibrations from known lumps."""

@@ -1,4 +1,4 @@
-r"""Effect of seat, soft lumps, thickness and head on Eq 6's size, from a study in which they vary.
+r"""Effects of seat, soft lumps, thickness and head on Eq 6's size, from a study that varies them.
 
 To first order about Eq 6 as it is learned, :math:`\theta`, with residuals :math:`r_i` of ln d,
 
@@ -18,14 +18,14 @@ import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import LEAST_HARD_RATIO
 from tactile_bayes.size.eq6 import AxisCalibration
-from tactile_bayes.size.learn.cross_validation import HARD_RATIO
 from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode
 
 LEAST_ROWS = 12
 TRANSFORMS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "seat": lambda seat: seat,
-    "stiffness_ratio": lambda ratio: np.asarray(np.minimum(np.log(ratio / HARD_RATIO), 0.0)),
+    "stiffness_ratio": lambda ratio: np.asarray(np.minimum(np.log(ratio / LEAST_HARD_RATIO), 0.0)),
     "thickness_mm": lambda thickness: np.asarray(np.log(thickness)),
     "head_radius_mm": lambda radius: np.asarray(np.log(radius)),
 }
@@ -34,7 +34,7 @@ TRANSFORMS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
 
 @dataclass(frozen=True, slots=True)
 class SizeTerm:
-    """What one property does to the size for the same amplitude and width.
+    """Effect of one property on the size at equal amplitude and width.
 
     Parameters
     ----------
@@ -58,14 +58,14 @@ class SizeTerm:
 
     @property
     def change(self) -> float:
-        """Of d from `low` to `high`, as a share."""
+        """Change of d from `low` to `high`, as a share."""
         ends = TRANSFORMS[self.name](np.array([self.low, self.high]))
         return float(np.expm1(self.coefficient * (ends[1] - ends[0])))
 
 
 @dataclass(frozen=True, slots=True)
 class SizeTerms:
-    """The terms of one axis of the head.
+    """Effects for one axis of the head.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class SizeTerms:
 
 
 def size_terms(table: SizeTable) -> dict[str, SizeTerms]:
-    """The terms by axis: ``"x"`` across the head, ``"y"`` along it; empty where nothing varies or rows are few."""
+    """Effects by axis: ``"x"`` across the head, ``"y"`` along it; empty where nothing varies or rows are few."""
     rising = table.amplitude > 0
     if table.cases is None or rising.sum() < LEAST_ROWS:
         return {}
@@ -103,7 +103,7 @@ def size_terms(table: SizeTable) -> dict[str, SizeTerms]:
 
 
 def _varied(cases: StudyCases) -> dict[str, FloatArray]:
-    """The properties that differ between rows in a way that matters, as the table has them."""
+    """Properties that vary enough between rows, as columns."""
     told = {**cases.others, "stiffness_ratio": cases.stiffness_ratio}
     if "seat_number" in told:
         told["seat"] = told["seat_number"]
@@ -129,7 +129,7 @@ def _terms(
     made = []
     for i, (name, values) in enumerate(varied.items()):
         alone = _left(np.concatenate([slopes, terms[:, i : i + 1]], axis=1), residual)
-        high = min(float(values.max()), HARD_RATIO) if name == "stiffness_ratio" else float(values.max())
+        high = min(float(values.max()), LEAST_HARD_RATIO) if name == "stiffness_ratio" else float(values.max())
         made.append(
             SizeTerm(
                 name,
@@ -154,7 +154,7 @@ def _left(design: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def _covariance(design: FloatArray, left: FloatArray, lump: np.ndarray[tuple[int], np.dtype[np.intp]]) -> FloatArray:
-    """Of the coefficients, with residuals of one lump taken as correlated in any way.
+    """Covariance of the coefficients, with any correlation of residuals within a lump.
 
     Notes
     -----

@@ -8,46 +8,53 @@ import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.size.eq6 import LeftOutErrors
+from tactile_bayes.presets import LEAST_HARD_RATIO
+from tactile_bayes.size.eq6 import AxisCalibration, LeftOutErrors
 from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode, width_changes
 from tactile_bayes.size.log_quadratic import quadratic_terms
 
 LEAST_GEOMETRIES = 8
 """A quadratic has six coefficients, and one geometry is missing from each fit."""
-HARD_RATIO = 8.0
-"""E2/E1 from which the paper takes a lump for hard: widths change by less than 5 % from there on."""
 
+FitAxis = Callable[[AxisRows], AxisCalibration]
+"""Eq 6 from the rows of one axis: `axis_at_mode` or `axis_in_two_stages`."""
 _Rows = np.ndarray[tuple[int], np.dtype[np.bool_]]
 _Predict = Callable[[_Rows], FloatArray]
 
 
-def left_out_of_study(table: SizeTable, *, least_stiffness_ratio: float = 0.0) -> LeftOutErrors | None:
-    """Errors of Eq 6 and of a log-quadratic when each geometry is left out of the learning in turn.
+def left_out_of_study(
+    table: SizeTable, *, least_stiffness_ratio: float = 0.0, fit: FitAxis | None = None
+) -> LeftOutErrors | None:
+    """Cross-validated errors of Eq 6 and of a log-quadratic, leaving out each geometry in turn.
 
     Parameters
     ----------
     table
         Of detectable cases; None is returned unless it has `StudyCases` in at least eight geometries.
     least_stiffness_ratio
-        Softer lumps take no part; 0 is `HARD_RATIO`.
+        Softer lumps take no part; 0 is `LEAST_HARD_RATIO`.
+    fit
+        Eq 6 from the rows of one axis; the joint posterior's mode when left out.
 
     Raises
     ------
     NotConvergedError
         When Eq 6 has no mode without one of the geometries.
+    BadDataError
+        When the two-stage fit has too few diameters without one.
 
     Notes
     -----
     A geometry is one seat, diameter and h/d. All stiffnesses of it go out together: they differ so little that one
     would tell the others' size. Where a lump's case at one diameter depth is out, so are the width changes against it.
 
-    Eq 6 is taken at the mode of the posterior that a calibration is drawn from; by both widths its size is the
-    geometric mean of those by each. The quadratic of ln d in ln a and ln sigma is one of least squares, as its spread
-    is not asked for; by both widths sigma is their geometric mean, as in `LogQuadratic`.
+    Eq 6 is by default taken at the mode of the posterior that a calibration is drawn from; by both widths its size is
+    the geometric mean of those by each. The quadratic of ln d in ln a and ln sigma is one of least squares, as its
+    spread is not asked for; by both widths sigma is their geometric mean, as in `LogQuadratic`.
     """
     if table.cases is None:
         return None
-    least = least_stiffness_ratio or HARD_RATIO
+    least = least_stiffness_ratio or LEAST_HARD_RATIO
     table = _rows(table, table.cases, (table.cases.stiffness_ratio >= least) & (table.amplitude > 0))
     assert table.cases is not None
     geometry = geometry_numbers(table.d_mm, table.cases)
@@ -55,7 +62,7 @@ def left_out_of_study(table: SizeTable, *, least_stiffness_ratio: float = 0.0) -
         return None
     widths = {"x": table.sigma_x_mm} if table.sigma_y_mm is None else {"x": table.sigma_x_mm, "y": table.sigma_y_mm}
     both = np.exp(np.mean([np.log(sigma) for sigma in widths.values()], axis=0))
-    eq6 = {name: _left_out(geometry, _eq6(table, sigma)) for name, sigma in widths.items()}
+    eq6 = {name: _left_out(geometry, _eq6(table, sigma, fit or axis_at_mode)) for name, sigma in widths.items()}
     eq6["both"] = np.exp(np.mean([np.log(np.maximum(size, 1e-3)) for size in eq6.values()], axis=0))
     quadratic = {name: _left_out(geometry, _quadratic(table, sigma)) for name, sigma in widths.items()}
     quadratic["both"] = _left_out(geometry, _quadratic(table, both))
@@ -69,7 +76,7 @@ def left_out_of_study(table: SizeTable, *, least_stiffness_ratio: float = 0.0) -
 
 
 def geometry_numbers(d_mm: FloatArray, cases: StudyCases) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """(n,) number of the geometry that each row is a case of: one seat, diameter and h/d."""
+    """(n,) index of each row's geometry: one seat, diameter and h/d."""
     names = list(zip(cases.seat, d_mm.tolist(), cases.depth_ratio.tolist(), strict=True))
     number = {name: i for i, name in enumerate(dict.fromkeys(names))}
     return np.array([number[name] for name in names], dtype=np.intp)
@@ -83,7 +90,7 @@ def _rows(table: SizeTable, cases: StudyCases, keep: _Rows) -> SizeTable:
 
 
 def _left_out(geometry: np.ndarray[tuple[int], np.dtype[np.intp]], predict: _Predict) -> FloatArray:
-    """(n,) sizes in mm, each by what was learned from the other geometries."""
+    """(n,) sizes in mm, each predicted from the other geometries."""
     sizes = np.empty(len(geometry))
     for number in range(int(geometry.max()) + 1):
         kept = geometry != number
@@ -91,7 +98,7 @@ def _left_out(geometry: np.ndarray[tuple[int], np.dtype[np.intp]], predict: _Pre
     return sizes
 
 
-def _eq6(table: SizeTable, sigma_mm: FloatArray) -> _Predict:
+def _eq6(table: SizeTable, sigma_mm: FloatArray, fit: FitAxis) -> _Predict:
     cases = table.cases
     assert cases is not None
     lump = cases.lumps(table.d_mm)
@@ -100,7 +107,8 @@ def _eq6(table: SizeTable, sigma_mm: FloatArray) -> _Predict:
         group = [key for key, is_kept in zip(lump, kept, strict=True) if is_kept]
         change = width_changes(sigma_mm[kept], depth_ratio=cases.depth_ratio[kept], group=group)
         try:
-            axis = axis_at_mode(AxisRows(table.d_mm[kept], table.amplitude[kept], sigma_mm[kept], change))
+            depth = cases.depth_ratio[kept]
+            axis = fit(AxisRows(table.d_mm[kept], table.amplitude[kept], sigma_mm[kept], change, depth))
         except NotConvergedError:
             out = int(np.flatnonzero(~kept)[0])
             where = f"{cases.seat[out]}, d {table.d_mm[out]:g} mm, h/d {cases.depth_ratio[out]:g}"

@@ -13,23 +13,29 @@ LEAST_BODIES = 80
 _ROUND = [POWERS.index(one) for one in ROUND]
 
 
+def table_with_depths(table: PopulationTable) -> tuple[PopulationTable, FatDepth, FloatArray] | None:
+    """Rows with a profile, what their profiles tell of the fat, and (n,) ln F by it; None for too few bodies."""
+    if table.profile is None:
+        return None
+    table = table.rows(np.isfinite(table.profile.sum(axis=1)))
+    if table.profile is None or table.log_fat is None or len(np.unique(table.body)) < LEAST_BODIES:
+        return None
+    depth = learn_depth(table.profile, table.log_fat)
+    return table, depth, depth.log_depth(table.profile)
+
+
 def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
-    """The calibration by amplitude, width and depth of fat, from the maps with a profile; None for too few bodies.
+    """Learn the calibration by amplitude, width and depth of fat from maps with a profile; None for too few bodies.
 
     Raises
     ------
     NotConvergedError
         When the posterior has no mode.
     """
-    if table.profile is None or table.log_fat is None:
+    found = table_with_depths(table)
+    if found is None:
         return None
-    table = table.rows(np.isfinite(table.profile.sum(axis=1)))
-    if len(np.unique(table.body)) < LEAST_BODIES:
-        return None
-    assert table.profile is not None
-    assert table.log_fat is not None
-    depth = learn_depth(table.profile, table.log_fat)
-    log_depth = depth.log_depth(table.profile)
+    table, depth, log_depth = found
     alpha, p0, w0 = (round(float(one.mean()), 3) for one in (table.log_amplitude, table.log_width, log_depth))
 
     def terms_of(log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
@@ -55,7 +61,7 @@ def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
 
 
 def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
-    """ln F by least squares on the full quadratic of (n, 3) profiles."""
+    """Fit ln F by least squares on the full quadratic of (n, 3) profiles."""
     centre, scale = profile.mean(axis=0), profile.std(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     x = profile_terms((profile - centre) / scale)

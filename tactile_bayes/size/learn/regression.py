@@ -13,16 +13,18 @@ bodies and spread between exams are so told apart, and a patient's map adds its 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import ndtri
 
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.laplace import mode_and_covariance
 from tactile_bayes.presets import HELD
 from tactile_bayes.size.hidden import HiddenTerms
 
+LEAST_BODIES = 20
 Terms = Callable[[FloatArray, FloatArray], FloatArray]
 """Takes (n,) ln a and p of a table's rows to (n, k) terms."""
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
@@ -31,7 +33,7 @@ _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PopulationTable:
-    """Maps of known lumps, one map a row.
+    """Maps of known lumps, one per row.
 
     Parameters
     ----------
@@ -63,7 +65,7 @@ class PopulationTable:
         return len(self.d_mm)
 
     def rows(self, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> PopulationTable:
-        """The rows for which `keep` is true."""
+        """Copy with the rows where `keep` is true."""
         return PopulationTable(
             self.body[keep],
             self.d_mm[keep],
@@ -79,37 +81,57 @@ class PopulationTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyRegression:
-    """The table as the likelihood needs it: rows for maps, and their means over the exams of each body.
+    """Data of the likelihood: maps as rows, and their means over each body's exams.
 
     Parameters
     ----------
     terms : (n, k) array
-        What ln d is linear in; the second is u.
-    log_d, map_variance, group : (n,) arrays
-        ln d; variance of the predicted ln d by the map's own posterior; number of the body.
-    exams, mean_terms, mean_log_d
-        Of the bodies.
+        What ln d is linear in.
+    constant, map_variance, group : (n,) arrays
+        What ln d has beside the terms; variance of the predicted ln d by the map's own posterior; number of the body.
+    exams, mean_terms, mean_log_d, mean_u
+        Of the bodies; the third is the mean of ln d less the constant, the fourth of the centred ln a.
     """
 
     terms: FloatArray
-    log_d: FloatArray
+    constant: FloatArray
     map_variance: FloatArray
     group: np.ndarray[tuple[int], np.dtype[np.intp]]
     exams: FloatArray
     mean_terms: FloatArray
     mean_log_d: FloatArray
+    mean_u: FloatArray
 
     @classmethod
     def of(cls, table: PopulationTable, terms_of: Terms) -> BodyRegression:
         """The regression of a table on the terms of its ln a and p."""
-        terms, log_d = terms_of(table.log_amplitude, table.log_width), np.log(table.d_mm)
+        terms = terms_of(table.log_amplitude, table.log_width)
+        nothing = np.zeros((2, len(table)))
+        by_terms = cls.linear(table, terms, u=terms[:, 1], constant=nothing[0], slope=nothing)
+        slope = _slopes(table, terms_of) @ by_terms.least_squares()
+        return replace(by_terms, map_variance=_map_variance(table, slope))
+
+    @classmethod
+    def linear(
+        cls, table: PopulationTable, terms: FloatArray, *, u: FloatArray, constant: FloatArray, slope: FloatArray
+    ) -> BodyRegression:
+        """The regression of a table on given terms.
+
+        Parameters
+        ----------
+        terms : (n, k) array
+        u : (n,) array
+            Centred ln a, with which the spread between bodies changes.
+        constant : (n,) array
+            What ln d has beside the terms.
+        slope : (2, n) array
+            Derivatives of the predicted ln d by ln a and p.
+        """
         group = np.asarray(np.unique(table.body, return_inverse=True)[1])
         exams = np.bincount(group).astype(np.float64)
         mean_terms = np.stack([np.bincount(group, column) / exams for column in terms.T], axis=1)
-        b = np.linalg.lstsq(mean_terms, np.bincount(group, log_d) / exams, rcond=None)[0]
-        slope = _slopes(table, terms_of) @ b
-        variance = np.einsum("in,nij,jn->n", slope, table.covariance[:, :2, :2], slope)
-        return cls(terms, log_d, variance, group, exams, mean_terms, np.bincount(group, log_d) / exams)
+        left, mean_u = (np.bincount(group, one) / exams for one in (np.log(table.d_mm) - constant, u))
+        return cls(terms, constant, _map_variance(table, slope), group, exams, mean_terms, left, mean_u)
 
     @property
     def groups(self) -> int:
@@ -117,15 +139,15 @@ class BodyRegression:
         return len(self.exams)
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """(groups,) means of (n,) values over the exams of each body."""
+        """(groups,) means of (n,) values over each body's exams."""
         return np.asarray(np.bincount(self.group, values) / self.exams)
 
     def least_squares(self) -> FloatArray:
-        """(k,) coefficients by ordinary least squares of the bodies' means."""
+        """(k,) ordinary least-squares coefficients from the bodies' means."""
         return np.asarray(np.linalg.lstsq(self.mean_terms, self.mean_log_d, rcond=None)[0])
 
     def log_exam_sd(self, coefficients: FloatArray) -> tuple[float, float]:
-        """ln t and its variance: how sizes by the quadratic differ within a body beyond their maps' own noise.
+        """ln t and its variance, t the SD of sizes between exams of a body beyond their maps' own noise.
 
         Without bodies examined twice, the prior.
         """
@@ -133,7 +155,7 @@ class BodyRegression:
         if freedom < 1:
             return float(_PRIOR[2, 0]), float(_PRIOR[2, 1] ** 2)
         k = self.terms.shape[1]
-        size = self.terms @ coefficients[:k]
+        size = self.terms @ coefficients[:k] + self.constant
         within = float(np.sum((size - self.mean(size)[self.group]) ** 2) / freedom)
         repeated = self.exams[self.group] > 1
         beyond = max(within - float(self.map_variance[repeated].mean()), (0.1 * np.exp(_PRIOR[2, 0])) ** 2)
@@ -143,7 +165,7 @@ class BodyRegression:
         """(m,) log posterior of (m, k + 2) coefficients, ln(sd between bodies) and its slope."""
         exam = np.exp(2 * self.log_exam_sd(self.least_squares())[0])
         residual = self.mean_log_d - theta[:, :-2] @ self.mean_terms.T
-        variance = np.exp(2 * (theta[:, -2:-1] + theta[:, -1:] * self.mean_terms[:, 1]))
+        variance = np.exp(2 * (theta[:, -2:-1] + theta[:, -1:] * self.mean_u))
         variance = variance + (exam + self.mean(self.map_variance)) / self.exams
         total = -0.5 * np.sum(np.log(variance) + residual**2 / variance, axis=1)
         prior = -0.5 * np.sum(((theta[:, -2:] - _PRIOR[:2, 0]) / _PRIOR[:2, 1]) ** 2, axis=1)
@@ -154,7 +176,7 @@ class BodyRegression:
         return np.asarray(self.mean_log_d - self.mean_terms @ mode[:-3])
 
     def posterior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance, taken as normal: k coefficients, ln(sd between bodies), its slope, ln(sd between exams).
+        """Mean and covariance of k coefficients, ln(sd between bodies), its slope, ln(sd between exams), as normal.
 
         Raises
         ------
@@ -172,7 +194,7 @@ class BodyRegression:
         return np.append(mode, log_exam_sd), covariance
 
     def oval(self, table: PopulationTable, design: FloatArray) -> tuple[FloatArray, float, float]:
-        """What makes a ball's map oval: coefficients of q0 in the (n, c) design, its spread between bodies and exams.
+        """Axis ratio of a ball's map: coefficients of q0 in the (n, c) design, spread between bodies and exams.
 
         By least squares over the balls, the two spreads by analysis of variance.
         """
@@ -187,8 +209,18 @@ class BodyRegression:
 
     def leverage(self) -> tuple[FloatArray, float]:
         """(k, k) inverse of X^T X over the table's maps, and the largest leverage of one of them."""
-        inverse = np.asarray(np.linalg.inv(self.terms.T @ self.terms), dtype=np.float64)
-        return inverse, float(np.einsum("ni,ij,nj->n", self.terms, inverse, self.terms).max())
+        return largest_leverage(self.terms)
+
+
+def largest_leverage(features: FloatArray) -> tuple[FloatArray, float]:
+    """(c, c) inverse of X^T X for (n, c) features, and the largest leverage of a row."""
+    inverse = np.asarray(np.linalg.inv(features.T @ features), dtype=np.float64)
+    return inverse, float(np.einsum("ni,ij,nj->n", features, inverse, features).max())
+
+
+def _map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
+    """(n,) variance of ln d by the maps' own posteriors, for (2, n) slopes by ln a and p."""
+    return np.asarray(np.einsum("in,nij,jn->n", slope, table.covariance[:, :2, :2], slope))
 
 
 def _slopes(table: PopulationTable, terms_of: Terms) -> FloatArray:
@@ -199,19 +231,30 @@ def _slopes(table: PopulationTable, terms_of: Terms) -> FloatArray:
     return np.stack([by_a, by_p])
 
 
-def hidden_terms(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> HiddenTerms | None:
-    """Joint second moments of B and of what was varied, each about what the map leads one to expect of it."""
+def hidden_terms(
+    table: PopulationTable, data: BodyRegression, mode: FloatArray, *, features: FloatArray | None = None
+) -> HiddenTerms | None:
+    """Joint second moments of B and of what was varied, each about what the map leads one to expect of it.
+
+    Parameters
+    ----------
+    features : (n, c) array
+        What a map leads one to expect is linear in these; the regression's own terms where left out. B is about the
+        terms in any case.
+    """
     if not table.unknowns:
         return None
-    design = data.mean_terms
+    own = features is None
+    design = data.mean_terms if features is None else np.stack([data.mean(column) for column in features.T], axis=1)
     varied = np.stack([data.mean(values) for values in table.unknowns.values()], axis=1)
-    both = np.concatenate([varied, data.body_residuals(mode)[:, None]], axis=1)
-    coefficients = np.linalg.lstsq(design, both, rcond=None)[0]
-    rest = both - design @ coefficients
+    coefficients = np.linalg.lstsq(design, varied, rcond=None)[0]
+    body = data.body_residuals(mode)
+    body = body - design @ np.linalg.lstsq(design, body, rcond=None)[0] if own else body
+    rest = np.column_stack([varied - design @ coefficients, body])
     moments = np.asarray(rest.T @ rest / max(data.groups - int(design.shape[1]), 1), dtype=np.float64)
     return HiddenTerms(
         names=tuple(table.unknowns),
-        expected=np.asarray(coefficients.T[:-1]),
+        expected=np.asarray(coefficients.T),
         covariance=moments[:-1, :-1],
         with_body=moments[:-1, -1],
         body_variance=float(moments[-1, -1]),
@@ -219,7 +262,7 @@ def hidden_terms(table: PopulationTable, data: BodyRegression, mode: FloatArray)
 
 
 def figures(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> dict[str, float]:
-    """Rows, spreads, and the errors of masses when each body is left out of the fit in turn."""
+    """Number of rows, spreads, and errors cross-validated by body."""
     error = left_out_errors(data.mean_terms, data.mean_log_d)
     return {
         "maps": float(len(table)),
@@ -234,15 +277,15 @@ def figures(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> d
 
 
 def held(data: BodyRegression, mode: FloatArray, error: FloatArray) -> float:
-    """Share of the bodies left out whose size lies in the interval of `HELD` by the spreads that were learned."""
+    """Share of held-out bodies whose size lies in the interval of probability `HELD`, by the learned spreads."""
     leverage = _leverage(data.mean_terms)
-    spread = np.exp(2 * (mode[-3] + mode[-2] * data.mean_terms[:, 1]))
+    spread = np.exp(2 * (mode[-3] + mode[-2] * data.mean_u))
     spread = spread + (np.exp(2 * mode[-1]) + data.mean(data.map_variance)) / data.exams
     return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(spread / (1.0 - leverage))))
 
 
 def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
-    """(n,) ln(predicted / true size) of each row when it is left out of the least-squares fit, in closed form."""
+    """(n,) ln(predicted / true size) of each row, held out of the least-squares fit, in closed form."""
     inverse = np.linalg.inv(terms.T @ terms)
     residual = log_d - terms @ (inverse @ (terms.T @ log_d))
     return np.asarray(-residual / (1.0 - _leverage(terms)))
@@ -251,3 +294,22 @@ def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
 def _leverage(terms: FloatArray) -> FloatArray:
     """(n,) weight of each row in its own least-squares prediction."""
     return np.asarray(np.einsum("ni,ij,nj->n", terms, np.linalg.inv(terms.T @ terms), terms))
+
+
+def check_population(table: PopulationTable) -> None:
+    """Raise `BadDataError` where bodies are too few, do not vary or hold a number that is not finite."""
+    bodies = len(np.unique(table.body))
+    if bodies < LEAST_BODIES:
+        raise BadDataError(f"{bodies} bodies with a map", way_out=f"a calibration needs at least {LEAST_BODIES}")
+    for name, values in (("d_mm", table.d_mm), ("amplitude", table.log_amplitude), ("width", table.log_width)):
+        if np.ptp(values) <= 0:
+            raise BadDataError(f"all rows have one {name}", way_out="a calibration needs lumps that differ")
+    finite = [table.d_mm, table.log_amplitude, table.log_width, table.half_log_ratio, table.covariance]
+    if not all(np.isfinite(values).all() for values in finite):
+        raise BadDataError("a row holds a number that is not finite", way_out="leave it out")
+
+
+def domain_of(table: PopulationTable) -> dict[str, tuple[float, float]]:
+    """Ranges of amplitude, mean width and diameter."""
+    values = {"amplitude": np.exp(table.log_amplitude), "sigma_mm": np.exp(table.log_width), "d_mm": table.d_mm}
+    return {name: (float(v.min()), float(v.max())) for name, v in values.items()}

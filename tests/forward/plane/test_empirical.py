@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_bayes.commands.study import fit_line
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.plane.empirical import (
     SHARE,
@@ -16,6 +17,7 @@ from tactile_bayes.forward.plane.empirical import (
     homogeneous_pressure,
     kappa,
     lump_pressure,
+    outside_range,
 )
 from tactile_bayes.forward.plane.line import build_line, head_positions
 from tactile_bayes.forward.plane.study import StudySettings
@@ -147,9 +149,36 @@ def test_where_the_paper_shows_agreement_there_is_some(quick: StudySettings) -> 
 
 def test_a_small_difference_of_squares_hides_a_wrong_bump(quick: StudySettings) -> None:
     """Decision 0007: the norm that the paper prints does not see what the strict one and the fit see."""
-    from tactile_bayes.commands.study import fit_line
-
     found = compare(Scene("deep", 15.5, 1.4, 0.0), settings=quick, fit=fit_line)
     assert found.map < 0.025
     assert found.map_strict > 0.5
     assert abs(found.empirical.amplitude / found.elastic.amplitude - 1) > 0.3
+
+
+SEEN = {
+    (15.0, 1.0): (0.184, 0.245),
+    (20.0, 0.8): (0.360, 0.444),
+    (20.0, 1.2): (0.075, 0.001),
+    (10.0, 1.5): (0.037, 0.001),
+}
+"""Amplitudes of plane strain and of Eqs 1 to 4 (centred, E2/E1 = 100): the table of decision record 0098."""
+
+
+@pytest.mark.parametrize("lump", SEEN)
+def test_where_the_empirical_map_loses_a_lump_it_warns(lump: tuple[float, float]) -> None:
+    """Against the plane-strain model; a lump inside the range is the negative control."""
+    d, h = lump
+    found = compare(Scene("", d, h, 0.0), settings=StudySettings(), fit=fit_line)
+    assert (found.elastic.amplitude, found.empirical.amplitude) == pytest.approx(SEEN[lump], abs=2e-3)
+    lost = found.empirical.amplitude < 0.5 * found.elastic.amplitude
+    assert lost == (outside_range(d, h) is not None)
+
+
+def test_the_warning_is_one_line_with_the_range() -> None:
+    for d, h in ((20.0, 1.2), (20.0, 2.0), (5.0, 0.8)):
+        warning = outside_range(d, h)
+        assert warning is not None
+        assert warning.startswith("warning: ")
+        assert "\n" not in warning
+        assert "10 mm and more down to h/d 1" in warning
+    assert outside_range(10.0, 1.0) is None

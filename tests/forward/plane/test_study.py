@@ -24,10 +24,12 @@ from tactile_bayes.forward.plane.study import (
     paper_grid,
     run_geometry,
     seat_name,
+    stiffness_changes,
     width_changes,
 )
 from tactile_bayes.inference.least_squares import fit_least_squares
 from tactile_bayes.presets import HEADS
+from tactile_bayes.report.study_text import study_text
 
 X = 0.5 * (np.arange(240) - 119.5)
 
@@ -180,3 +182,13 @@ def test_a_head_that_is_none_is_a_usage_error(words: tuple[str, ...]) -> None:
     ended = CliRunner().invoke(cli, [*words, "--head", "round"])
     assert ended.exit_code == 2
     assert "shoulders-inside" in ended.output
+
+
+def test_the_change_of_width_with_stiffness_is_the_largest_from_8_on() -> None:
+    """Fig 7b: widths of one lump over its width at E2/E1 = 100, softer ones and other depths left out."""
+    rows = [row(10, 1.0, 0.2, sigma, ratio=ratio) for ratio, sigma in ((2, 3.0), (8, 4.6), (10, 4.8), (100, 5.0))]
+    rows += [row(10, 1.2, 0.2, 9.0), row(10, 1.2, 0.2, 1.0, ratio=8.0), row(5, 1.0, 0.01, 1.0, ratio=8.0)]
+    rows += [row(5, 1.0, 0.2, 2.0)]
+    assert stiffness_changes(rows) == {10: pytest.approx(0.08)}
+    assert stiffness_changes(rows, least_ratio=2.0) == {10: pytest.approx(0.4)}
+    assert "centred, width at h/d 1 from E2/E1 = 8 on: within 8.0 % at 10 mm" in study_text(rows)

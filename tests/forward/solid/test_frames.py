@@ -115,7 +115,7 @@ def test_two_lumps_are_the_sum_of_their_changes() -> None:
 
 def test_overlapping_lumps_that_leave_no_compliance_are_refused() -> None:
     close = sphere(15.0, 8.0, 17.0)
-    with pytest.raises(BadDataError, match="keep lumps further apart"):
+    with pytest.raises(BadDataError, match="too close together for this model"):
         frame(*[PlacedLump(close, 0.3 * i, 0.0) for i in range(6)])
 
 

@@ -117,7 +117,7 @@ def test_a_low_rank_change_is_the_changed_matrix() -> None:
 
 
 def test_a_skin_without_compliance_left_is_refused() -> None:
-    with pytest.raises(BadDataError, match="keep lumps further apart"):
+    with pytest.raises(BadDataError, match="too close together for this model"):
         ContactStiffness.of(small_body()).changed(np.ones((49, 1)), np.array([-1.0]))
     with pytest.raises(BadDataError, match="not positive definite"):
         ContactStiffness.of(-small_body())

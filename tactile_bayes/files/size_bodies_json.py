@@ -1,0 +1,56 @@
+"""What the files of both forms of a size calibration over a population share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
+from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.hidden import RoundLumps
+
+
+def bodies_document(calibration: BodyCalibration) -> dict[str, Any]:
+    """Its shared part as plain data; numbers keep nine significant digits."""
+    balls = calibration.round_lumps
+    return {
+        "source": calibration.source,
+        "recipe": calibration.recipe.as_dict(),
+        "centre": {"log_amplitude": calibration.centre[0], "log_width": calibration.centre[1]},
+        "mean": numbers(calibration.mean),
+        "covariance": numbers(calibration.covariance),
+        "round_lumps": {
+            "coefficients": numbers(balls.coefficients),
+            "body_sd": number(balls.body_sd),
+            "exam_sd": number(balls.exam_sd),
+        },
+        "information_inverse": numbers(calibration.information_inverse),
+        "most_leverage": number(calibration.most_leverage),
+        "domain": {name: [number(low), number(high)] for name, (low, high) in calibration.domain.items()},
+        "hidden": None if calibration.hidden is None else hidden_document(calibration.hidden),
+        "fit": {name: number(value) for name, value in calibration.fit.items()},
+    }
+
+
+def parse_bodies(document: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of a `BodyCalibration` from a document that keeps its schema.
+
+    Raises
+    ------
+    BadDataError
+        When its numbers cannot be those of a calibration.
+    """
+    balls = document["round_lumps"]
+    return {
+        "centre": (float(document["centre"]["log_amplitude"]), float(document["centre"]["log_width"])),
+        "mean": array_of(document, "mean"),
+        "covariance": array_of(document, "covariance"),
+        "round_lumps": RoundLumps(array_of(balls, "coefficients"), float(balls["body_sd"]), float(balls["exam_sd"])),
+        "information_inverse": array_of(document, "information_inverse"),
+        "most_leverage": float(document["most_leverage"]),
+        "domain": {name: (float(low), float(high)) for name, (low, high) in document["domain"].items()},
+        "recipe": Recipe(**document["recipe"]),
+        "hidden": parse_hidden(document["hidden"], terms=len(document["information_inverse"])),
+        "fit": {name: float(value) for name, value in document["fit"].items()},
+        "source": document["source"],
+    }

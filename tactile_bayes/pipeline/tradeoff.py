@@ -1,0 +1,150 @@
+"""The trade of time for accuracy on a user's own maps and scans: calibration and options as `estimate` takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.pipeline.one_map import answer_of, estimate_file, estimate_inputs
+from tactile_bayes.pipeline.settings import Settings
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.posterior.options import EstimateOptions
+    from tactile_bayes.scan import Scan
+    from tactile_bayes.size.calibration import Calibration
+    from tactile_bayes.size.pooling import PooledEstimate
+    from tactile_bayes.studies.cost_ladder import Clock, Ladder, PooledRow, Progress
+    from tactile_bayes.studies.size_answers import SizeAnswer
+
+Announce = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """How a study is run.
+
+    Parameters
+    ----------
+    clock
+        CPU seconds so far.
+    tolerance_mm, runs, announce, progress
+        As of `studies.estimate_tradeoff.measure`.
+    """
+
+    clock: Clock
+    tolerance_mm: float
+    runs: int
+    announce: Announce = lambda _seconds: None
+    progress: Progress | None = None
+
+
+def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[TactileMap, Ladder]:
+    """Every setting of `estimate` on a map that need not be built again; the map too.
+
+    Raises
+    ------
+    BadDataError
+        When the file is no map, or the calibration that was named does not fit it.
+    UsageError
+        When the settings name a checkpoint: the runs are many.
+    """
+    from tactile_bayes.files.map_nc import read_map
+    from tactile_bayes.studies.estimate_tradeoff import measure
+
+    _refuse_checkpoint(settings)
+    tactile_map = read_map(path)
+    try:
+        calibration, options, _ = estimate_inputs(settings, tactile_map)
+        return tactile_map, measure(
+            tactile_map,
+            calibration=calibration,
+            options=options,
+            clock=work.clock,
+            tolerance_mm=work.tolerance_mm,
+            seed=settings.seed,
+            runs=work.runs,
+            probability=settings.interval,
+            announce=work.announce,
+            progress=work.progress,
+        )
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
+    """The size by the first map of one mass, by the first two, and so on.
+
+    Raises
+    ------
+    BadDataError
+        When a file is no map, or the maps were normalised in several ways.
+    UsageError
+        When the calibration cannot pool maps.
+    """
+    from tactile_bayes.pipeline.pooled import pool_answers
+    from tactile_bayes.studies.cost_ladder import PooledRow
+
+    rows, answers, spent = [], [], 0.0
+    for number, path in enumerate(paths, start=1):
+        begun = clock()
+        answers.append(answer_of(estimate_file(path, settings)))
+        spent += clock() - begun
+        begun = clock()
+        pooled = pool_answers(answers, settings, names=[one.stem for one in paths[:number]], inputs={}).pooled
+        pooling = clock() - begun
+        rows.append(PooledRow(number, spent + pooling, *_pooled_answer(pooled, settings)))
+    return tuple(rows)
+
+
+def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnswer, float]:
+    """The size of this exam, and half the width of the interval of another one."""
+    from tactile_bayes.studies.size_answers import SIZE, SizeAnswer
+
+    if pooled.size is None:
+        return SizeAnswer(pooled.reason), float("nan")
+    found = {SIZE: pooled.size.summarise(SIZE, probability=settings.interval)}
+    answer = SizeAnswer("", None, found, settings.method, pooled.size.variance_share)
+    if pooled.size.another_exam is None:
+        return answer, float("nan")
+    another = pooled.size.another_exam.summarise(SIZE, probability=settings.interval)
+    return answer, 0.5 * (another.high - another.low)
+
+
+def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
+    """Every setting of `map` on a scan, each with an estimate by default of the map that it makes.
+
+    Raises
+    ------
+    BadDataError
+        When no map can be built by default.
+    UsageError
+        When the settings name a checkpoint: the runs are many.
+    """
+    from tactile_bayes.studies.map_tradeoff import measure
+
+    _refuse_checkpoint(settings)
+
+    def inputs(tactile_map: TactileMap) -> tuple[Calibration | None, EstimateOptions]:
+        calibration, options, _ = estimate_inputs(settings, tactile_map)
+        return calibration, options
+
+    return measure(
+        scan,
+        inputs=inputs,
+        clock=work.clock,
+        tolerance_mm=work.tolerance_mm,
+        seed=settings.seed,
+        runs=work.runs,
+        probability=settings.interval,
+        announce=work.announce,
+        progress=work.progress,
+    )
+
+
+def _refuse_checkpoint(settings: Settings) -> None:
+    if settings.checkpoint is not None:
+        raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")

@@ -1,0 +1,153 @@
+"""Cost of accuracy before the map: cells, frames, time of strokes, normalising and engine, each up to the size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.engine import fast_is_installed
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.thinning import first_seconds
+from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, INTERVAL, NORMALISE
+from tactile_bayes.scan import Scan
+from tactile_bayes.size.calibration import Calibration
+from tactile_bayes.studies.cost_ladder import Clock, Ladder, Priced, Progress, Reference, Run, priced
+from tactile_bayes.studies.estimate_tradeoff import Estimator
+from tactile_bayes.studies.size_answers import SizeAnswer
+
+FINEST_CELL_MM = 0.5
+CELLS_MM = (FINEST_CELL_MM, 0.75, 1.5, 2.0, 3.0, 4.0)
+EVERY = (2, 4, 8, 16, 32)
+SHARES_OF_TIME = (0.75, 0.5, 0.25)
+CELL, FRAMES, TIME, LEVEL, ENGINE = "cell size", "frames used", "time of strokes", "normalising", "engine"
+Inputs = Callable[[TactileMap], tuple[Calibration | None, EstimateOptions]]
+
+
+@dataclass(frozen=True, slots=True)
+class MapSetting:
+    """One way to build a map.
+
+    Parameters
+    ----------
+    axis, label, default, usable
+        As of `Priced`.
+    options
+        Of `build_map`.
+    duration_s
+        Use the first so many seconds only; None uses all.
+    weight
+        About how many times the default's CPU time it takes, for a forecast.
+    """
+
+    axis: str
+    label: str
+    options: dict[str, Any] = field(default_factory=dict)
+    duration_s: float | None = None
+    weight: float = 1.0
+    default: bool = False
+    usable: bool = True
+
+
+def settings_of(scan: Scan) -> list[MapSetting]:
+    """Everything that is tried, the default first."""
+    time_s = scan.frames.time_s
+    whole_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    return [
+        MapSetting(CELL, f"--cell-mm {CELL_MM:g}", default=True),
+        *(MapSetting(CELL, f"--cell-mm {h:g}", {"cell_mm": h}, weight=0.5 + 0.5 / h**2) for h in CELLS_MM),
+        *(MapSetting(FRAMES, f"--every {n}", {"every": n}, weight=0.5 + 0.5 / n) for n in EVERY),
+        *(
+            MapSetting(TIME, f"the first {share * whole_s:.3g} s of {whole_s:.3g} s", {}, share * whole_s, usable=False)
+            for share in SHARES_OF_TIME
+            if whole_s > 0
+        ),
+        *(
+            MapSetting(LEVEL, f"--normalise {way}", {"normalise": way}, usable=False)
+            for way in NORMALISE
+            if way != DEFAULT_NORMALISE
+        ),
+        *_engines(),
+    ]
+
+
+def _engines() -> Iterator[MapSetting]:
+    for name in ("numpy", "fast") if fast_is_installed() else ("numpy",):
+        yield MapSetting(ENGINE, f"engine {name}", {"engine": name}, usable=False)
+
+
+def measure(
+    scan: Scan,
+    *,
+    inputs: Inputs,
+    clock: Clock,
+    tolerance_mm: float,
+    seed: int = 1,
+    runs: int = 3,
+    probability: float = INTERVAL,
+    announce: Callable[[float], None] = lambda _seconds: None,
+    progress: Progress | None = None,
+) -> Ladder:
+    """Build and estimate the map of a scan at every setting.
+
+    Parameters
+    ----------
+    inputs
+        From a map to the calibration and the options with which `estimate` takes it by itself.
+    clock, tolerance_mm, seed, runs, probability, announce, progress
+        As of `studies.estimate_tradeoff.measure`.
+
+    Raises
+    ------
+    BadDataError
+        When no map can be built by default.
+    """
+
+    def run_of(one: MapSetting) -> Run:
+        def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
+            begun = clock()
+            try:
+                tactile_map = _build(scan, one)
+                built_s = clock() - begun
+                calibration, options = inputs(tactile_map)
+                estimator = Estimator(tactile_map, calibration, seed, clock, probability)
+                seconds, answer = estimator.run(options)(number)
+            except BadDataError as error:
+                if one.default:
+                    raise
+                return {"map": clock() - begun, "estimate": 0.0}, SizeAnswer(str(error))
+            return {"map": built_s, **seconds}, answer
+
+        return once
+
+    settings = settings_of(scan)
+    default = run_of(settings[0])
+    default(0)  # imports and first calls cost nothing afterwards
+    seconds, _ = default(0)
+    announce(sum(seconds.values()) * (4.0 + runs * sum(one.weight for one in settings)))
+    reference = _reference(scan, inputs, clock=clock, seed=seed, probability=probability)
+    rows: list[Priced] = []
+    for number, one in enumerate(settings, start=1):
+        found = priced(one.axis, one.label, run_of(one), reference, runs=runs, default=one.default, usable=one.usable)
+        rows.append(found)
+        if progress is not None:
+            progress(number, len(settings))
+    return Ladder(tuple(rows), reference, tolerance_mm)
+
+
+def _build(scan: Scan, one: MapSetting) -> TactileMap:
+    used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
+    return build_map(used, **one.options)
+
+
+def _reference(scan: Scan, inputs: Inputs, *, clock: Clock, seed: int, probability: float) -> Reference:
+    """A long run on the map with the finest cells, of all frames."""
+    begun = clock()
+    finest = build_map(scan, cell_mm=FINEST_CELL_MM)
+    calibration, options = inputs(finest)
+    found = Estimator(finest, calibration, seed, clock, probability).reference(options)
+    words = found.words.replace("the default's posterior", f"the map of all frames in cells of {FINEST_CELL_MM:g} mm")
+    return replace(found, words=words, cpu_s=clock() - begun)

@@ -1,0 +1,336 @@
+"""A scan against a forward model of a scene: the same poses and mean pressures, frame by frame and as maps.
+
+Section 2.3 of the paper compares rubber models with its forward models so: frames within 15 %, maps within 2.6 %. It
+does not define its mean squared difference; here it is the sum of squared differences over the sum of squares of the
+model (docs/decisions/0007).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.plane.empirical import fit_shape, lump_pressure
+from tactile_bayes.forward.plane.tables import mean_squared_difference
+from tactile_bayes.forward.scene import Scene
+from tactile_bayes.forward.simulate import felt_at_poses
+from tactile_bayes.geometry import FloatArray, inverse
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.frames import SelectedFrames, select_frames
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.options import FitOptions
+from tactile_bayes.posterior.white.fit import BumpFit, fit_bump, fitted_candidates
+from tactile_bayes.presets import CELL_MM, FIT_RADIUS_MM, PRESSURE_WINDOW_KPA
+from tactile_bayes.records import dataclass
+from tactile_bayes.scan import CountArray, ElementCalibration, PressureFrames, Scan
+
+Progress = Callable[[int, int], None]
+NEAR_MM = 40.0
+"""Maps are compared within this distance of the lump."""
+# Readings of a model travel as whole numbers, this many a kPa: up to the 34 kPa at which a taxel saturates.
+_COUNTS_PER_KPA = 1900.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredFrames:
+    """The frames of a scan that are compared.
+
+    Parameters
+    ----------
+    scan
+        These frames alone, at one pose a frame as before.
+    pressure_kpa : (n, rows, columns) array
+        NaN for taxels that are left out.
+    rotation, origin_mm : (n, 3, 3), (n, 3) arrays
+        Of the head in the map's plane.
+    level_kpa : (n,) array
+        Mean over the valid taxels.
+    tactile_map
+        Of these frames.
+    place_mm
+        The lump on the map: where the scene's first lump is put.
+    lump
+        The bump of Eq 7 there; None where none was fitted.
+    """
+
+    scan: Scan
+    pressure_kpa: FloatArray
+    rotation: FloatArray
+    origin_mm: FloatArray
+    level_kpa: FloatArray
+    tactile_map: TactileMap
+    place_mm: tuple[float, float]
+    lump: BumpFit | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelComparison:
+    """How far one model is from the measured frames and map; differences as shares of the model's sum of squares.
+
+    Parameters
+    ----------
+    fidelity
+        Which of `forward.simulate.FIDELITIES`.
+    pressure_kpa : (n, rows, columns) array
+        The model's frames.
+    tactile_map
+        Of the model's frames, on the cells of the measured map.
+    frames_all, frames_centre, frames_near
+        Mean over the frames of each frame's difference: of all taxels; along the head's centre line; and the latter
+        in frames whose centre lies within 12 mm of the lump.
+    rms_kpa
+        Root mean square difference of a taxel.
+    map_all, map_centre, map_strict
+        Of the map within 40 mm of the lump, of its centre line across the lump, and of the map relative to map - 1.
+    lump
+        The bump of Eq 7 on the model's map; None where none was fitted.
+    """
+
+    fidelity: str
+    pressure_kpa: FloatArray
+    tactile_map: TactileMap
+    frames_all: float
+    frames_centre: float
+    frames_near: float
+    rms_kpa: float
+    map_all: float
+    map_centre: float
+    map_strict: float
+    lump: BumpFit | None
+
+
+def measured_frames(
+    scan: Scan,
+    *,
+    every: int = 1,
+    cell_mm: float = CELL_MM,
+    pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA,
+    latency_ms: float = 0.0,
+    place_mm: tuple[float, float] | None = None,
+) -> MeasuredFrames:
+    """The frames of a scan that a map takes, their poses in its plane, and the place of the lump.
+
+    Parameters
+    ----------
+    every
+        Take one used frame in so many.
+    cell_mm, pressure_window_kpa, latency_ms
+        As in `mapping.build.build_map`.
+    place_mm
+        The lump in the map's plane; None takes the highest bump that can be a lump.
+
+    Raises
+    ------
+    BadDataError
+        When no frame is left, or no lump is found and no place is given.
+    """
+    selected = select_frames(scan, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms)
+    used = np.flatnonzero(selected.used)[::every]
+    part = _frames_of(scan, scan.frames.counts, used, scan.element_calibration)
+    made = build_map(
+        part, cell_mm=cell_mm, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms, normalise="mean"
+    )
+    assert made.plane_from_base is not None
+    rotation, origin = _poses_in_plane(selected, used, made.plane_from_base)
+    pressure = scan.element_calibration.to_kpa(scan.frames.counts[used])
+    pressure[:, ~selected.good_taxels] = np.nan
+    lump = _bump(made, place_mm)
+    if lump is None and place_mm is None:
+        raise BadDataError("no lump is found on the scan's map", way_out="say where it is: --at X Y")
+    place = place_mm if place_mm is not None else _centre(lump)
+    return MeasuredFrames(part, pressure, rotation, origin, selected.level_kpa[used], made, place, lump)
+
+
+def compare_model(
+    measured: MeasuredFrames,
+    scene: Scene,
+    *,
+    fidelity: str,
+    head: str | None = None,
+    progress: Progress | None = None,
+) -> ModelComparison:
+    """One model of a scene against measured frames.
+
+    Parameters
+    ----------
+    scene
+        Its first lump is put where the measured one is; a scene without a lump stays where it is.
+    fidelity, head
+        As in `forward.simulate.simulate`.
+
+    Raises
+    ------
+    BadDataError
+        When the scene's array is not the scan's, or the model cannot make the scene.
+    """
+    _check_array(measured.scan, scene)
+    lump = scene.solid_lumps[0] if scene.solid_lumps else scene.lumps[0] if scene.lumps else None
+    at = measured.place_mm if lump is None else (lump.x_mm, lump.y_mm)
+    origin = measured.origin_mm.copy()
+    origin[:, :2] += np.subtract(at, measured.place_mm)
+    pressure = felt_at_poses(
+        scene,
+        measured.rotation,
+        origin,
+        mean_kpa=measured.level_kpa,
+        fidelity=fidelity,
+        head=head,
+        progress=progress,
+    )
+    made = _model_map(measured, pressure)
+    model, seen = pressure.reshape(len(pressure), -1), measured.pressure_kpa.reshape(len(pressure), -1)
+    line, line_seen = centre_line(pressure), centre_line(measured.pressure_kpa)
+    near = np.hypot(*(measured.origin_mm[:, :2] - measured.place_mm).T) <= 12.0
+    frames = _shares(line_seen, line)
+    cells = _map_cells(measured, made)
+    ours, theirs = measured.tactile_map.mean[cells], made.mean[cells]
+    row = cells & _centre_row(measured)[:, None]
+    return ModelComparison(
+        fidelity,
+        pressure,
+        made,
+        float(np.mean(_shares(seen, model))),
+        float(np.mean(frames)),
+        float(np.mean(frames[near])) if near.any() else float("nan"),
+        float(np.sqrt(np.nanmean((seen - model) ** 2))),
+        mean_squared_difference(ours, theirs),
+        mean_squared_difference(measured.tactile_map.mean[row], made.mean[row]),
+        float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
+        _bump(made, measured.place_mm),
+    )
+
+
+def centre_line(pressure_kpa: FloatArray) -> FloatArray:
+    """(n, rows) pressure across the head along its centre line: the mean of the two middle columns."""
+    middle = pressure_kpa.shape[2] // 2
+    return np.asarray(pressure_kpa[:, :, middle - 1 : middle + 1].mean(axis=2))
+
+
+def centre_row(measured: MeasuredFrames, tactile_map: TactileMap) -> tuple[FloatArray, FloatArray]:
+    """Places from the lump (k,) and the map there (k,), along the rows of cells within 1.5 mm of its centre."""
+    rows = tactile_map.mean[_centre_row(measured)]
+    read = np.isfinite(rows).any(axis=0)
+    return tactile_map.x_mm[read] - measured.place_mm[0], np.asarray(np.nanmean(rows[:, read], axis=0))
+
+
+def line_bump(measured: MeasuredFrames, tactile_map: TactileMap) -> tuple[float, float]:
+    """Amplitude and sigma (mm) of Eq 5, level 1, on the map's centre line within `FIT_RADIUS_MM` of the lump."""
+    x, mean = centre_row(measured, tactile_map)
+    near = np.abs(x) <= FIT_RADIUS_MM
+
+    def bump(log_width: float) -> FloatArray:
+        return lump_pressure(x[near], height_kpa=1.0, width_mm=float(np.exp(log_width)))
+
+    ends = np.log([0.5 * tactile_map.recipe.cell_mm, FIT_RADIUS_MM])
+    found = fit_shape(bump, mean[near] - 1.0, grid=np.linspace(ends[0], ends[1], 60))
+    return found.height, float(np.exp(found.parameter))
+
+
+def residual_map(measured: MeasuredFrames, comparison: ModelComparison) -> FloatArray:
+    """(ny, nx) measured less modelled map; NaN where either has no readings."""
+    return np.asarray(measured.tactile_map.mean - comparison.tactile_map.mean)
+
+
+def residual_slope(measured: MeasuredFrames, comparison: ModelComparison) -> tuple[float, float, float]:
+    """Slope of the residual map along x and y, per 10 mm, and the root mean square that it leaves.
+
+    A slope is a tilt of the real head against the modelled one: the map's plane is not quite that of the skin.
+    """
+    made = measured.tactile_map
+    cells = _map_cells(measured, comparison.tactile_map)
+    y, x = np.nonzero(cells)
+    design = np.stack([np.ones(len(x)), made.x_mm[x] / 10.0, made.y_mm[y] / 10.0], axis=1)
+    residual = residual_map(measured, comparison)[cells]
+    found = np.linalg.lstsq(design, residual, rcond=None)[0]
+    return float(found[1]), float(found[2]), float(np.sqrt(np.mean((residual - design @ found) ** 2)))
+
+
+def _frames_of(scan: Scan, counts: CountArray, used: NDArray[np.intp], gains: ElementCalibration) -> Scan:
+    """The scan with some of its frames alone."""
+    return replace(scan, frames=PressureFrames(scan.frames.time_s[used], counts[used]), element_calibration=gains)
+
+
+def _poses_in_plane(
+    selected: SelectedFrames, used: NDArray[np.intp], plane_from_base: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rotations (n, 3, 3) and origins (n, 3) of the head's face in the plane."""
+    tracker_from_head = inverse(selected.scan.head.scanhead_from_tracker)
+    rotation = selected.poses.rotation[used]
+    origin = selected.poses.position_mm[used] + rotation @ tracker_from_head[:3, 3]
+    turn = plane_from_base[:3, :3]
+    return turn @ rotation @ tracker_from_head[:3, :3], origin @ turn.T + plane_from_base[:3, 3]
+
+
+def _model_map(measured: MeasuredFrames, pressure_kpa: FloatArray) -> TactileMap:
+    """The map of the model's frames by the road of the measured ones; taxels left out there are left out here."""
+    counts = np.clip(np.rint(pressure_kpa * _COUNTS_PER_KPA), 0, np.iinfo(np.uint16).max - 1).astype(np.uint16)
+    bad = np.isnan(measured.pressure_kpa).all(axis=0)
+    gain = np.where(bad, 0.0, 1.0 / _COUNTS_PER_KPA)
+    gains = ElementCalibration(gain, np.zeros_like(gain), saturation_count=np.iinfo(np.uint16).max)
+    scan = replace(measured.scan, frames=PressureFrames(measured.scan.frames.time_s, counts), element_calibration=gains)
+    recipe = measured.tactile_map.recipe
+    low, high = recipe.pressure_window_kpa or PRESSURE_WINDOW_KPA
+    # The model's level is the measured one's to rounding: no frame may fall out at the window's ends.
+    return build_map(
+        scan,
+        cell_mm=recipe.cell_mm,
+        pressure_window_kpa=(0.99 * low, 1.01 * high),
+        latency_ms=recipe.latency_ms,
+        normalise="mean",
+    )
+
+
+def _map_cells(measured: MeasuredFrames, made: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """(ny, nx) cells within `NEAR_MM` of the lump that both maps cover.
+
+    Raises
+    ------
+    BadDataError
+        When the maps' cells differ, which they do not for frames at the same poses.
+    """
+    mine = measured.tactile_map
+    if mine.mean.shape != made.mean.shape or not np.allclose(mine.x_mm, made.x_mm):
+        raise BadDataError(
+            f"the maps have {mine.mean.shape} and {made.mean.shape} cells", way_out="some frames of the model are bad"
+        )
+    far = np.hypot(mine.x_mm[None, :] - measured.place_mm[0], mine.y_mm[:, None] - measured.place_mm[1])
+    return np.asarray(mine.covered & made.covered & (far <= NEAR_MM))
+
+
+def _centre_row(measured: MeasuredFrames) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    cell = measured.tactile_map.recipe.cell_mm
+    return np.asarray(np.abs(measured.tactile_map.y_mm - measured.place_mm[1]) <= max(1.5, 0.51 * cell))
+
+
+def _shares(seen: FloatArray, model: FloatArray) -> FloatArray:
+    """(n,) difference of each frame as a share of the model's sum of squares, over the taxels that are valid."""
+    valid = np.isfinite(seen)
+    gap = np.where(valid, seen - model, 0.0)
+    return np.asarray((gap**2).sum(axis=1) / (np.where(valid, model, 0.0) ** 2).sum(axis=1))
+
+
+def _bump(made: TactileMap, place_mm: tuple[float, float] | None) -> BumpFit | None:
+    """Eq 7 with a background of 1: at a place, or at the highest bump that can be a lump."""
+    options = FitOptions()
+    if place_mm is not None:
+        return fit_bump(made, place_mm, options=options)[0]
+    return next((one.fit for one in fitted_candidates(made, options) if one.fit is not None and not one.fault), None)
+
+
+def _centre(fit: BumpFit | None) -> tuple[float, float]:
+    assert fit is not None
+    return float(fit.theta[1]), float(fit.theta[2])
+
+
+def _check_array(scan: Scan, scene: Scene) -> None:
+    wanted, given = scan.head.shape, (scene.head.rows, scene.head.columns)
+    if wanted != given or abs(scan.head.pitch_mm - scene.head.pitch_mm) > 1e-6:
+        raise BadDataError(
+            f"the scene's head has {given[0]} x {given[1]} taxels {scene.head.pitch_mm:g} mm apart, the scan's "
+            f"{wanted[0]} x {wanted[1]} taxels {scan.head.pitch_mm:g} mm apart",
+            way_out="give the scan's head in [head] of the scene",
+        )

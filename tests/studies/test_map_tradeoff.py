@@ -1,0 +1,89 @@
+"""`tradeoff map`: cells, frames and strokes against the finest map, and what is said where nothing can be built."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import tactile_bayes
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.schema import check_document
+from tactile_bayes.mapping.thinning import first_seconds
+from tactile_bayes.pipeline.scans import load_scans
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.pipeline.tradeoff import Work, tradeoff_of_scan
+from tactile_bayes.report.ladder_document import ladder_document
+from tactile_bayes.report.ladder_text import ladder_text
+from tactile_bayes.scan import Scan
+from tactile_bayes.studies import estimate_tradeoff
+from tactile_bayes.studies import map_tradeoff as study
+from tactile_bayes.studies.cost_ladder import Ladder, Priced
+from tactile_bayes.studies.size_answers import SIZE, WIDTHS
+
+DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
+
+
+@cache
+def demo() -> Scan:
+    (scan,), _ = load_scans([DEMO])
+    return scan
+
+
+@cache
+def ladder() -> Ladder:
+    ticks = itertools.count()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "CELLS_MM", (0.5, 8.0))
+        patch.setattr(study, "EVERY", (2, 1000))
+        patch.setattr(study, "SHARES_OF_TIME", (0.01,))
+        patch.setattr(estimate_tradeoff, "LONG_RUNS", (("importance", 0.01),))
+        return tradeoff_of_scan(demo(), Settings(), Work(lambda: float(next(ticks)), 0.2, 1))
+
+
+def row(label: str) -> Priced:
+    (found,) = (one for one in ladder().rows if one.label == label)
+    return found
+
+
+def test_the_finest_map_is_the_reference():
+    """The same map by the default's draws: what is left is their Monte-Carlo error."""
+    finest = row("--cell-mm 0.5")
+    assert finest.off.ends < 4 * finest.answer.quantities[SIZE].mc_error
+    assert "cells of 0.5 mm" in ladder().reference.words
+    assert ladder().reference.error_mm < 0.02
+
+
+def test_the_engine_and_every_second_frame_change_little():
+    assert row("engine numpy").answer == row("--cell-mm 1").answer
+    assert row("--every 2").off.ends < 1.0
+
+
+def test_cells_too_large_come_out_as_wrong():
+    """The negative control: the lump's sigma is 5 mm, cells of 8 mm do not resolve it."""
+    wrong = row("--cell-mm 8")
+    assert wrong.answer.reported is None or wrong.off.ends > 5 * row("--cell-mm 1").off.ends
+    assert ladder().enough() is not wrong
+
+
+def test_what_cannot_be_built_or_sized_is_a_row_too(tmp_path: Path):
+    short = next(one for one in ladder().rows if one.axis == study.TIME)
+    for one in (short, row("--every 1000")):
+        assert one.answer.reported is None
+        assert one.answer.reason
+        assert math.isnan(one.off.ends)
+    pressure = row("--normalise none")
+    assert set(pressure.answer.quantities) == set(WIDTHS)
+    assert math.isnan(pressure.off.ends)
+    text = ladder_text(ladder())
+    assert "a width: this map has no size" in text
+    assert "map s  estimate s" in text
+    check_document(ladder_document(ladder(), what="map", provenance={}), "tradeoff.schema.json", path=tmp_path)
+
+
+def test_a_scan_without_a_map_is_refused():
+    with pytest.raises(BadDataError):
+        tradeoff_of_scan(first_seconds(demo(), 0.001), Settings(), Work(lambda: 0.0, 0.2, 1))
