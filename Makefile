@@ -52,17 +52,13 @@ bench-trial: $(VENV)/.installed
 # The size calibrations that come with the program, made again: an hour on two cores for each population's scans.
 calibrations: $(VENV)/.installed
 	mkdir -p build
-	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 240 --seed 7 --workers 2 \
-		--normalise gain -o build/population.csv --force
-	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 400 --centred 240 --seed 7 --workers 2 \
-		--normalise mean -o build/population_mean.csv --force
-	$(BIN)/tactile-bayes calibrate size build/population.csv --form log-quadratic \
+	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 1500 --centred 750 --seed 7 --workers 2 \
+		--normalise gain --normalise mean -o build/population.csv --force
+	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise gain --form log-quadratic \
 		-o tactile_bayes/calibrations/solid.json --force
-	$(BIN)/tactile-bayes calibrate size build/population_mean.csv --form log-quadratic \
+	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise mean --form log-quadratic \
 		-o tactile_bayes/calibrations/solid_mean.json --force
-	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 700 --centred 400 --seed 7 --workers 2 \
-		--normalise gain -o build/population_eq6.csv --force
-	$(BIN)/tactile-bayes calibrate size build/population_eq6.csv --form eq6 \
+	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise gain --form eq6 \
 		-o tactile_bayes/calibrations/eq6.json --force
 	$(BIN)/tactile-bayes study -o build/paper_grid.csv --force
 	$(BIN)/tactile-bayes calibrate size build/paper_grid.csv --fit-radius-mm 48 --least-stiffness-ratio 8 \

@@ -45,7 +45,8 @@ def command() -> None:
 @click.option(
     "--normalise",
     type=click.Choice(NORMALISE),
-    help="Normalisation of the table's maps, if the table does not state it. Default: mean.",
+    help="Normalisation of the table's maps, if the table does not state it; of a table of `population` with rows by "
+    "several, which to learn from. Default: mean.",
 )
 @click.option(
     "--background",
@@ -115,7 +116,8 @@ def size(
     would go if it were known; `estimate` does not use that.
 
     From a table of `population`, which has a row for each exam of a body, either form tells apart what differs between
-    bodies and between exams of one body. `population` made the maps: nothing is declared. From the pressure over the
+    bodies and between exams of one body. `population` made the maps: nothing is declared, and --normalise chooses among
+    a table's rows. From the pressure over the
     head where it felt no lump it also learns how deep the fat is, and sizes that go with it. The log-quadratic form is
     ln d as a quadratic in ln a and ln sigma, or a cubic with the depth of fat.
 
@@ -134,7 +136,7 @@ def size(
         refuse_existing(path, force=force)
     if form == "log-quadratic" or is_population(table):
         _refuse_declared(ctx)
-        click.echo(_over_bodies(table, output, form, force=force), nl=False)
+        click.echo(_over_bodies(table, output, form, normalise, force=force), nl=False)
         return
     declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     rows = read_table(table, "size_table.table.json")
@@ -160,20 +162,20 @@ def size(
 def _refuse_declared(ctx: click.Context) -> None:
     from tactile_bayes.errors import UsageError
 
-    for name in ("fit", "normalise", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed"):
+    for name in ("fit", "background", "fit_radius_mm", "noise", "least_stiffness_ratio", "figure", "seed"):
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
             raise UsageError(f"--{option} is for tables of lumps: a table of `population` fixes how its maps were made")
 
 
-def _over_bodies(table: Path, output: Path, form: str, *, force: bool) -> str:
+def _over_bodies(table: Path, output: Path, form: str, normalise: str | None, *, force: bool) -> str:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_body_calibration
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.pipeline.size_calibration import learn_population
     from tactile_bayes.report.population_text import body_calibration_text
 
-    calibration, settings = learn_population(read_table(table, "population.table.json"), form)
+    calibration, settings = learn_population(read_table(table, "population.table.json"), form, normalise)
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table))
     write_body_calibration(output, calibration, provenance=provenance, force=force)
     return body_calibration_text(calibration)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,9 +34,11 @@ _FILE = FilePath()
 @click.option(
     "--normalise",
     type=click.Choice(["gain", "mean"]),
-    default=DEFAULT_NORMALISE,
+    multiple=True,
+    default=[DEFAULT_NORMALISE],
     show_default=True,
-    help="Normalisation of the maps, as in `map`; the calibration is for maps made the same way.",
+    help="Normalisation of the maps, as in `map`; the calibration is for maps made the same way. Give it twice for a "
+    "row by each from one scan.",
 )
 @seed_option(7)
 @WORKERS
@@ -46,7 +49,7 @@ def command(
     masses: int,
     centred: int,
     scans: int,
-    normalise: str,
+    normalise: tuple[str, ...],
     seed: int,
     workers: int,
     scheduler: str | None,
@@ -56,7 +59,7 @@ def command(
 
     Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
     pressure, strokes, head yaw, tilt, noise, tracker errors and latency. The solid model makes the scans; maps are
-    built and fitted as `map` and `estimate` do it. A mass takes about ten seconds. An interrupted run goes on where it
+    built and fitted as `map` and `estimate` do it. A mass takes about two seconds. An interrupted run goes on where it
     stopped. `calibrate size` learns Eq 6 from the table, or with
     --form log-quadratic a calibration of the default's kind.
 
@@ -78,7 +81,7 @@ def command(
         "scans": scans,
         "seed": seed,
         "first_centred": masses if centred else None,
-        "normalise": normalise,
+        "normalise": list(dict.fromkeys(normalise)),
         **as_settings(BodyPrior(), ExamPrior()),
     }
     kept = output.with_name(f"{output.name}.unfinished")
@@ -88,7 +91,13 @@ def command(
         progress_bar("masses") as progress,
     ):
         outcomes = run_batch(
-            partial(rows_of_mass, scans=scans, seed=seed, first_centred=masses, normalise=normalise),
+            partial(
+                rows_of_mass,
+                scans=scans,
+                seed=seed,
+                first_centred=masses,
+                normalise=tuple(dict.fromkeys(normalise)),
+            ),
             range(masses + centred),
             key=str,
             executor=executor,
@@ -113,7 +122,7 @@ def command(
 
 
 def rows_of_mass(
-    index: int, *, scans: int, seed: int, first_centred: int, normalise: str = DEFAULT_NORMALISE
+    index: int, *, scans: int, seed: int, first_centred: int, normalise: Sequence[str] = (DEFAULT_NORMALISE,)
 ) -> list[MassRow]:
     """Rows of one mass, in any process."""
     import numpy as np

@@ -119,13 +119,15 @@ def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_rati
     return tuple(found)
 
 
-def learn_population(rows: Table, form: str) -> tuple[BodyCalibration, dict[str, Any]]:
+def learn_population(rows: Table, form: str, normalise: str | None = None) -> tuple[BodyCalibration, dict[str, Any]]:
     """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
 
     Parameters
     ----------
     form
         ``"log-quadratic"`` or ``"eq6"``.
+    normalise
+        Of the rows to learn from; may be left out where all are alike.
 
     Raises
     ------
@@ -141,15 +143,14 @@ def learn_population(rows: Table, form: str) -> tuple[BodyCalibration, dict[str,
     from tactile_bayes.studies.population import measuring_options, population_table
 
     fit = measuring_options().fit
-    recipe = Recipe(
-        _normalise_of(rows), fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False
-    )
+    way, columns = _of_one_way(rows, normalise)
+    recipe = Recipe(way, fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False)
     learn = learn_log_quadratic if form == "log-quadratic" else learn_population_eq6
     try:
-        calibration = learn(population_table(rows.columns), recipe=recipe, source=_SOURCE)
+        calibration = learn(population_table(columns), recipe=recipe, source=_SOURCE)
     except BadDataError as error:
         raise error.at(rows.path) from None
-    masses = len(set(rows.columns["body"]))
+    masses = len(set(columns["body"]))
     return calibration, {"form": form, "masses": masses, **as_settings(BodyPrior(), ExamPrior())}
 
 
@@ -230,16 +231,28 @@ def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) 
         return None, str(error)
 
 
-def _normalise_of(rows: Table) -> str:
-    """Way a `population` table's maps were normalised; by the mean in tables without the column."""
-    found = {str(value or "mean") for value in rows.columns.get("normalise", ["mean"])}
-    if len(found) > 1:
+def _of_one_way(rows: Table, normalise: str | None) -> tuple[str, dict[str, list[Any]]]:
+    """How a `population` table's maps were normalised, and its columns for the rows that were.
+
+    Tables without the column, and empty cells, are of maps normalised by the mean.
+    """
+    ways = [str(value or "mean") for value in rows.columns.get("normalise", ["mean"] * len(rows))]
+    found = sorted(set(ways))
+    if normalise is None and len(found) > 1:
         raise BadDataError(
-            f"its maps were normalised in several ways ({', '.join(sorted(found))})",
-            way_out="learn from the rows of one way",
+            f"its maps were normalised in several ways ({', '.join(found)})",
+            way_out=f"learn from the rows of one way: --normalise {found[0]}",
             path=str(rows.path),
         )
-    return found.pop()
+    chosen = normalise or found[0]
+    if chosen not in found:
+        raise BadDataError(
+            f"none of its maps were made with --normalise {chosen}",
+            way_out=f"give --normalise {found[0]}",
+            path=str(rows.path),
+        )
+    kept = [i for i, way in enumerate(ways) if way == chosen]
+    return chosen, {name: [values[i] for i in kept] for name, values in rows.columns.items()}
 
 
 def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:

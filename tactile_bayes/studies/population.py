@@ -87,9 +87,13 @@ class MassRow:
 
 
 def measure_mass(
-    scenes: Sequence[Scene], *, body: int, scan: Callable[[Scene], Scan], normalise: str = DEFAULT_NORMALISE
+    scenes: Sequence[Scene],
+    *,
+    body: int,
+    scan: Callable[[Scene], Scan],
+    normalise: Sequence[str] = (DEFAULT_NORMALISE,),
 ) -> list[MassRow]:
-    """Scan, map and fit each scene of a mass; returns its rows.
+    """Scan each scene of a mass, map and fit it; returns a row for each scene and normalisation.
 
     Parameters
     ----------
@@ -98,9 +102,13 @@ def measure_mass(
     scan
         Makes the scan of a scene.
     normalise
-        As `build_map`'s.
+        As `build_map`'s: a map by each from one scan.
     """
-    return [measure_exam(scene, scan(scene), body=body, exam=i, normalise=normalise) for i, scene in enumerate(scenes)]
+    rows = []
+    for i, scene in enumerate(scenes):
+        made = scan(scene)
+        rows += [measure_exam(scene, made, body=body, exam=i, normalise=one) for one in normalise]
+    return rows
 
 
 def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> MassRow:

@@ -121,6 +121,15 @@ def test_maps_normalised_in_several_ways_teach_nothing(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert "t.csv: its maps were normalised in several ways (gain, mean)" in done.stderr
     assert not (tmp_path / "s.json").exists()
+    assert "--normalise gain" in done.stderr
+    words = ("calibrate", "size", "t.csv", "--form", "log-quadratic", "-o", "s.json", "--normalise")
+    done = run_here(*words, "mean", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "40 bodies, 40 maps" in done.stdout
+    assert read_size_calibration(tmp_path / "s.json").recipe.normalise == "mean"
+    done = run_here(*words, "none", "--force", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "none of its maps were made with --normalise none" in done.stderr
 
 
 def test_a_table_of_another_kind_is_refused(tmp_path: Path) -> None:
@@ -172,6 +181,11 @@ def test_a_scan_of_a_plain_lump_is_measured_as_a_patients() -> None:
         assert found.sigma_x_mm == pytest.approx(4.6, rel=0.15)
         assert found.var_p is not None
         assert 0 < found.var_p < 0.05**2
+
+    both = measure_mass(scenes, body=2, scan=scan, normalise=("gain", "mean"))
+    assert [(r.exam, r.normalise) for r in both] == [(0, "gain"), (0, "mean"), (1, "gain"), (1, "mean")]
+    assert both[::2] == rows
+    assert both[1].amplitude != both[0].amplitude
 
     def nothing(scene):
         return simulate(replace(scene, body=None, solid_lumps=()), rng=np.random.default_rng(scene.seed)).scan

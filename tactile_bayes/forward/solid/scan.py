@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -119,25 +119,30 @@ def layers_of(body: SceneBody, fat_mm: float) -> LayeredBody:
 def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> CondensedLump:
     """Condense the body around a lump; the lump's stiffness and place do not matter here."""
     geometry = LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, fat_mm, body.thickness_mm)
-    return condense_lump(geometry, Tissue(body.fat_kpa, body.gland_ratio, body.nu))
+    return _condensed(geometry, Tissue(body.fat_kpa, body.gland_ratio, body.nu))
 
 
+# Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
+_BODIES_KEPT = 8
+
+
+@lru_cache(maxsize=_BODIES_KEPT)
+def _condensed(geometry: LumpGeometry, tissue: Tissue) -> CondensedLump:
+    return condense_lump(geometry, tissue)
+
+
+@lru_cache(maxsize=_BODIES_KEPT)
 def _head(head: Head, body: SceneBody, fat_mm: float) -> SolidHead:
     return solid_head(face_of(head), layers_of(body, fat_mm))
 
 
 def _placed(scene: Scene) -> list[PlacedLump]:
-    """The scene's lumps with their places; lumps of equal size and depth are condensed once."""
+    """The scene's lumps with their places."""
     body = scene.body or SceneBody()
     fat = fat_thickness(body, scene.solid_lumps)
-
-    @cache
-    def condensed(d_mm: float, height_mm: float, depth_ratio: float) -> CondensedLump:
-        return condensed_lump(SolidLump(d_mm=d_mm, height_mm=height_mm, depth_ratio=depth_ratio), body, fat)
-
     placed = []
     for lump in scene.stiff_balls:
-        around = condensed(lump.d_mm, lump.vertical_mm, lump.depth_ratio)
+        around = condensed_lump(lump, body, fat)
         change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
         placed.append(PlacedLump(change, lump.x_mm, lump.y_mm))
     return placed
