@@ -217,19 +217,25 @@ def _polynomial(factor: FloatArray) -> FloatArray:
 
 def _quadrature(mesh: LumpMesh) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Shape functions (9 points, 9 nodes), gradients (e, 9, 9, 2), points (e, 9, 2) and r dr dz weights (e, 9)."""
-    x, w = np.polynomial.legendre.leggauss(3)
-    value = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
-    slope = np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
-    shape = np.einsum("ai,bj->abij", value, value).reshape(9, 9)
-    local = np.stack([np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)], axis=-1).reshape(
-        9, 9, 2
-    )
+    shape, local, cell = lagrange_points()
     node = mesh.node_mm[mesh.element]
     jacobian = np.einsum("qnk,enx->eqxk", local, node)
     point = np.einsum("qn,enx->eqx", shape, node)
     gradient = np.einsum("qnk,eqkx->eqnx", local, np.linalg.inv(jacobian))
-    weight = np.abs(np.linalg.det(jacobian)) * np.outer(w, w).ravel() * point[..., 0]
+    weight = np.abs(np.linalg.det(jacobian)) * cell * point[..., 0]
     return shape, gradient, point, weight
+
+
+def lagrange_points() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Biquadratic shape functions (9 points, 9 nodes) and local gradients (9, 9, 2) at Gauss points, with weights (9,)."""
+    x, w = np.polynomial.legendre.leggauss(3)
+    value = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
+    slope = np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
+    shape = np.einsum("ai,bj->abij", value, value).reshape(9, 9)
+    slopes = np.stack([np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)], axis=-1).reshape(
+        9, 9, 2
+    )
+    return shape, slopes, np.outer(w, w).ravel()
 
 
 def _strains(shape: FloatArray, gradient: FloatArray, r_mm: FloatArray) -> FloatArray:
@@ -259,7 +265,7 @@ def _skin(mesh: LumpMesh) -> IntArray:
     return mesh.surface[1:-1]
 
 
-def _unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
+def order_unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
     """Index (-1: fixed) and sign of the reduced unknown for each of the (n, 3) displacements of one order.
 
     The base and the far rim do not move. On the axis, displacements must be single-valued: order 0 keeps u_z, order 1
@@ -288,7 +294,7 @@ def _unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
 def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int) -> CondensedMode:
     from scipy.sparse.linalg import splu
 
-    number, sign = _unknowns(mesh, order)
+    number, sign = order_unknowns(mesh, order)
     inside = mesh.region >= INTERIOR_FAT
     stiffness = elements[0] + order * elements[1] + order**2 * elements[2]
     boundary = np.unique(number[mesh.arc])
