@@ -43,6 +43,11 @@ class Harmonic:
     odd: bool = False
 
     @property
+    def twist(self) -> bool:
+        """Whether this is the twist about the vertical, u_theta alone."""
+        return self.odd and self.order == 0
+
+    @property
     def measure(self) -> float:
         """Integral of the squared form over the circle."""
         return 2.0 * np.pi if self.order == 0 else np.pi
@@ -59,11 +64,10 @@ class Harmonic:
 def families(orders: int, *, symmetric: bool) -> tuple[tuple[Harmonic, ...], ...]:
     """All forms below an order, in groups that do not act on each other.
 
-    A plane of symmetry keeps the even forms from the odd ones. The odd form of order 0 is a twist about the vertical,
-    which moves no skin by itself.
+    A plane of symmetry keeps the even forms from the odd ones. The odd form of order 0 is a twist about the vertical.
     """
     even = tuple(Harmonic(m) for m in range(orders))
-    odd = tuple(Harmonic(m, odd=True) for m in range(1, orders))
+    odd = tuple(Harmonic(m, odd=True) for m in range(orders))
     return (even, odd) if symmetric else (even + odd,)
 
 
@@ -164,18 +168,22 @@ class Inclusion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stations:
-    """Quadrature angles, with (t, k, 3) values of the scaled forms and their derivatives, and the weight of an angle."""
+    """Quadrature angles, with (t, k, 3) values of the scaled forms and their derivatives, and the weight of an angle.
+
+    `swells` are the forms with a volume change: all but the twist.
+    """
 
     value: FloatArray
     slope: FloatArray
     weight: float
+    swells: IntArray
 
     @classmethod
     def of(cls, forms: Sequence[Harmonic], theta: FloatArray, weight: float) -> _Stations:
         pairs = [form.values(theta) for form in forms]
         scale = np.array([form.measure for form in forms]) ** -0.5
         value, slope = (np.stack([pair[i] for pair in pairs], axis=1) * scale[:, None] for i in (0, 1))
-        return cls(value, slope, weight)
+        return cls(value, slope, weight, np.array([i for i, form in enumerate(forms) if not form.twist]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +225,7 @@ def _lines(mesh: LumpMesh, forms: Sequence[Harmonic], lines: int) -> list[_Line]
 def _hull_line(mesh: LumpMesh, forms: Sequence[Harmonic]) -> _Line:
     numbers, signs, start = [], [], 0
     for form in forms:
-        number, sign = order_unknowns(mesh, form.order)
+        number, sign = order_unknowns(mesh, form.order, twist=form.twist)
         on_arc = number[mesh.arc]
         boundary = np.unique(on_arc[on_arc >= 0])
         numbers.append(np.where(on_arc >= 0, start + np.searchsorted(boundary, on_arc), -1))
@@ -292,7 +300,8 @@ def _projected(volume: FloatArray, point: FloatArray, measure: FloatArray, stati
     """(t * 9, n) volume changes of unit unknowns, projected on functions linear in (r, z) times the forms of u_z."""
     offset = point - point.mean(axis=1, keepdims=True)
     linear = np.concatenate([np.ones_like(offset[..., :1]), offset], axis=-1)
-    basis = np.einsum("tqp,tk->tqpk", linear, stations.value[:, :, 2]).reshape(len(measure), -1)
+    forms = stations.value[:, stations.swells, 2]
+    basis = np.einsum("tqp,tk->tqpk", linear, forms).reshape(len(measure), -1)
     weighted = basis * measure[:, None]
     return np.asarray(basis @ np.linalg.solve(basis.T @ weighted, weighted.T @ volume))
 

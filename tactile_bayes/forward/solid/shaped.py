@@ -9,7 +9,15 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.lump_shape import LumpShape
-from tactile_bayes.forward.solid.axisymmetric import CondensedLump, Tissue, condense_lump, orders_needed, skin_spline
+from tactile_bayes.forward.solid.axisymmetric import (
+    CondensedLump,
+    CondensedMode,
+    Tissue,
+    condense_lump,
+    condense_twist,
+    orders_needed,
+    skin_spline,
+)
 from tactile_bayes.forward.solid.frames import RANK_TOLERANCE, REACH_MM, STEP_MM, square_mean
 from tactile_bayes.forward.solid.inclusion import Harmonic, Inclusion, Rings, families
 from tactile_bayes.forward.solid.mesh import LEAST_CAP, LumpGeometry, MeshSize, lump_mesh
@@ -25,7 +33,7 @@ _COVER: Final = 1.025
 _LEAST_ORDERS: Final = 9
 _MOST_ORDERS: Final = 12
 # More lines of elements along the hull than this cost time and change nothing; a test says so.
-SHAPE_MESH: Final = MeshSize(arc=20)
+SHAPE_MESH: Final = MeshSize(arc=20, core=6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +104,8 @@ class ShapedLump:
     ----------
     around
         The body around the hull, with the tissue that the hull replaces.
+    twist
+        The same for twisting about the vertical.
     inclusion
     tissue
     families
@@ -103,6 +113,7 @@ class ShapedLump:
     """
 
     around: CondensedLump
+    twist: CondensedMode
     inclusion: Inclusion
     tissue: Tissue
     families: tuple[tuple[Harmonic, ...], ...]
@@ -119,7 +130,7 @@ class ShapedLump:
     def _matrix(self, lump_kpa: float, forms: tuple[Harmonic, ...]) -> FloatArray:
         from scipy.linalg import block_diag
 
-        modes = [self.around.modes[form.order] for form in forms]
+        modes = [self.twist if form.twist else self.around.modes[form.order] for form in forms]
         stiffness = self.inclusion.condensed(lump_kpa, self.tissue, forms, symmetric=len(self.families) > 1)
         flexibility = block_diag(*[mode.flexibility for mode in modes])
         change = stiffness - block_diag(*[mode.original_stiffness for mode in modes])
@@ -189,7 +200,8 @@ def shaped_lump(
     size = size or SHAPE_MESH
     around = condense_lump(hull, tissue, size=size, orders=count)
     inclusion = Inclusion(lump_mesh(hull, size), hull.depth_mm, hull.boundary_mm(), shape.radius_mm, rings or Rings())
-    return ShapedLump(around, inclusion, tissue, families(count, symmetric=shape.symmetric))
+    twist = condense_twist(hull, tissue, size=size)
+    return ShapedLump(around, twist, inclusion, tissue, families(count, symmetric=shape.symmetric))
 
 
 def hull_of(shape: LumpShape, *, depth_mm: float, fat_mm: float, thickness_mm: float) -> LumpGeometry:
