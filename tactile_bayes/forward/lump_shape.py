@@ -58,11 +58,15 @@ class LumpShape:
         return self.rough_share == 0
 
     @property
+    def ellipsoid(self) -> bool:
+        """Whether the outline is that of the half axes."""
+        return not self.pair and self.lobe_share == 0 and self.rough_share == 0
+
+    @property
     def upright_spheroid(self) -> bool:
         """Whether the shape is a ball or a spheroid about the vertical."""
-        a, b, _ = self.half_axes_mm
-        plain = not self.pair and self.lobe_share == 0 and self.rough_share == 0
-        return plain and a == b and self.tilt_rad == 0
+        a, b, c = self.half_axes_mm
+        return self.ellipsoid and a == b and (self.tilt_rad == 0 or a == c)
 
     def radius_mm(self, direction: FloatArray) -> FloatArray:
         """(...,) distance from centre to boundary along (..., 3) unit vectors."""
@@ -88,17 +92,30 @@ class LumpShape:
     @property
     def half_height_mm(self) -> float:
         """Farthest reach of the boundary above or below the centre."""
+        if self.ellipsoid:
+            a, _, c = self.half_axes_mm
+            return float(np.hypot(a * np.sin(self.tilt_rad), c * np.cos(self.tilt_rad)))
         return float(np.abs(self.points_mm()[:, 2]).max())
 
     def diameters_mm(self) -> tuple[float, float]:
         """Largest and smallest distance between two parallel planes that touch the shape (caliper diameters)."""
+        if self.ellipsoid:
+            return 2.0 * max(self.half_axes_mm), 2.0 * min(self.half_axes_mm)
         directions = np.concatenate([_sphere(_DIRECTIONS), _upright(np.eye(3), self.tilt_rad)])
         return _extremes(self.points_mm(), directions)
 
     def diameters_across_mm(self) -> tuple[float, float]:
         """Largest and smallest diameter of the outline seen from above, by calipers that stay level."""
+        if self.ellipsoid:
+            return self._across()
         angle = np.arange(_TURNS) * (np.pi / _TURNS)
         return _extremes(self.points_mm()[:, :2], np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+
+    def _across(self) -> tuple[float, float]:
+        a, b, c = self.half_axes_mm
+        along = float(np.hypot(a * np.cos(self.tilt_rad), c * np.sin(self.tilt_rad)))
+        return 2.0 * max(along, b), 2.0 * min(along, b)
 
 
 def _tilted(direction: FloatArray, tilt_rad: float) -> tuple[FloatArray, FloatArray, FloatArray]:

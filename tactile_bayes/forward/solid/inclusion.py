@@ -264,11 +264,12 @@ def _eliminated(
         free = np.flatnonzero(index >= 0)
         local = local[np.ix_(free, free)] * np.outer(factor[free], factor[free])
         np.add.at(total, (index[free][:, None], index[free][None, :]), local)
-    cut = starts[2]
-    from scipy.linalg import cho_factor, cho_solve
+    from scipy.linalg import cholesky, solve_triangular
 
-    across = total[:cut, cut:]
-    condensed = total[cut:, cut:] - across.T @ cho_solve(cho_factor(total[:cut, :cut]), across)
+    cut = starts[2]
+    factor = cholesky(total[:cut, :cut], lower=True, check_finite=False)
+    across = solve_triangular(factor, total[:cut, cut:], lower=True, check_finite=False)
+    condensed = total[cut:, cut:] - across.T @ across
     return np.asarray((condensed + condensed.T) / 2)
 
 
