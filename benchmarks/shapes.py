@@ -4,9 +4,9 @@
     python -m benchmarks.shapes sizes DIR [DIR ...]     # size the fits with the default calibration: one table
 
 Bodies and exams are drawn from `forward.population`, with mean diameters across of 8 to 25 mm and depths up to 1.4
-of them; one exam a body. `make` takes about 15 s a body and goes on where it stopped; `sizes` takes seconds, so a rule of
-sizing can be tried on the same fits. The sizes of a map are compared with the diameters seen from above, and the largest
-also with the largest of all.
+of them; one exam a body. `make` takes about 5 s of CPU a body and goes on where it stopped; `sizes` takes seconds, so
+that a rule of sizing can be tried on the same fits. The sizes of a map are compared with the diameters seen from above,
+and the largest also with the largest of all.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -21,14 +22,21 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_body, draw_exam
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SolidLump
+from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.elongation import ShapePrior
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.posterior import SizePosterior
 
 SEED: Final = 20270110
 BODIES: Final = BodyPrior(d_mm=(8.0, 25.0), depth_ratio=(0.56, 1.4))
 LARGEST_MM: Final = 25.0
+_DRAWS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_rad")
 # A shape needs this much of its half height below the skin, and above the chest wall.
 _COVER: Final = 1.12
 
@@ -59,16 +67,16 @@ def _flat(ratio: float) -> ShapeClass:
 
 
 CLASSES: Final = {
-    "ball": ShapeClass(),
-    "flat 1.2": _flat(1.2),
     "flat 1.5": _flat(1.5),
-    "flat 2.0": _flat(2.0),
+    "pair": ShapeClass(1.8**0.5, 1.8**-0.5, outline=(("pair", True),)),
     "disc 1.5": ShapeClass(down=1 / 1.5),
     "standing 1.5": ShapeClass(down=1.5),
-    "tilted 1.5": replace(_flat(1.5), tilted=True),
+    "ball": ShapeClass(),
+    "flat 2.0": _flat(2.0),
+    "flat 1.2": _flat(1.2),
     "lobed": ShapeClass(outline=(("lobe_share", 0.2),)),
+    "tilted 1.5": replace(_flat(1.5), tilted=True),
     "rough": ShapeClass(outline=(("rough_share", 0.1),)),
-    "pair": ShapeClass(1.8**0.5, 1.8**-0.5, outline=(("pair", True),)),
 }
 
 
@@ -137,17 +145,105 @@ def _measured(scene: Scene) -> dict[str, Any]:
     posterior = estimate.map_posterior
     if posterior is None or estimate.size is None:
         return row | {"why": estimate.reason}
-    profile = head_profile({name: tactile_map.quality.get(name) for name in HEAD_PROFILE})
-    draws = {n: getattr(posterior, n) for n in ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_rad")}
-    scene_line = estimate.diagnostics.noise.scene if hasattr(estimate.diagnostics.noise, "scene") else ""
-    return row | draws | {
-        "profile": np.array(profile if profile is not None else ()),
-        "max_size_mm": estimate.size.max_size_mm,
-        "min_size_mm": estimate.size.min_size_mm,
-        "oval_probability": estimate.size.figures["oval_probability"],
-        "replicates": estimate.size.replicates,
-        "scene": str(scene_line),
-    }
+    profile = head_profile({name: v for name in HEAD_PROFILE if (v := tactile_map.quality.get(name)) is not None})
+    draws = {n: getattr(posterior, n) for n in _DRAWS}
+    return (
+        row
+        | draws
+        | {
+            "profile": np.array(profile if profile is not None else ()),
+            "max_size_mm": estimate.size.max_size_mm,
+            "min_size_mm": estimate.size.min_size_mm,
+            "oval_probability": estimate.size.figures["oval_probability"],
+            "replicates": estimate.size.replicates,
+        }
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Sized:
+    """One sized exam: errors as shares of the truth, and whether the intervals cover it.
+
+    Parameters
+    ----------
+    across
+        Error of the largest size against the largest diameter seen from above.
+    any_way
+        The same against the largest diameter of all.
+    smallest
+        Error of the smallest size against the smallest diameter seen from above.
+    covers, covers_any, covers_smallest
+        Whether the 95 % intervals hold these diameters.
+    half_width
+        Half the interval of the largest size over its median.
+    oval
+        Whether the report says that the lump is oval.
+    """
+
+    across: float
+    any_way: float
+    smallest: float
+    covers: bool
+    covers_any: bool
+    covers_smallest: bool
+    half_width: float
+    oval: bool
+
+
+def sized(row: Mapping[str, Any], size: SizePosterior) -> Sized:
+    """Compare a size with the truth of its row."""
+    largest, smallest = (size.summarise(name, probability=0.95) for name in ("max_size_mm", "min_size_mm"))
+    true, least, any_way = (float(row[n]) for n in ("largest_across_mm", "smallest_across_mm", "largest_mm"))
+    return Sized(
+        largest.median / true - 1.0,
+        largest.median / any_way - 1.0,
+        smallest.median / least - 1.0,
+        largest.low <= true <= largest.high,
+        largest.low <= any_way <= largest.high,
+        smallest.low <= least <= smallest.high,
+        (largest.high - largest.low) / 2 / largest.median,
+        size.figures["oval_probability"] >= 0.5,
+    )
+
+
+def resized(row: Mapping[str, Any], prior: ShapePrior | None = None) -> SizePosterior:
+    """Size of stored draws by the default calibration, with another prior of shapes if given."""
+    profile = tuple(float(v) for v in row["profile"]) or None
+    draws = ShapeDraws.of(*(row[n] for n in _DRAWS), profile=profile, labels=row["replicates"])
+    path = size_calibration_path("solid")
+    assert path is not None
+    calibration = read_size_calibration(path)
+    assert isinstance(calibration, BodyCalibration)
+    priors = SizePriors() if prior is None else SizePriors(shape=prior)
+    return pooled_size([draws], calibration=calibration, priors=priors, rng=np.random.default_rng(1))
+
+
+def table(folders: Sequence[Path], prior: ShapePrior | None = None) -> str:
+    """Errors and coverage by class."""
+    found: dict[str, list[Sized]] = defaultdict(list)
+    asked: dict[str, int] = defaultdict(int)
+    for name in CLASSES:
+        for path in (p for folder in folders for p in sorted(folder.glob(f"{name.replace(' ', '_')}-*.npz"))):
+            with np.load(path) as row:
+                asked[name] += 1
+                if "why" not in row:
+                    found[name].append(sized(row, resized(row, prior)))
+    head = f"{'class':14}{'sized':>8}{'median':>8}{'mean |e|':>9}{'covers':>8}{'smallest':>9}{'covers':>8}"
+    lines = [head + f"{'3D |e|':>8}{'covers':>8}{'half':>6}{'oval':>6}"]
+    for name, rows in found.items():
+        n = len(rows)
+
+        def share(what: str, rows: list[Sized] = rows, n: int = n) -> str:
+            return f"{sum(getattr(r, what) for r in rows)}/{n}"
+
+        across = np.array([r.across for r in rows])
+        lines.append(
+            f"{name:14}{f'{n}/{asked[name]}':>8}{np.median(across):>+8.1%}{np.abs(across).mean():>9.1%}"
+            f"{share('covers'):>8}{np.mean([abs(r.smallest) for r in rows]):>9.1%}{share('covers_smallest'):>8}"
+            f"{np.mean([abs(r.any_way) for r in rows]):>8.1%}{share('covers_any'):>8}"
+            f"{np.mean([r.half_width for r in rows]):>6.0%}{share('oval'):>6}"
+        )
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -158,9 +254,14 @@ def main() -> None:
     parser.add_argument("--bodies", type=int, default=10)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), choices=list(CLASSES))
+    parser.add_argument("--oval-probability", type=float, default=ShapePrior().oval_probability)
+    parser.add_argument("--oval-sd", type=float, default=ShapePrior().oval_sd)
     arguments = parser.parse_args()
     if arguments.what == "make":
         make(arguments.folder[0], bodies=arguments.bodies, seed=arguments.seed, classes=arguments.classes)
+    else:
+        prior = ShapePrior(arguments.oval_probability, arguments.oval_sd)
+        print(table(arguments.folder, prior))
 
 
 if __name__ == "__main__":

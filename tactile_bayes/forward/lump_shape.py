@@ -36,7 +36,8 @@ class LumpShape:
     tilt_rad
         By which the first axis rises towards the skin.
     lobes, lobe_share
-        The radius is multiplied by :math:`1 + c \sin^k\vartheta \cos k\varphi` about the third axis, k lobes of share c.
+        The radius is multiplied by :math:`1 + c \sin^k\vartheta \cos k\varphi` about the third axis: k lobes of
+        share c.
     rough_share, rough_seed
         The log radius has a random field of degrees 2 to 7 with this root mean square added.
     pair
@@ -110,7 +111,6 @@ class LumpShape:
             return self._across()
         angle = np.arange(_TURNS) * (np.pi / _TURNS)
         return _extremes(self.points_mm()[:, :2], np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-
 
     def _across(self) -> tuple[float, float]:
         a, b, c = self.half_axes_mm

@@ -157,7 +157,7 @@ def condense_lump(
 
 
 def condense_twist(geometry: LumpGeometry, tissue: Tissue, *, size: MeshSize | None = None) -> CondensedMode:
-    """Condense twisting about the vertical, alone u_theta of order 0: no skin sinks, but a lump that is no ball feels it."""
+    """Condense twisting about the vertical, u_theta of order 0: no skin sinks, but a lump that is no ball is turned."""
     mesh = lump_mesh(geometry, size)
     fat, gland = tissue.fat_kpa, tissue.fat_kpa * tissue.gland_ratio
     modulus = np.where((mesh.region == EXTERIOR_GLAND) | (mesh.region == INTERIOR_GLAND), gland, fat)
@@ -235,14 +235,13 @@ def _quadrature(mesh: LumpMesh) -> tuple[FloatArray, FloatArray, FloatArray, Flo
 
 
 def lagrange_points() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Biquadratic shape functions (9 points, 9 nodes) and local gradients (9, 9, 2) at Gauss points, with weights (9,)."""
+    """Biquadratic shape functions (9 points, 9 nodes), local gradients (9, 9, 2) and weights (9,) at Gauss points."""
     x, w = np.polynomial.legendre.leggauss(3)
     value = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
     slope = np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
     shape = np.einsum("ai,bj->abij", value, value).reshape(9, 9)
-    slopes = np.stack([np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)], axis=-1).reshape(
-        9, 9, 2
-    )
+    across, along = np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)
+    slopes = np.stack([across, along], axis=-1).reshape(9, 9, 2)
     return shape, slopes, np.outer(w, w).ravel()
 
 
@@ -302,7 +301,9 @@ def order_unknowns(mesh: LumpMesh, order: int, *, twist: bool = False) -> tuple[
     return number, sign
 
 
-def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int, *, twist: bool = False) -> CondensedMode:
+def _condense(
+    mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int, *, twist: bool = False
+) -> CondensedMode:
     from scipy.sparse.linalg import splu
 
     number, sign = order_unknowns(mesh, order, twist=twist)

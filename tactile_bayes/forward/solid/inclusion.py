@@ -1,9 +1,9 @@
 r"""Stiffness of a hull with a lump of any star-shaped form inside, condensed onto the hull in coupled Fourier orders.
 
-The hull is the spheroid of an axisymmetric mesh; the body outside is condensed order by order in `axisymmetric`. Inside,
-nodes lie on rays from the centre: rings of elements fill the lump and the shell between lump and hull. The nodes move
-with the angle theta, so that element edges follow the lump's boundary in every half-plane; displacements are biquadratic
-there and a Fourier series in theta at fixed mesh coordinates, whose orders the moving mesh couples.
+The hull is the spheroid of an axisymmetric mesh; the body outside is condensed order by order in `axisymmetric`.
+Inside, nodes lie on rays from the centre: rings of elements fill the lump and the shell between lump and hull. The
+nodes move with the angle theta, so that element edges follow the lump's boundary in every half-plane; displacements are
+biquadratic there and a Fourier series in theta at fixed mesh coordinates, whose orders the moving mesh couples.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _SPARE_ANGLES: Final = 10
 class Harmonic:
     r"""One angular form of the displacements.
 
-    Even: :math:`u_r, u_z \sim \cos m\theta, u_\theta \sim \sin m\theta`; odd: sin, sin and -cos, the even form turned by
-    a quarter of a period, so that both have the same axisymmetric stiffness.
+    Even: :math:`u_r, u_z \sim \cos m\theta, u_\theta \sim \sin m\theta`; odd: sin, sin and -cos, the even form turned
+    by a quarter of a period, so that both have the same axisymmetric stiffness.
     """
 
     order: int
@@ -75,7 +75,7 @@ def families(orders: int, *, symmetric: bool) -> tuple[tuple[Harmonic, ...], ...
 class Rings:
     """Rings of elements in the lump and in the shell around it."""
 
-    lump: int = 2
+    lump: int = 1
     shell: int = 2
 
 
@@ -113,7 +113,7 @@ class Inclusion:
         highest = max(form.order for form in forms)
         count = (2 * highest + _SPARE_ANGLES) * (1 if symmetric else 2)
         span = np.pi if symmetric else 2.0 * np.pi
-        theta = (np.arange(count) + 0.5) * (span / count)
+        theta: FloatArray = (np.arange(count, dtype=np.float64) + 0.5) * (span / count)
         stations = _Stations.of(forms, theta, 2.0 * np.pi / count)
         node = self._nodes(theta)
         turn = (self._nodes(theta + _STEP_RAD) - self._nodes(theta - _STEP_RAD)) / (2.0 * _STEP_RAD)
@@ -148,8 +148,8 @@ class Inclusion:
     def _angles(self, hull: FloatArray, theta: FloatArray) -> FloatArray:
         """(t, arc) angles from the downward vertical of the nodes on the lump.
 
-        Those of the hull's nodes; where the layers' boundary crosses the lump, stretched so that the node on the hull at
-        that depth has its fellow on the lump at that depth too, and element edges follow the boundary between them.
+        Those of the hull's nodes; where the layers' boundary crosses the lump, stretched so that the hull's node at
+        that depth belongs to a node of the lump at that depth too, and element edges follow the boundary between them.
         """
         plain = np.arctan2(hull[:, 0], hull[:, 1])
         depth = self.boundary_mm - self.centre_mm
@@ -163,7 +163,8 @@ class Inclusion:
             below = self._radius(middle, theta) * np.cos(middle) > depth
             low, high = np.where(below, middle, low), np.where(below, high, middle)
         at = plain[cut]
-        return np.where(plain <= at, plain * (low / at), np.pi - (np.pi - plain) * ((np.pi - low) / (np.pi - at)))
+        lower, upper = plain * (low / at), np.pi - (np.pi - plain) * ((np.pi - low) / (np.pi - at))
+        return np.asarray(np.where(plain <= at, lower, upper))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,7 +264,8 @@ def _eliminated(
         index, factor = (a[:, :, at].transpose(1, 0, 2, 3).ravel() for a in (number, sign))
         free = np.flatnonzero(index >= 0)
         local = local[np.ix_(free, free)] * np.outer(factor[free], factor[free])
-        np.add.at(total, (index[free][:, None], index[free][None, :]), local)
+        unknown: IntArray = index[free].astype(np.int64)
+        np.add.at(total, (unknown[:, None], unknown[None, :]), local)
     from scipy.linalg import cholesky, solve_triangular
 
     cut = starts[2]

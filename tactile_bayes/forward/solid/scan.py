@@ -147,9 +147,7 @@ def _shaped(lump: SolidLump, body: SceneBody, fat_mm: float, pitch_mm: float) ->
 
 
 @lru_cache(maxsize=_BODIES_KEPT)
-def _shaped_lump(
-    shape: LumpShape, tissue: Tissue, depth_mm: float, fat_mm: float, thickness_mm: float
-) -> ShapedLump:
+def _shaped_lump(shape: LumpShape, tissue: Tissue, depth_mm: float, fat_mm: float, thickness_mm: float) -> ShapedLump:
     return shaped_lump(shape, tissue, depth_mm=depth_mm, fat_mm=fat_mm, thickness_mm=thickness_mm)
 
 

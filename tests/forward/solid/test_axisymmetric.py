@@ -14,9 +14,9 @@ from tactile_bayes.forward.solid.axisymmetric import (
     CondensedLump,
     Tissue,
     _assemble,
-    order_unknowns,
     condense_lump,
     element_stiffness,
+    order_unknowns,
     orders_needed,
     skin_spline,
 )
