@@ -29,6 +29,7 @@ from tactile_bayes.size.calibration_range import outside_domain, too_far
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import SPREADS, FatTerms
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.site_shift import SiteShift
 
 UNLIKE = "is unlike any body of the table"
 SPREAD_PARAMETERS = ("log_body_sd", "body_sd_slope", "log_exam_sd")
@@ -72,6 +73,8 @@ class BodyCalibration:
         Why the depth is not used though the calibration could; empty otherwise.
     any_depth
         Of a calibration for one depth, that for any.
+    site
+        Correction by a site's own phantoms; `pooling` adds it, no method of this class does.
     """
 
     centre: tuple[float, float]
@@ -89,6 +92,7 @@ class BodyCalibration:
     fat_mm: float | None = None
     fat_note: str = ""
     any_depth: Self | None = None
+    site: SiteShift | None = None
 
     def __post_init__(self) -> None:
         k = self.coefficients + SPREADS
