@@ -355,8 +355,7 @@ def pool_maps(
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     centres = {
-        i: float(np.nanmean(corrected_log_size(calibration, shape)))
-        for i, shape in zip(found, used, strict=True)
+        i: float(np.nanmean(corrected_log_size(calibration, shape))) for i, shape in zip(found, used, strict=True)
     }
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"

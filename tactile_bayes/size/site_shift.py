@@ -4,20 +4,26 @@ With p the log of the map's mean width in mm and :math:`p_0` that of the calibra
 
 .. math:: \ln d = g(\text{map}) + c_0 + c_1 (p - p_0) + B + E
 
-g, B and E are the calibration's. :math:`c_0` and :math:`c_1` tell how a site's array, head and technique differ from the
-simulation that the calibration was learned from; `size.learn.site_shift` learns them.
+g, B and E are the calibration's. :math:`c_0` and :math:`c_1` tell how a site's array, head and technique differ from
+the simulation that the calibration was learned from; `size.learn.site_shift` learns them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.size.body_calibration import BodyCalibration
 
 PARAMETERS = ("c0", "c1")
 NO_PROFILE = "the phantoms that correct the calibration have no pressure profile of the head"
@@ -78,6 +84,14 @@ class SiteShift:
         v, c = log_width - self.centre, self.covariance
         return np.asarray(c[0, 0] + 2.0 * v * c[0, 1] + v**2 * c[1, 1])
 
+    def percent(self, log_width: float, *, probability: float = INTERVAL) -> tuple[float, float, float]:
+        """Median of the shift at p in percent of d, and the ends of its equal-tailed interval."""
+        p = np.array(log_width)
+        z = float(normal_quantile(np.array(0.5 + probability / 2)))
+        middle, half = float(self.log_shift(p)), float(np.sqrt(self.variance(p))) * z
+        low, high = (float(100 * np.expm1(end)) for end in (middle - half, middle + half))
+        return float(100 * np.expm1(middle)), low, high
+
     @property
     def phantoms_log_width(self) -> float:
         """Mean p of the phantoms, where the shift is known best; p_0 where the file does not say."""
@@ -92,3 +106,10 @@ def site_log_shift(site: SiteShift | None, log_width: FloatArray) -> FloatArray:
 def site_slope(site: SiteShift | None) -> float:
     """What a site adds to the derivative of ln d by p."""
     return 0.0 if site is None else float(site.mean[1])
+
+
+def with_site(calibration: BodyCalibration, site: SiteShift) -> BodyCalibration:
+    """The calibration with a correction; without the depth of fat where the phantoms were sized without it."""
+    if site.uses_fat or calibration.with_fat is None:
+        return replace(calibration, site=site)
+    return replace(calibration, site=site, with_fat=None, fat_note=NO_PROFILE)

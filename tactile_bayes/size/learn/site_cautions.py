@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.learn.site_shift import Residuals, ShiftPosterior, SitePrior
 
 FAR = 3.0
@@ -52,6 +53,18 @@ def cautions_of(
             "check their sizes, depths, seats and stiffness"
         )
     return (*lines, *_apart(names, data, prior, posterior_of))
+
+
+def no_depth(calibration: BodyCalibration, known: Sequence[Mapping[str, float]]) -> tuple[str, ...]:
+    """The caution where the depth of phantoms is not known, though a size depends on it most."""
+    names = () if calibration.hidden is None else calibration.hidden.names
+    without = sum("depth_mm" not in one for one in known)
+    if "depth_mm" not in names or not without:
+        return ()
+    return (
+        f"{without} of {len(known)} phantoms have no depth_ratio: where they lie deeper or shallower than lumps of the "
+        "calibration, this passes for the site's; state depth_ratio, seat and stiffness_ratio",
+    )
 
 
 def _apart(

@@ -14,7 +14,6 @@ over a grid, and the mixture is handed on as a normal of its mean and covariance
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -22,14 +21,14 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.learn.site_cautions import cautions_of
+from tactile_bayes.size.learn.site_cautions import cautions_of, no_depth
 from tactile_bayes.size.pooling import ShapeDraws
-from tactile_bayes.size.site_shift import NO_PROFILE, SiteShift
+from tactile_bayes.size.site_shift import SiteShift, with_site
 
 LEAST_PHANTOMS = 3
 SHARED = ("seat", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
 """Properties that phantoms of one set may have in common: those made alike, or of one block of material."""
-_GRID = np.geomspace(0.1, 10.0, 80)
+_GRID = np.geomspace(0.1, 10.0, 81)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +149,12 @@ def shift_posterior(data: Residuals, prior: SitePrior) -> ShiftPosterior:
 
 
 def correct_calibration(
-    calibration: BodyCalibration, maps: Sequence[PhantomMap], *, base: str, prior: SitePrior | None = None
+    calibration: BodyCalibration,
+    maps: Sequence[PhantomMap],
+    *,
+    base: str,
+    prior: SitePrior | None = None,
+    left_out: Sequence[str] = (),
 ) -> BodyCalibration:
     """The calibration with a site's correction.
 
@@ -160,6 +164,8 @@ def correct_calibration(
         Of at least `LEAST_PHANTOMS` phantoms, made and fitted by the calibration's recipe.
     base
         Name of the calibration, for reports.
+    left_out
+        Phantoms that take no part for reasons found before, in words.
 
     Raises
     ------
@@ -172,15 +178,15 @@ def correct_calibration(
     groups: dict[str, list[PhantomMap]] = {}
     for one in maps:
         groups.setdefault(one.phantom, []).append(one)
-    rows, left_out = [], []
+    rows, out = [], list(left_out)
     for name, group in groups.items():
         row = _phantom(calibration, group)
         if isinstance(row, str):
-            left_out.append(f"{name}: {row}")
+            out.append(f"{name}: {row}")
         else:
             rows.append((name, row))
     if len(rows) < LEAST_PHANTOMS:
-        why = f" ({'; '.join(left_out)})" if left_out else ""
+        why = f" ({'; '.join(out)})" if out else ""
         raise BadDataError(
             f"{len(rows)} phantom{'' if len(rows) == 1 else 's'} in the range of {base}{why}",
             way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
@@ -197,17 +203,13 @@ def correct_calibration(
         base=base,
         uses_fat=uses_fat,
         fit=_figures(data, found, calibration.centre[1]),
-        cautions=cautions_of([name for name, _ in rows], data, found, prior, posterior_of=shift_posterior),
-        left_out=tuple(left_out),
+        cautions=(
+            *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
+            *cautions_of([name for name, _ in rows], data, found, prior, posterior_of=shift_posterior),
+        ),
+        left_out=tuple(out),
     )
     return with_site(calibration, site)
-
-
-def with_site(calibration: BodyCalibration, site: SiteShift) -> BodyCalibration:
-    """The calibration with a correction; without the depth of fat where the phantoms had none."""
-    if site.uses_fat or calibration.with_fat is None:
-        return replace(calibration, site=site)
-    return replace(calibration, site=site, with_fat=None, fat_note=NO_PROFILE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,13 +232,15 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
         if outside := outside_of(used, one.shape):
             return outside
     log_size = [used.log_size(one.shape.log_amplitude, one.shape.log_width) for one in maps]
-    log_a, log_width = (np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width"))
+    log_a, log_width = (
+        np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
+    )
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
     terms = used.terms(log_a, log_width)
     body_sd = float(used.body_and_error(terms, log_a, np.zeros(len(maps)))[0].mean())
     expected, alone, together = _known(used, maps[0].known, float(log_a.mean()), float(log_width.mean()))
     n = len(maps)
-    exam = used.between_exams.sd ** 2 / n
+    exam = used.between_exams.sd**2 / n
     noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
     return _Phantom(
         residual=float(left.mean()) - expected,
