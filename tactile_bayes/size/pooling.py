@@ -25,7 +25,7 @@ from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, turned
 from tactile_bayes.size.posterior import SizePosterior, shares
-from tactile_bayes.size.site_shift import site_log_shift, site_slope
+from tactile_bayes.size.site_shift import site_log_shift, site_slope, site_variance
 
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
@@ -283,12 +283,11 @@ def _left_open(
     terms = np.sum(weight[..., None] * calibration.terms(log_a, log_width), axis=0)
     body_sd, shift, error = calibration.body_and_error(terms, middle_a, score)
     expected, left = _known_body(calibration, known, middle_a, middle_width)
-    site = calibration.site
     return expected + shift, {
         "between_maps": np.sum(weight**2, axis=0) * tau**2,
         "calibration": error,
         "body": (left * body_sd) ** 2,
-        **({} if site is None else {"site": site.variance(middle_width)}),
+        **site_variance(calibration.site, middle_width),
     }
 
 

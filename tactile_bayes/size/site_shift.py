@@ -103,6 +103,11 @@ def site_log_shift(site: SiteShift | None, log_width: FloatArray) -> FloatArray:
     return np.zeros_like(log_width) if site is None else site.log_shift(log_width)
 
 
+def site_variance(site: SiteShift | None, log_width: FloatArray) -> dict[str, FloatArray]:
+    """(...,) what a site's uncertainty adds to the variance of ln d, by source; empty without a correction."""
+    return {} if site is None else {"site": site.variance(log_width)}
+
+
 def site_slope(site: SiteShift | None) -> float:
     """What a site adds to the derivative of ln d by p."""
     return 0.0 if site is None else float(site.mean[1])

@@ -134,17 +134,18 @@ def shift_posterior(data: Residuals, prior: SitePrior) -> ShiftPosterior:
     """Posterior of a site's shift given what the calibration leaves of its phantoms."""
     x, y, precision = data.design, data.residual, np.diag(1.0 / np.append(prior.sd, 1.0) ** 2)
     weight = 1.0 / (_GRID[:, None] ** 2 * data.spread_variance + data.map_variance)
-    information = np.einsum("ni,kn,nj->kij", x, weight, x) + precision
-    projected = np.einsum("ni,kn,n->ki", x, weight, y)
+    squares = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
+    information = (weight @ squares).reshape(-1, *precision.shape) + precision
+    projected = weight @ (x * y[:, None])
     covariance = np.linalg.inv(information)
-    mean = np.einsum("kij,kj->ki", covariance, projected)
+    mean = (covariance @ projected[..., None])[..., 0]
     log = 0.5 * (np.log(weight).sum(axis=1) - np.linalg.slogdet(information)[1] - weight @ y**2)
     log += 0.5 * np.sum(projected * mean, axis=1) - 0.5 * (np.log(_GRID) / prior.spread_log_sd) ** 2
     share = np.exp(log - log.max())  # even steps in ln k, in which the prior is normal
     share /= share.sum()
     centre = share @ mean
     apart = mean - centre
-    whole = np.einsum("k,kij->ij", share, covariance) + np.einsum("k,ki,kj->ij", share, apart, apart)
+    whole = np.tensordot(share, covariance, 1) + (share * apart.T) @ apart
     return ShiftPosterior(centre, whole, float(share @ _GRID), float(share @ _GRID**2))
 
 
@@ -225,12 +226,15 @@ class _Phantom:
 
 def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phantom | str:
     """What the calibration leaves of a phantom, or why it takes no part."""
+    if not all(np.isfinite(one.shape.log_amplitude).any() for one in maps):
+        return "a map does not rise above its background"
     centre, used = calibration.centre[1], calibration.at_fat([one.shape.profile for one in maps])
     for one in maps:
         used = used.fitting(*one.shape.middle)
     for one in maps:
-        if outside := outside_of(used, one.shape):
-            return outside
+        note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
+        if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
+            return "; ".join(outside)
     log_size = [used.log_size(one.shape.log_amplitude, one.shape.log_width) for one in maps]
     log_a, log_width = (
         np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
@@ -251,14 +255,6 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
         maps=n,
         uses_fat=used.fat_mm is not None or calibration.with_fat is None,
     )
-
-
-def outside_of(calibration: BodyCalibration, shape: ShapeDraws) -> str:
-    """Why a map is outside a calibration's range, in words; empty where it lies inside."""
-    if not (np.isfinite(shape.log_amplitude).any() and np.isfinite(shape.log_width).any()):
-        return "the map does not rise above its background"
-    outside = [text for text in calibration.outside(*shape.middle) if text != calibration.fat_note]
-    return "; ".join(outside)
 
 
 def _known(
