@@ -9,7 +9,7 @@ import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 if TYPE_CHECKING:
@@ -193,6 +193,7 @@ def _corrected(
 
     with progress_bar("maps") as progress:
         found = correct_size(table, base, declared, seed=seed, progress=progress)
+    also_read(*found.inputs.values())
     found.write(output, force=force)
     return site_calibration_text(found.calibration)
 

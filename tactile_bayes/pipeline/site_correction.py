@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tactile_bayes.size.learn.site_shift import PhantomMap
 
 HARDEST_RATIO = 100.0
-"""The largest E2/E1 of simulated bodies; a harder lump is taken for this one, for widths change no more."""
+"""Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,12 +34,15 @@ class Corrected:
         For the provenance.
     inputs
         Files by role, for the provenance.
+    seed
+        Of the random numbers, where maps were estimated.
     """
 
     calibration: BodyCalibration
     base: dict[str, Any]
     settings: dict[str, Any]
     inputs: dict[str, Path]
+    seed: int | None = None
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --size-calibration` takes."""
@@ -47,7 +50,7 @@ class Corrected:
         from tactile_bayes.files.size_site_json import write_site_calibration
 
         assert self.calibration.site is not None
-        provenance = Provenance("calibrate size", self.settings, hash_inputs(**self.inputs))
+        provenance = Provenance("calibrate size", self.settings, hash_inputs(**self.inputs), seed=self.seed)
         write_site_calibration(path, self.calibration.site, base=self.base, provenance=provenance, force=force)
 
 
