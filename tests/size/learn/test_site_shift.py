@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import binom, multivariate_normal
 
+import tactile_bayes
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.between_maps import BetweenMaps
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
 from tactile_bayes.size.learn.site_shift import (
+    LACK,
     PhantomMap,
     Residuals,
     SitePrior,
@@ -230,7 +237,7 @@ def test_what_phantoms_of_a_set_share_and_nobody_states_stays_uncertain():
     many = phantoms(np.random.default_rng(9), 150, shift=0.0, slope=0.0)
     open_, none = (correct_calibration(calibration(hidden=h), many, base="c").site for h in (hidden, None))
     assert open_ is not None and none is not None  # noqa: PT018
-    common = 0.5 * BODY_SD**2
+    common = (0.5 + 0.5 * LACK) * BODY_SD**2
     left = common * SitePrior().shift_sd ** 2 / (common + SitePrior().shift_sd ** 2)
     assert open_.covariance[0, 0] == pytest.approx(left, rel=0.1)
     assert none.covariance[0, 0] < 0.1 * left
@@ -276,3 +283,36 @@ def test_odd_corrections_say_what_is_odd_and_plain_ones_say_nothing():
     made = phantoms(rng, 12, shift=0.0, slope=0.0)
     apart = [replace(made[0], d_mm=2.0 * made[0].d_mm), *made[1:]]
     assert "p0 lies" in cautions(apart)
+
+
+def independent_phantoms(seat: str, *, stated: bool) -> list[PhantomMap]:
+    """The demo's phantoms of a seat, maps of a model that shares no code with this program (fitted by least squares)."""
+    made = []
+    for i, row in enumerate(csv.DictReader((Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv").open())):
+        if row["seat"] == seat:
+            d_mm, *bump = (np.array([float(row[n])]) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))
+            depth_mm = float(row["depth_ratio"]) * float(d_mm[0])
+            known = {"depth_mm": depth_mm, "stiffness_ratio": 100.0, "seat": {"centred": 0.0, "resting": 1.2}[seat]}
+            shape = ShapeDraws.of(*bump, np.zeros(1))
+            made.append(PhantomMap(f"row {i}", float(d_mm[0]), shape, known if stated else {}))
+    return made
+
+
+@pytest.mark.parametrize("name", ["solid-mean", "eq6"])
+def test_two_sets_of_an_independent_model_give_one_shift_where_their_design_is_stated(name: str) -> None:
+    path = size_calibration_path(name)
+    assert path is not None
+    use = read_size_calibration(path)
+    assert isinstance(use, BodyCalibration)
+
+    def shift(seat: str, *, stated: bool) -> tuple[float, float, float]:
+        site = correct_calibration(use, independent_phantoms(seat, stated=stated), base=name).site
+        assert site is not None
+        return float(site.mean[0]), float(site.covariance[0, 0]), site.fit["sd_after"]
+
+    sets = [shift(seat, stated=True) for seat in ("centred", "resting")]
+    apart = abs(sets[0][0] - sets[1][0]) / np.sqrt(sets[0][1] + sets[1][1])
+    assert apart < 3.0
+    assert all(abs(one) < 0.15 and left < 0.1 for one, _, left in sets)
+    # the control: without depth and seat the sets' design is taken for scatter
+    assert all(shift(seat, stated=False)[2] > 0.2 for seat in ("centred", "resting"))
