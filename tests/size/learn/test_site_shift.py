@@ -286,9 +286,9 @@ def test_odd_corrections_say_what_is_odd_and_plain_ones_say_nothing():
 
 
 def independent_phantoms(seat: str, *, stated: bool) -> list[PhantomMap]:
-    """The demo's phantoms of a seat, maps of a model that shares no code with this program (fitted by least squares)."""
-    made = []
-    for i, row in enumerate(csv.DictReader((Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv").open())):
+    """The demo's phantoms of a seat, of a model that shares no code with this program; fitted by least squares."""
+    lines, made = (Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv").read_text().splitlines(), []
+    for i, row in enumerate(csv.DictReader(lines)):
         if row["seat"] == seat:
             d_mm, *bump = (np.array([float(row[n])]) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))
             depth_mm = float(row["depth_ratio"]) * float(d_mm[0])
