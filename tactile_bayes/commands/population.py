@@ -61,7 +61,7 @@ def command(
     pressure, strokes, head yaw, tilt, noise, tracker errors and latency. The solid model makes the scans; maps are
     built and fitted as `map` and `estimate` do it. A mass takes about two seconds. An interrupted run goes on where it
     stopped. `calibrate size` learns Eq 6 from the table, or with
-    --form log-quadratic a calibration of the default's kind.
+    --form gaussian-process a calibration of the default's kind.
 
     Example: tactile-bayes population --masses 100 --workers 4 -o population.csv
     """

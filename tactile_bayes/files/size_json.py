@@ -79,7 +79,7 @@ def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
         When the document is not one, or a field breaks the schema.
     """
     form = document.get("form") if isinstance(document, dict) else None
-    if form == "log-quadratic":
+    if form in ("log-quadratic", "gaussian-process"):
         from tactile_bayes.files import size_quadratic_json as quadratic
 
         _check(document, quadratic.SCHEMA_FILE, path)

@@ -31,7 +31,7 @@ SHARED = ("seat", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
 """Properties that phantoms of one set may have in common: those made alike, or of one block of material."""
 LACK = 0.5
 """Share of what all properties leave of B that phantoms of a set have in common: B is not linear in its properties, and
-two sets of the same sizes in other seats differed by 5 % (record 0102)."""
+two sets of the same sizes in two seats differ by 7 % (record 0102)."""
 _GRID = np.geomspace(0.1, 10.0, 81)
 
 
@@ -245,7 +245,7 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     )
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
     terms = used.terms(log_a, log_width)
-    body_sd = float(used.body_and_error(terms, log_a, np.zeros(len(maps)))[0].mean())
+    body_sd = float(used.body_and_error(terms, log_a, log_width, np.zeros(len(maps)))[0].mean())
     expected, alone, together = _known(used, maps[0].known, float(log_a.mean()), float(log_width.mean()))
     n = len(maps)
     exam = used.between_exams.sd**2 / n
