@@ -30,6 +30,7 @@ from tactile_bayes.size.learn.site_shift import (
 )
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.site_shift import with_site
 
 BODY_SD, EXAM_SD, CENTRE = 0.10, 0.03, (-1.0, 1.5)
 
@@ -316,3 +317,24 @@ def test_two_sets_of_an_independent_model_give_one_shift_where_their_design_is_s
     assert all(abs(one) < 0.15 and left < 0.1 for one, _, left in sets)
     # the control: without depth and seat the sets' design is taken for scatter
     assert all(shift(seat, stated=False)[2] > 0.2 for seat in ("centred", "resting"))
+
+
+def test_a_correction_is_kept_by_every_copy_that_a_calibration_makes_of_itself() -> None:
+    site = correct_calibration(
+        calibration(), phantoms(np.random.default_rng(1), 4, shift=0.1, slope=0.0), base="c"
+    ).site
+    assert site is not None
+    for name in ("solid", "eq6"):
+        path = size_calibration_path(name)
+        assert path is not None
+        use = read_size_calibration(path)
+        assert isinstance(use, BodyCalibration)
+        assert use.with_fat is not None
+        profile = tuple(float(value) for value in use.with_fat.depth.centre)
+        at = with_site(use, site).at_fat([profile])
+        assert at.fat_mm is not None
+        assert at.site is site
+        assert at.any_depth is not None
+        assert at.any_depth.site is site
+        silent = with_site(use, replace(site, uses_fat=False)).at_fat([profile])
+        assert silent.fat_mm is None
