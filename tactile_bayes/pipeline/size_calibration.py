@@ -136,22 +136,32 @@ def learn_population(rows: Table, form: str, normalise: str | None = None) -> tu
     NotConvergedError
         When the posterior has no mode.
     """
-    from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from dataclasses import replace
+
     from tactile_bayes.size.eq6 import Recipe
     from tactile_bayes.size.learn.eq6_population import learn_population_eq6
     from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
-    from tactile_bayes.studies.population import measuring_options, population_table
+    from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
     fit = measuring_options().fit
     way, columns = _of_one_way(rows, normalise)
-    recipe = Recipe(way, fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False)
     learn = learn_log_quadratic if form == "log-quadratic" else learn_population_eq6
     try:
+        recipe = Recipe(
+            way,
+            fit.background,
+            fit.radius_mm,
+            declared=False,
+            noise=fit.noise,
+            flat_field=False,
+            head=table_head(columns),
+        )
         calibration = learn(population_table(columns), recipe=recipe, source=_SOURCE)
     except BadDataError as error:
         raise error.at(rows.path) from None
-    masses = len(set(columns["body"]))
-    return calibration, {"form": form, "masses": masses, **as_settings(BodyPrior(), ExamPrior())}
+    bodies = table_bodies(columns)
+    settings = {"form": form, "masses": len(set(columns["body"])), "bodies": bodies}
+    return replace(calibration, bodies=bodies), settings
 
 
 def is_population(source: Path | Sheet) -> bool:
