@@ -55,9 +55,7 @@ def learn(head: Path, folder: Path, *, bodies: Path | None, masses: int) -> Path
 def trial_scenes(head: Head, masses: int, priors: tuple[BodyPrior, ExamPrior]) -> list[Scene]:
     """Exams of bodies that no calibration has seen."""
     bodies, exams = priors
-    drawn = [
-        draw_mass(i, scans=EXAMS, seed=TRIAL_SEED, bodies=bodies, exams=exams, head=head) for i in range(masses)
-    ]
+    drawn = [draw_mass(i, scans=EXAMS, seed=TRIAL_SEED, bodies=bodies, exams=exams, head=head) for i in range(masses)]
     return [scene for scenes in drawn for scene in scenes]
 
 
