@@ -15,7 +15,7 @@ from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 if TYPE_CHECKING:
     from datetime import datetime
 
-    from tactile_bayes.pipeline.size_calibration import EqSixFit
+    from tactile_bayes.pipeline.size_calibration import EqSixFit, PopulationForm
 
 _FILE = FilePath()
 
@@ -30,10 +30,10 @@ def command() -> None:
 @click.option("-o", "--output", required=True, metavar="SIZE.json", type=_FILE, help="Where to write the calibration.")
 @click.option(
     "--form",
-    type=click.Choice(["eq6", "log-quadratic"]),
+    type=click.Choice(["eq6", "log-quadratic", "gaussian-process"]),
     default="eq6",
     show_default=True,
-    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; log-quadratic: of bodies only.",
+    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; the others: of bodies only.",
 )
 @click.option(
     "--fit",
@@ -86,7 +86,7 @@ def size(
     /,
     table: Path,
     output: Path,
-    form: str,
+    form: PopulationForm,
     fit: EqSixFit,
     normalise: str | None,
     background: str | None,
@@ -115,11 +115,13 @@ def size(
     head_radius_mm vary in it, the report tells what each does to the size that Eq 6 gives, and how much of its scatter
     would go if it were known; `estimate` does not use that.
 
-    From a table of `population`, which has a row for each exam of a body, either form tells apart what differs between
+    From a table of `population`, which has a row for each exam of a body, every form tells apart what differs between
     bodies and between exams of one body. `population` made the maps: nothing is declared, and --normalise chooses among
     a table's rows. From the pressure over the
     head where it felt no lump it also learns how deep the fat is, and sizes that go with it. The log-quadratic form is
-    ln d as a quadratic in ln a and ln sigma, or a cubic with the depth of fat.
+    ln d as a quadratic in ln a and ln sigma, or a cubic with the depth of fat. The Gaussian process takes ln a,
+    ln sigma and that pressure profile, with a spread between bodies that is wide for deep, faint and soft lumps; it is
+    the form of the shipped `solid`. A map without the profile gets the log-quadratic.
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
@@ -134,7 +136,7 @@ def size(
 
     for path in filter(None, (output, figure)):
         refuse_existing(path, force=force)
-    if form == "log-quadratic" or is_population(table):
+    if form != "eq6" or is_population(table):
         _refuse_declared(ctx)
         click.echo(_over_bodies(table, output, form, normalise, force=force), nl=False)
         return
@@ -168,7 +170,7 @@ def _refuse_declared(ctx: click.Context) -> None:
             raise UsageError(f"--{option} is for tables of lumps: a table of `population` fixes how its maps were made")
 
 
-def _over_bodies(table: Path, output: Path, form: str, normalise: str | None, *, force: bool) -> str:
+def _over_bodies(table: Path, output: Path, form: PopulationForm, normalise: str | None, *, force: bool) -> str:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_body_calibration
     from tactile_bayes.files.tables import read_table

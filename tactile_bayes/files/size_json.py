@@ -63,7 +63,7 @@ def read_size_calibration(path: Path) -> Calibration:
     """
     document: Any = load_json(path)
     form = document.get("form") if isinstance(document, dict) else None
-    if form == "log-quadratic":
+    if form in ("log-quadratic", "gaussian-process"):
         from tactile_bayes.files import size_quadratic_json as quadratic
 
         _check(document, quadratic.SCHEMA_FILE, path)

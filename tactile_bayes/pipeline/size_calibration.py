@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, assert_never
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from tactile_bayes.size.learn.eq6_two_stage import OtherFit
 
 EqSixFit = Literal["joint", "two-stage"]
+PopulationForm = Literal["eq6", "log-quadratic", "gaussian-process"]
+FORMS: tuple[PopulationForm, ...] = ("eq6", "log-quadratic", "gaussian-process")
+"""What can be learned from a table of `population`; only the first from a table of lumps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,13 +123,15 @@ def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_rati
     return tuple(found)
 
 
-def learn_population(rows: Table, form: str, normalise: str | None = None) -> tuple[BodyCalibration, dict[str, Any]]:
+def learn_population(
+    rows: Table, form: PopulationForm, normalise: str | None = None
+) -> tuple[BodyCalibration, dict[str, Any]]:
     """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
 
     Parameters
     ----------
     form
-        ``"log-quadratic"`` or ``"eq6"``.
+        One of `FORMS`.
     normalise
         Of the rows to learn from; may be left out where all are alike.
 
@@ -139,13 +145,10 @@ def learn_population(rows: Table, form: str, normalise: str | None = None) -> tu
     from dataclasses import replace
 
     from tactile_bayes.size.eq6 import Recipe
-    from tactile_bayes.size.learn.eq6_population import learn_population_eq6
-    from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
     from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
     fit = measuring_options().fit
-    way, columns = _of_one_way(rows, normalise)
-    learn = learn_log_quadratic if form == "log-quadratic" else learn_population_eq6
+    way, columns = rows_of_one_way(rows, normalise)
     try:
         recipe = Recipe(
             way,
@@ -156,12 +159,31 @@ def learn_population(rows: Table, form: str, normalise: str | None = None) -> tu
             flat_field=False,
             head=table_head(columns),
         )
-        calibration = learn(population_table(columns), recipe=recipe, source=_SOURCE)
+        calibration = population_learner(form)(population_table(columns), recipe=recipe, source=_SOURCE)
     except BadDataError as error:
         raise error.at(rows.path) from None
     bodies = table_bodies(columns)
     settings = {"form": form, "masses": len(set(columns["body"])), "bodies": bodies}
     return replace(calibration, bodies=bodies), settings
+
+
+def population_learner(form: PopulationForm) -> Callable[..., BodyCalibration]:
+    """The function that learns a calibration of a form from a `PopulationTable` and a `Recipe`."""
+    match form:
+        case "eq6":
+            from tactile_bayes.size.learn.eq6_population import learn_population_eq6
+
+            return learn_population_eq6
+        case "log-quadratic":
+            from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+
+            return learn_log_quadratic
+        case "gaussian-process":
+            from tactile_bayes.size.learn.fat_process import learn_fat_process
+            from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+
+            return partial(learn_log_quadratic, learn_fat=learn_fat_process)
+    assert_never(form)
 
 
 def is_population(source: Path | Sheet) -> bool:
@@ -241,7 +263,7 @@ def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) 
         return None, str(error)
 
 
-def _of_one_way(rows: Table, normalise: str | None) -> tuple[str, dict[str, list[Any]]]:
+def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[str, dict[str, list[Any]]]:
     """How a `population` table's maps were normalised, and its columns for the rows that were.
 
     Tables without the column, and empty cells, are of maps normalised by the mean.

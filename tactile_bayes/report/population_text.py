@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.presets import HELD, RESEARCH_USE
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.size.fat_depth import SPREADS, FatTerms
+from tactile_bayes.size.fat_depth import FatTerms
 from tactile_bayes.size.log_quadratic import QUADRATIC
 from tactile_bayes.size.population_eq6 import PopulationEq6
 
@@ -36,7 +36,7 @@ BODY_NAMES = {
 def body_calibration_text(calibration: BodyCalibration) -> str:
     """Coefficients, spreads, what the unknowns cost, and the errors on masses left out."""
     fit = calibration.fit
-    body_sd, slope, exam_sd = calibration.mean[-SPREADS:]
+    body_sd, slope, exam_sd = calibration.mean[calibration.coefficients :]
     lines = [
         *(_eq6_lines(calibration) if isinstance(calibration, PopulationEq6) else _quadratic_lines(calibration)),
         f"between bodies, SD of ln d {np.exp(body_sd):.3f} (times e^({slope:+.2f} u)), "
