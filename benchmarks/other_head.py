@@ -2,10 +2,10 @@
 
     python -m benchmarks.other_head HEAD.json DIR [--bodies BODIES.toml] [--masses 150] [--trial 25] [--form FORM]
 
-By the command line it simulates the bodies (`population`) and learns a calibration (`calibrate size`); a
-table and maps that DIR holds already are kept. Then it scans the trial's masses twice each, from another seed, maps every scan
-and sizes it with that calibration; at last it shows that neither this calibration nor the shipped one sizes maps of
-the other's head. Both heads of record 0101 were tried with the seeds that are the defaults here.
+By the command line it simulates the bodies (`population`) and learns a calibration (`calibrate size`); a table and maps
+that DIR holds already are kept. Then it scans the trial's masses twice each, from another seed, maps every scan and
+sizes it with that calibration; at last it shows that neither this calibration nor the shipped one sizes maps of the
+other's head. Both heads of record 0101 were tried with the seeds that are the defaults here.
 """
 
 from __future__ import annotations

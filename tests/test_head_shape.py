@@ -95,5 +95,5 @@ def test_a_head_survives_its_file_and_nonsense_does_not() -> None:
     ):
         with pytest.raises(BadDataError, match=f"head.{name} is"):
             HeadShape.from_document({**shape.as_dict(), name: value})
-    with pytest.raises(BadDataError, match="head.raduis is not known"):
+    with pytest.raises(BadDataError, match=r"head\.raduis is not known"):
         HeadShape.from_document({**shape.as_dict(), "raduis": 3})

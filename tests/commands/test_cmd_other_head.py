@@ -19,10 +19,12 @@ from tactile_bayes.commands import population
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.forward.scene import Head, Lump, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.pipeline.size_calibration import table_recipe
 from tactile_bayes.studies.population import MassRow, head_columns
 
 FLAT = Head(rows=12, columns=12, pitch_mm=2.0, radius_mm=100_000.0)
@@ -173,6 +175,25 @@ def test_maps_of_another_head_are_not_pooled(folder: Path) -> None:
     pooled = run_here("estimate", "old.nc", "paper.nc", "--pool", *FAST, "--json", cwd=folder)
     assert pooled.returncode == 0, pooled.stderr
     assert any("the map does not name its head" in text for text in json.loads(pooled.stdout)["left_out"])
+
+
+def lumps(columns: str, *cells: str) -> Table:
+    text = "".join(
+        f"{line}\n" for line in (f"d_mm,amplitude,sigma_x_mm{columns}", *(f"10,0.3,4{one}" for one in cells))
+    )
+    return read_table(Sheet(Path("lumps.csv"), text), "size_table.table.json")
+
+
+def test_a_table_of_phantoms_may_name_its_head() -> None:
+    declared = dict.fromkeys(("normalise", "background", "fit_radius_mm", "noise"))
+    named = ",head_rows,head_columns,head_pitch_mm,head_radius_mm"
+    assert table_recipe(lumps("", ""), declared).head is None
+    assert table_recipe(lumps(named, ",12,12,2,", ",12,12,2,"), declared).head == HeadShape(12, 12, 2.0, None)
+    assert table_recipe(lumps(named, ",16,26,1.5,35"), declared).head == DEFAULT_HEAD
+    with pytest.raises(BadDataError, match="names a head without head_pitch_mm"):
+        table_recipe(lumps(named, ",12,12,,"), declared)
+    with pytest.raises(BadDataError, match="head_rows differs between rows"):
+        table_recipe(lumps(named, ",12,12,2,", ",16,12,2,"), declared)
 
 
 @pytest.mark.slow
