@@ -118,12 +118,13 @@ def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | 
 
 def _check_heads(answers: Sequence[Answer], calibration: BodyCalibration, names: Sequence[str]) -> None:
     """Refuse a map that was made with another head than the calibration's."""
-    from tactile_bayes.posterior.estimate import OTHER_HEAD
+    from tactile_bayes.posterior.estimate import way_to_head
 
     for answer, name in zip(answers, names, strict=True):
         differs = calibration.recipe.head_differences(answer.head)
         if differs:
-            raise BadDataError(f"{name}: the calibration is for another head: {'; '.join(differs)}", way_out=OTHER_HEAD)
+            what = f"{name}: the calibration is for another head: {'; '.join(differs)}"
+            raise BadDataError(what, way_out=way_to_head(answer.head))
 
 
 def _plain(settings: Settings) -> dict[str, Any]:

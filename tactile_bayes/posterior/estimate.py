@@ -8,6 +8,7 @@ import numpy as np
 
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
+from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
 from tactile_bayes.posterior.assessment import MapDraws
@@ -33,7 +34,7 @@ OTHER_HEAD = (
     "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
     "calibrate size population.csv --form log-quadratic -o size.json`, and give --size-calibration size.json"
 )
-"""Way out where a calibration was made for another head."""
+"""How to make a calibration for another head."""
 
 
 def estimate_map(
@@ -171,10 +172,16 @@ def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: FitOpti
         )
 
 
+def way_to_head(head: HeadShape | None) -> str:
+    """What gives a calibration for a map's head."""
+    shipped = head is not None and not DEFAULT_HEAD.differences(head)
+    return f"give --size-calibration solid or eq6, which are for this head; or {OTHER_HEAD}" if shipped else OTHER_HEAD
+
+
 def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
     """What makes a map fit a calibration: its map command where the map differs, else the fit's options."""
     if recipe.head_differences(tactile_map.head):
-        return OTHER_HEAD
+        return way_to_head(tactile_map.head)
     made = (tactile_map.recipe.normalise, tactile_map.recipe.flat_field_known)
     wanted = (recipe.normalise, made[1] if recipe.flat_field is None else recipe.flat_field)
     if made[0] != wanted[0] or (made[1] is not None and made[1] != wanted[1]):

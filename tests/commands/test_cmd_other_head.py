@@ -139,6 +139,7 @@ def test_a_calibration_for_another_head_is_refused_with_the_way_to_the_right_one
     assert "(the calibration: " in done.stderr
     assert "tactile-bayes population --head HEAD.json" in done.stderr
     assert "tactile-bayes calibrate size" in done.stderr
+    assert ("give --size-calibration solid or eq6, which are for this head" in done.stderr) == (name == "paper")
 
 
 @pytest.mark.parametrize(("name", "calibration"), [("flat", "log-quadratic.json"), ("paper", "solid")])
