@@ -163,6 +163,14 @@ def learn_population(
         calibration = population_learner(form)(population_table(columns), recipe=recipe, source=_SOURCE)
     except BadDataError as error:
         raise error.at(rows.path) from None
+    if form == "gaussian-process" and calibration.with_fat is None:
+        from tactile_bayes.size.learn.fat_depth import LEAST_BODIES
+
+        raise BadDataError(
+            f"fewer than {LEAST_BODIES} bodies have a lump and a head profile: too few for a Gaussian process",
+            way_out="give a larger population, or --form log-quadratic",
+            path=str(rows.path),
+        )
     bodies = table_bodies(columns)
     settings = {"form": form, "masses": len(set(columns["body"])), "bodies": bodies}
     return replace(calibration, bodies=bodies), settings

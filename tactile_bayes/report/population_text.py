@@ -10,6 +10,7 @@ from tactile_bayes.presets import HELD, RESEARCH_USE
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.fat_depth import FatTerms
+from tactile_bayes.size.fat_process import FatProcess
 from tactile_bayes.size.log_quadratic import QUADRATIC
 from tactile_bayes.size.population_eq6 import PopulationEq6
 
@@ -101,7 +102,11 @@ def _left_out_text(fit: Mapping[str, float]) -> str:
 def _fat_lines(calibration: BodyCalibration, fat: FatTerms) -> list[str]:
     """What knowing the depth of the fat, from the pressure over the head, does to all that."""
     low, high = fat.fat_mm
-    how = "m and f by its logarithm and v" if isinstance(calibration, PopulationEq6) else "a cubic in u, v and its log"
+    how = "a cubic in u, v and its log"
+    if isinstance(calibration, PopulationEq6):
+        how = "m and f by its logarithm and v"
+    elif isinstance(fat, FatProcess):
+        how = "a Gaussian process in u, v and the pressure profile; ln SD between bodies a quadratic"
     return [
         f"for maps that give the depth of the fat, {low:.3g} to {high:.3g} mm, "
         f"to {100 * fat.depth.log_sd:.1f} %: {how}",

@@ -33,6 +33,8 @@ _LENGTH, _SCALE, _BODY_SD = (np.log(2.0), 1.0), (np.log(0.3), 1.0), (np.log(0.1)
 """Centre and width of the normal priors on the logs of lengths, scale and SD(B) at the centre."""
 _SLOPE_SD = 0.3
 """Width of the prior on the other coefficients of ln SD(B)."""
+_START_LENGTHS = (2.0, 0.7)
+"""The evidence has modes where what is smooth is taken for scatter, and the other way round."""
 _STEP = 1e-4
 _MOST_ITERATIONS = 60
 Minimise = Callable[..., Any]
@@ -146,12 +148,12 @@ def learn_fat_process(table: PopulationTable) -> FatProcess | None:
 def fit_process(table: PopulationTable, rows: ProcessRows) -> tuple[ProcessRows, Fitted, FloatArray]:
     """Points, kernel and spreads by turns; the rows with the maps' own variance, the fit, ln SD(E) and its variance."""
     count = max(min(POINTS, rows.data.groups // BODIES_PER_POINT), LEAST_BODIES // BODIES_PER_POINT)
-    theta = np.concatenate([np.full(rows.x.shape[1], _LENGTH[0]), [_SCALE[0], _BODY_SD[0]]])
-    theta = np.append(theta, np.zeros(rows.spread.shape[1] - 1))
     exam = np.array(rows.data.log_exam_sd(rows.data.least_squares()))
+    starts = [_start(rows, length) for length in _START_LENGTHS]
     for _ in range(ROUNDS):
-        points = spread_points(rows.mean(rows.x), np.exp(theta[: rows.x.shape[1]]), count)
-        theta = _best(rows, points, theta, exam_sd=float(np.exp(exam[0])))
+        fits = [_best(rows, one, count, exam_sd=float(np.exp(exam[0]))) for one in starts]
+        theta, points, _ = min(fits, key=lambda one: one[2])
+        starts = [theta]
         fitted = given(rows, points, theta, exam_sd=float(np.exp(exam[0])))
         rows = replace(rows, data=replace(rows.data, map_variance=_map_variance(table, rows, fitted)))
         whole = replace(rows.data, terms=all_terms(rows, fitted.kernel))
@@ -216,8 +218,17 @@ def log_prior(theta: FloatArray, lengths: int) -> float:
     return float(-0.5 * np.sum(((theta - centre) / width) ** 2))
 
 
-def _best(rows: ProcessRows, points: FloatArray, start: FloatArray, *, exam_sd: float) -> FloatArray:
+def _start(rows: ProcessRows, length: float) -> FloatArray:
+    lengths, spread = np.full(rows.x.shape[1], np.log(length)), np.zeros(rows.spread.shape[1])
+    spread[0] = _BODY_SD[0]
+    return np.concatenate([lengths, [_SCALE[0]], spread])
+
+
+def _best(rows: ProcessRows, start: FloatArray, count: int, *, exam_sd: float) -> tuple[FloatArray, FloatArray, float]:
+    """Logs of kernel and spreads at the mode next to a start, the points, and the mode's negative log density."""
     from scipy.optimize import minimize
+
+    points = spread_points(rows.mean(rows.x), np.exp(start[: rows.x.shape[1]]), count)
 
     def cost(theta: FloatArray) -> float:
         return -given(rows, points, theta, exam_sd=exam_sd).log_evidence - log_prior(theta, rows.x.shape[1])
@@ -225,7 +236,7 @@ def _best(rows: ProcessRows, points: FloatArray, start: FloatArray, *, exam_sd: 
     bounds = [(-2.0, 4.0)] * rows.x.shape[1] + [(-4.0, 2.0)] + [(-5.0, 1.0)]
     bounds += [(-1.5, 1.5)] * (len(start) - len(bounds))
     found = minimize(cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": _MOST_ITERATIONS})
-    return np.asarray(found.x, dtype=np.float64)
+    return np.asarray(found.x, dtype=np.float64), points, float(found.fun)
 
 
 def _map_variance(table: PopulationTable, rows: ProcessRows, fitted: Fitted) -> FloatArray:
