@@ -99,6 +99,7 @@ def _map(path: Path) -> dict[str, Any]:
         "frames": tactile_map.frame_count,
         "patient_frame": tactile_map.patient_from_plane is not None,
         "recipe": asdict(tactile_map.recipe),
+        **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
         "quality": dict(tactile_map.quality),
         "masked_taxels": list(tactile_map.masked_taxels),
         "provenance": header["provenance"],
@@ -154,10 +155,12 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
     from tactile_bayes.size.body_calibration import BodyCalibration
 
     if isinstance(calibration, BodyCalibration):
-        kept = ("form", "source", "recipe", "parameters", "centre", "mean", "domain", "fit", "provenance")
+        kept = ["form", "source", "recipe", "parameters", "centre", "mean", "domain", "fit", "provenance"]
+        kept += ["bodies"] if "bodies" in document else []
         return {
             "schema": document["schema"],
             "kind": "size calibration",
+            "head": str(calibration.recipe.head),
             "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
             **{name: document[name] for name in kept},
             "variance_taken_away_by_knowing": calibration.unknowns,

@@ -122,7 +122,7 @@ def _eq6(document: Any, *, path: Path) -> SizeCalibration:
             x=_axis(document["x"]),
             y=_axis(document["y"]),
             residual_correlation=float(document["residual_correlation"]),
-            recipe=Recipe(**document["recipe"]),
+            recipe=Recipe.from_document(document["recipe"]),
             axes=tuple(document["axes"]),
             left_out=_left_out(document.get("left_out")),
             cautions=tuple(document.get("cautions", ())),

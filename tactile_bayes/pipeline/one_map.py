@@ -14,6 +14,7 @@ from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.head_shape import HeadShape
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.result import Estimate
@@ -29,8 +30,8 @@ class Answer:
     """Answer for one map: its JSON object and its text, or an error with its exit code.
 
     `text` is the report in at most 12 lines, `full_text` all of it. `shape` holds what pooling
-    needs of a map on which a lump was found, `normalise` how the map's frames were, `fingerprint` what its values seed
-    random numbers with.
+    needs of a map on which a lump was found, `normalise` how the map's frames were, `head` what it was made with,
+    `fingerprint` what its values seed random numbers with.
     """
 
     document: dict[str, Any] | None
@@ -40,6 +41,7 @@ class Answer:
     normalise: str = ""
     fingerprint: int = 0
     full_text: str = ""
+    head: HeadShape | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +221,7 @@ def choose_calibration(
     """
     from tactile_bayes.files.shipped import default_for, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.estimate import recipe_differences
+    from tactile_bayes.posterior.estimate import OTHER_HEAD, recipe_differences
 
     if settings.calibration is None or isinstance(settings.calibration, str):
         path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
@@ -240,7 +242,8 @@ def choose_calibration(
     if settings.method == "optimise":
         return None, None, _LEAST_SQUARES
     if differs:
-        return None, None, NoSize(f"the shipped calibration does not fit: {'; '.join(differs)}; widths only")
+        advice = OTHER_HEAD if calibration.recipe.head_differences(tactile_map.head) else ""
+        return None, None, NoSize(f"the shipped calibration does not fit: {'; '.join(differs)}; widths only", advice)
     return path, calibration, None
 
 
@@ -351,7 +354,7 @@ def answer_of(outcome: Outcome) -> Answer:
     full_text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
-    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text)
+    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)
 
 
 def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:

@@ -15,6 +15,7 @@ _SOURCE = "balls in a population of bodies, scanned by the solid model"
 
 if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet, Table
+    from tactile_bayes.head_shape import HeadShape
     from tactile_bayes.pipeline.one_map import Progress
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.eq6 import LeftOutErrors, Recipe, SizeCalibration
@@ -142,14 +143,23 @@ def learn_population(
     NotConvergedError
         When the posterior has no mode.
     """
-    from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from dataclasses import replace
+
     from tactile_bayes.size.eq6 import Recipe
-    from tactile_bayes.studies.population import measuring_options, population_table
+    from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
     fit = measuring_options().fit
     way, columns = rows_of_one_way(rows, normalise)
-    recipe = Recipe(way, fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False)
     try:
+        recipe = Recipe(
+            way,
+            fit.background,
+            fit.radius_mm,
+            declared=False,
+            noise=fit.noise,
+            flat_field=False,
+            head=table_head(columns),
+        )
         calibration = population_learner(form)(population_table(columns), recipe=recipe, source=_SOURCE)
     except BadDataError as error:
         raise error.at(rows.path) from None
@@ -161,8 +171,9 @@ def learn_population(
             way_out="give a larger population, or --form log-quadratic",
             path=str(rows.path),
         )
-    masses = len(set(columns["body"]))
-    return calibration, {"form": form, "masses": masses, **as_settings(BodyPrior(), ExamPrior())}
+    bodies = table_bodies(columns)
+    settings = {"form": form, "masses": len(set(columns["body"])), "bodies": bodies}
+    return replace(calibration, bodies=bodies), settings
 
 
 def population_learner(form: PopulationForm) -> Callable[..., BodyCalibration]:
@@ -226,7 +237,29 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
     radius_mm = found["fit_radius_mm"] or FIT_RADIUS_MM
     noise: Noise = found["noise"] or "independent"
     by_hand = any(said[name] is None for name in declared)
-    return Recipe(normalise, background, radius_mm, declared=by_hand, noise=noise, flat_field=said["flat_field"])
+    return Recipe(
+        normalise,
+        background,
+        radius_mm,
+        declared=by_hand,
+        noise=noise,
+        flat_field=said["flat_field"],
+        head=_named_head(table),
+    )
+
+
+def _named_head(table: Table) -> HeadShape | None:
+    """Head that a table of lumps names; None where it does not."""
+    from tactile_bayes.head_shape import HeadShape
+
+    names = ("head_rows", "head_columns", "head_pitch_mm")
+    values = [_alike(table, name) for name in names]
+    if values == [None, None, None]:
+        return None
+    if None in values:
+        what = f"names a head without {names[values.index(None)]}"
+        raise BadDataError(what, way_out=f"give {', '.join(names)} and head_radius_mm", path=str(table.path))
+    return HeadShape(values[0], values[1], values[2], _alike(table, "head_radius_mm"))
 
 
 def _alike(table: Table, name: str) -> Any:

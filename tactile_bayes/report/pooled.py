@@ -61,7 +61,7 @@ def pooled_document(
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
-        "left_out": [omissions.fat_depth(used.fat_note)] if used.fat_note else [],
+        "left_out": _omitted(used, documents),
         "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
         "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
@@ -70,6 +70,13 @@ def pooled_document(
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
     }
+
+
+def _omitted(used: BodyCalibration, documents: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the pooled size does not contain, in words."""
+    head = omissions.head(used.recipe.head)
+    unknown = any(head in document["left_out"] for document in documents)
+    return [*([head] if unknown else []), *([omissions.fat_depth(used.fat_note)] if used.fat_note else [])]
 
 
 def _another_exam(size: SizePosterior | None, probability: float) -> dict[str, Any] | None:

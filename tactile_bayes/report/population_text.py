@@ -23,6 +23,16 @@ UNKNOWN_NAMES = {
     "thickness_mm": "thickness of the tissue",
 }
 
+BODY_NAMES = {
+    "d_mm": "d (mm)",
+    "depth_ratio": "h/d",
+    "stiffness_ratio": "E2/E1",
+    "seat": "seat",
+    "fat_kpa": "fat (kPa)",
+    "gland_ratio": "gland over fat",
+    "thickness_mm": "thickness (mm)",
+}
+
 
 def body_calibration_text(calibration: BodyCalibration) -> str:
     """Coefficients, spreads, what the unknowns cost, and the errors on masses left out."""
@@ -38,11 +48,18 @@ def body_calibration_text(calibration: BodyCalibration) -> str:
     for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
         low, high = calibration.domain[name]
         lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
+    lines += _bodies_lines(calibration.bodies)
     lines.append(f"recipe: {calibration.recipe}")
     lines.append(f"for maps made with {calibration.recipe.map_command}")
     if calibration.with_fat is not None:
         lines += _fat_lines(calibration, calibration.with_fat)
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _bodies_lines(bodies: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Ranges of the bodies in one line; none where a file of an earlier version does not name them."""
+    parts = [f"{BODY_NAMES.get(name, name)} {low:.3g} to {high:.3g}" for name, (low, high) in bodies.items()]
+    return [f"bodies: {', '.join(parts)}"] if parts else []
 
 
 def _quadratic_lines(calibration: BodyCalibration) -> list[str]:
@@ -102,7 +119,8 @@ def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) ->
     """Which calibration gave the size of a map with this mean width, and what it cannot know."""
     line = f"Sizes by the {name}"
     if isinstance(calibration, BodyCalibration):
-        line += f" ({calibration.source}); "
+        head = "" if calibration.recipe.head is None else f"; for a head of {calibration.recipe.head}"
+        line += f" ({calibration.source}{head}); "
         if isinstance(calibration, PopulationEq6):
             line += f"Eq 6 for this map: {constants_text(calibration.constants(sigma_mm))}; "
         line += f"{fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"

@@ -67,6 +67,8 @@ class BodyCalibration:
         Figures of the fit.
     source
         In words: what the table was made of.
+    bodies
+        Ranges of the table's lumps and bodies, by their columns; empty in files of earlier versions.
     with_fat
         The same for maps that tell how deep the fat under the head is; None where the table did not.
     fat_mm
@@ -90,6 +92,7 @@ class BodyCalibration:
     hidden: HiddenTerms | None = None
     fit: Mapping[str, float] = field(default_factory=dict)
     source: str = ""
+    bodies: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     with_fat: FatTerms | None = None
     fat_mm: float | None = None
     fat_note: str = ""
