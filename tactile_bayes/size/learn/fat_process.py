@@ -3,8 +3,10 @@ r"""Learning of the Gaussian process over a population's maps, see `size.fat_pro
 Given the kernel and the spread of B, the coefficients have a normal posterior in closed form, and with them a lower
 bound of the evidence of the bodies' means: less than the evidence by what the points do not explain of the process, so
 that lengths too short for the points do not pay (Titsias 2009, eq. 9). Its maximum, with weak priors, gives the
-kernel's lengths and scale and the coefficients of ln SD(B). The spread between exams comes from how the exams of one
-body differ, as in `regression`.
+kernel's lengths and scale. The coefficients of ln SD(B) are then those by which bodies left out are most probable, so
+that intervals hold on bodies never seen (Rasmussen & Williams 2006, sec. 5.4.2): by the evidence alone they held too
+seldom for shallow and clear lumps. The spread between exams comes from how the exams of one body differ, as in
+`regression`.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ _SLOPE_SD = 0.3
 _START_LENGTHS = (2.0, 0.7)
 """The evidence has modes where what is smooth is taken for scatter, and the other way round."""
 _STEP = 1e-4
-_MOST_ITERATIONS = 60
+_MOST_ITERATIONS = 200
+_DIFFERENCE = 1e-4
+"""Step of the gradient: below it the rounding of the solutions shows."""
 Minimise = Callable[..., Any]
 
 
@@ -160,7 +164,32 @@ def fit_process(table: PopulationTable, rows: ProcessRows) -> tuple[ProcessRows,
         rows = replace(rows, data=replace(rows.data, map_variance=_map_variance(table, rows, fitted)))
         whole = replace(rows.data, terms=all_terms(rows, fitted.kernel))
         exam = np.array(whole.log_exam_sd(fitted.mean))
-    return rows, given(rows, points, theta, exam_sd=float(np.exp(exam[0]))), exam
+    fitted = given(rows, points, theta, exam_sd=float(np.exp(exam[0])))
+    return rows, _spread_by_left_out(rows, fitted, exam_sd=float(np.exp(exam[0]))), exam
+
+
+def _spread_by_left_out(rows: ProcessRows, fitted: Fitted, *, exam_sd: float) -> Fitted:
+    """The fit with the coefficients of ln SD(B) by which bodies left out are most probable, the kernel kept."""
+    from scipy.optimize import minimize
+
+    density = _left_out_density(rows, fitted, exam_sd=exam_sd)
+
+    def cost(log_spread: FloatArray) -> float:
+        return -density(log_spread)
+
+    found = minimize(cost, fitted.log_spread, method="L-BFGS-B", options={"eps": _DIFFERENCE})
+    return _solved(rows, fitted.kernel, fitted.terms, np.asarray(found.x), exam_sd=exam_sd)
+
+
+def _left_out_density(rows: ProcessRows, fitted: Fitted, *, exam_sd: float) -> Callable[[FloatArray], float]:
+    """Log density of all bodies, each left out, with the prior, by (s,) coefficients of ln SD(B)."""
+
+    def density(log_spread: FloatArray) -> float:
+        solved = _solved(rows, fitted.kernel, fitted.terms, log_spread, exam_sd=exam_sd)
+        error, variance = solved.left_out(rows.data.mean_log_d)
+        return float(-0.5 * np.sum(np.log(variance) + error**2 / variance)) + _spread_prior(log_spread)
+
+    return density
 
 
 def spread_points(x: FloatArray, lengths: FloatArray, count: int) -> FloatArray:
@@ -194,10 +223,15 @@ def given(rows: ProcessRows, points: FloatArray, theta: FloatArray, *, exam_sd: 
     theta : (k + 1 + s,) array
         Logs of the k lengths and of the scale, coefficients of ln SD(B).
     """
-    k, data = rows.x.shape[1], rows.data
+    k = rows.x.shape[1]
     kernel = Kernel(points, np.exp(theta[:k]), float(np.exp(theta[k])))
-    terms = rows.mean(all_terms(rows, kernel))
-    variance = np.exp(2 * rows.spread @ theta[k + 1 :]) + (exam_sd**2 + data.mean(data.map_variance)) / data.exams
+    return _solved(rows, kernel, rows.mean(all_terms(rows, kernel)), theta[k + 1 :], exam_sd=exam_sd)
+
+
+def _solved(rows: ProcessRows, kernel: Kernel, terms: FloatArray, log_spread: FloatArray, *, exam_sd: float) -> Fitted:
+    """As `given`, for a kernel whose (b, k) terms are known."""
+    data = rows.data
+    variance = np.exp(2 * rows.spread @ log_spread) + (exam_sd**2 + data.mean(data.map_variance)) / data.exams
     prior = np.ones(terms.shape[1])
     prior[: len(LINEAR_POWERS)] = _LINEAR_SD**-2
     scaled = terms / np.sqrt(variance)[:, None]
@@ -210,16 +244,19 @@ def given(rows: ProcessRows, points: FloatArray, theta: FloatArray, *, exam_sd: 
     evidence = -0.5 * misfit - 0.5 * np.log(variance).sum() - np.log(np.diag(factor)).sum()
     unexplained = kernel.scale**2 - np.sum(terms[:, len(LINEAR_POWERS) :] ** 2, axis=1)
     evidence -= 0.5 * np.sum(np.maximum(unexplained, 0.0) / variance)
-    return Fitted(kernel, theta[k + 1 :], mean, covariance, terms, variance, float(evidence))
+    return Fitted(kernel, log_spread, mean, covariance, terms, variance, float(evidence))
 
 
 def log_prior(theta: FloatArray, lengths: int) -> float:
     """Of the logs of lengths and scale and the coefficients of ln SD(B)."""
-    centre = np.concatenate([np.full(lengths, _LENGTH[0]), [_SCALE[0], _BODY_SD[0]]])
-    width = np.concatenate([np.full(lengths, _LENGTH[1]), [_SCALE[1], _BODY_SD[1]]])
-    rest = len(theta) - len(centre)
-    centre, width = np.append(centre, np.zeros(rest)), np.append(width, np.full(rest, _SLOPE_SD))
-    return float(-0.5 * np.sum(((theta - centre) / width) ** 2))
+    of_lengths = np.sum(((theta[:lengths] - _LENGTH[0]) / _LENGTH[1]) ** 2)
+    of_scale = ((theta[lengths] - _SCALE[0]) / _SCALE[1]) ** 2
+    return float(-0.5 * (of_lengths + of_scale)) + _spread_prior(theta[lengths + 1 :])
+
+
+def _spread_prior(log_spread: FloatArray) -> float:
+    at_centre = ((log_spread[0] - _BODY_SD[0]) / _BODY_SD[1]) ** 2
+    return float(-0.5 * (at_centre + np.sum((log_spread[1:] / _SLOPE_SD) ** 2)))
 
 
 def _start(rows: ProcessRows, length: float) -> FloatArray:
@@ -228,18 +265,36 @@ def _start(rows: ProcessRows, length: float) -> FloatArray:
     return np.concatenate([lengths, [_SCALE[0]], spread])
 
 
+def _of_means(rows: ProcessRows, *, exam_sd: float) -> ProcessRows:
+    """The bodies' means as rows of one exam each, with its spread: exams of a body differ little."""
+    data, count = rows.data, rows.data.groups
+    means = replace(
+        data,
+        terms=data.mean_terms,
+        constant=np.zeros(count),
+        map_variance=(exam_sd**2 + data.mean(data.map_variance)) / data.exams,
+        group=np.arange(count),
+        exams=np.ones(count),
+    )
+    return replace(rows, data=means, x=rows.mean(rows.x))
+
+
 def _best(rows: ProcessRows, start: FloatArray, count: int, *, exam_sd: float) -> tuple[FloatArray, FloatArray, float]:
     """Logs of kernel and spreads at the mode next to a start, the points, and the mode's negative log density."""
     from scipy.optimize import minimize
 
     points = spread_points(rows.mean(rows.x), np.exp(start[: rows.x.shape[1]]), count)
 
+    bodies = _of_means(rows, exam_sd=exam_sd)
+
     def cost(theta: FloatArray) -> float:
-        return -given(rows, points, theta, exam_sd=exam_sd).log_evidence - log_prior(theta, rows.x.shape[1])
+        return -given(bodies, points, theta, exam_sd=0.0).log_evidence - log_prior(theta, rows.x.shape[1])
 
     bounds = [(-2.0, 4.0)] * rows.x.shape[1] + [(-4.0, 2.0)] + [(-5.0, 1.0)]
     bounds += [(-1.5, 1.5)] * (len(start) - len(bounds))
-    found = minimize(cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": _MOST_ITERATIONS})
+    found = minimize(
+        cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": _MOST_ITERATIONS, "eps": _DIFFERENCE}
+    )
     return np.asarray(found.x, dtype=np.float64), points, float(found.fun)
 
 
@@ -256,19 +311,16 @@ def _map_variance(table: PopulationTable, rows: ProcessRows, fitted: Fitted) -> 
 
 
 def _covariance(rows: ProcessRows, fitted: Fitted, exam: FloatArray) -> FloatArray:
-    """Of coefficients, ln SD(B) and ln SD(E): the second from the curvature of the evidence, kernel kept."""
+    """Of coefficients, ln SD(B) and ln SD(E): the second by curvature, kernel kept."""
     from tactile_bayes.inference.laplace import mode_and_covariance
 
     k, s = len(fitted.mean), len(fitted.log_spread)
-    kernel = np.log(np.append(fitted.kernel.lengths, fitted.kernel.scale))
-    points, sd = fitted.kernel.points, float(np.exp(exam[0]))
+    density = _left_out_density(rows, fitted, exam_sd=float(np.exp(exam[0])))
 
-    def log_density(many: FloatArray) -> FloatArray:
-        theta = [np.concatenate([kernel, one]) for one in many]
-        found = [given(rows, points, one, exam_sd=sd).log_evidence + log_prior(one, rows.x.shape[1]) for one in theta]
-        return np.array(found)
+    def many(spreads: FloatArray) -> FloatArray:
+        return np.array([density(one) for one in spreads])
 
-    _, of_spread, _ = mode_and_covariance(log_density, fitted.log_spread, scale=np.full(s, 0.05))
+    _, of_spread, _ = mode_and_covariance(many, fitted.log_spread, scale=np.full(s, 0.05))
     whole = np.zeros((k + s + 1, k + s + 1))
     whole[:k, :k], whole[k:-1, k:-1], whole[-1, -1] = fitted.covariance, of_spread, exam[1]
     return whole
