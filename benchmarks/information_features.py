@@ -15,7 +15,7 @@ from tactile_bayes.geometry import FloatArray, apply, inverse
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.frames import select_frames
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.presets import PRESSURE_WINDOW_KPA
+from tactile_bayes.presets import PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import Scan
 
 WINDOW_MM = 20.0
@@ -28,6 +28,8 @@ PLACES_MM = (0.0, 2.5, 5.0, 7.5, 10.0, 12.5, 16.0, 20.0)
 """Ends of the bins of the lump's distance from the head's middle, across the head."""
 BESIDE_MM = 8.0
 """Frames with the lump further than this from the middle along the head are in no bin."""
+EXPANDED_EVERY = 2
+"""One frame in so many is expanded."""
 WIDTH_STEPS = np.arange(0.25, 4.0, 0.5)
 """Places in widths where the map's bump is read."""
 
@@ -158,6 +160,7 @@ class HeadFrames:
     Parameters
     ----------
     kpa : (n, r, c) array
+        Saturated readings at the end of the range.
     level_kpa : (n,) array
         Means of the frames.
     lump_mm : (n, 2) array
@@ -166,6 +169,8 @@ class HeadFrames:
         Place of the head's apex in the map's plane.
     bump : (n, r, c) array
         Unit Gaussian of the map at the taxels.
+    offset_mm : (n, r, c, 2) array
+        Place of the taxels from the lump, in the map's plane.
     free : (r, c) array
         Mean of the frames that feel least of the lump, each over its mean.
     own : (n,) array
@@ -179,6 +184,7 @@ class HeadFrames:
     lump_mm: FloatArray
     apex_mm: FloatArray
     bump: FloatArray
+    offset_mm: FloatArray
     free: FloatArray
     own: FloatArray
     amplitude: FloatArray
@@ -188,7 +194,7 @@ class HeadFrames:
     def of(cls, scan: Scan, plane_from_base: FloatArray, bump: Bump) -> HeadFrames:
         """Read a scan's frames."""
         part = select_frames(scan, pressure_window_kpa=PRESSURE_WINDOW_KPA)
-        kpa = scan.element_calibration.to_kpa(scan.frames.counts[part.used])
+        kpa = np.nan_to_num(scan.element_calibration.to_kpa(scan.frames.counts[part.used]), nan=PRESSURE_RANGE_KPA[1])
         poses, lever = part.used_poses.part(part.used), inverse(scan.head.scanhead_from_tracker)
         to_plane = plane_from_base[:3, :3]
         turn = to_plane @ poses.rotation @ lever[:3, :3]
@@ -201,7 +207,7 @@ class HeadFrames:
         least = felt.sum(axis=(1, 2))
         free = (kpa / level[:, None, None])[least <= np.quantile(least, FREE_SHARE)].mean(axis=0)
         own, amplitude, weight = _frame_amplitudes(kpa, felt, free)
-        return cls(kpa, level, lump, apex, felt, free, own, amplitude, weight)
+        return cls(kpa, level, lump, apex, felt, places - bump.centre_mm, free, own, amplitude, weight)
 
 
 def _frame_amplitudes(kpa: FloatArray, felt: FloatArray, free: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -313,3 +319,45 @@ def mean_frames(frames: HeadFrames, bump: Bump) -> FloatArray:
         if (bins == k).any():
             found[k] = added[bins == k].mean(axis=0)
     return np.asarray(found.reshape(len(found), rows, columns // 2, 2).mean(axis=3), dtype=np.float32)
+
+
+def expansion(frames: HeadFrames, bump: Bump, pitch_mm: float = 1.5) -> FloatArray:
+    """(25,) coefficients of what the lump adds to the frames, over its amplitude.
+
+    Least squares over all readings of the frames that have the lump near the head, each over its frame's level, with the
+    level and two slopes of the head's own frame open in every frame. The functions are Gauss-Hermite functions of the
+    taxel's distance from the lump in widths, of even order up to 4, and a Gaussian twice as wide; each times 1, X^2 and
+    Y^2 of the lump's place under the head in halves of its size; and odd ones times X or Y: how the bump is shifted and
+    skewed where the lump is off the head's middle.
+    """
+    half = 0.5 * pitch_mm * np.array(frames.free.shape)
+    place = frames.lump_mm / half
+    near = np.flatnonzero((np.abs(place) < (1.6, 1.3)).all(axis=1))[::EXPANDED_EVERY]
+    place, square = place[near], np.minimum(place[near] ** 2, 2.0)
+    offset = _offsets(frames, bump)[near].astype(np.float32)
+    n, t = offset.shape[:2]
+    u, v = offset[..., 0], offset[..., 1]
+    g = np.exp(-0.5 * (u**2 + v**2))
+    wide = np.exp(-0.125 * (u**2 + v**2))
+    x2, y2 = (u**2 - 1) / 1.4142, (v**2 - 1) / 1.4142
+    x4, y4 = ((w**4 - 6 * w**2 + 3) / 4.899 for w in (u, v))
+    even = [g, g * x2, g * y2, g * x2 * y2, g * x4, g * y4, wide]
+    columns = [one * by for one in even for by in (1.0, square[:, :1], square[:, 1:])]
+    px, py = place[:, :1], place[:, 1:]
+    columns += [g * u * px, g * v * py, g * u * (x2 - 1.4142) * px, g * v * (y2 - 1.4142) * py]
+    value = (frames.kpa[near] / frames.own[near, None, None]).reshape(n, t)
+    across, along = (np.linspace(-1, 1, size) for size in frames.free.shape)
+    shared = np.stack([frames.free, frames.free * across[:, None], frames.free * along]).reshape(3, -1)
+    root = np.linalg.qr(shared.T)[0]
+    left = np.array([*columns, value], dtype=np.float32)
+    left -= (left @ root.astype(np.float32)) @ root.T.astype(np.float32)
+    flat = left.reshape(len(left), -1)
+    products = (flat @ flat.T).astype(np.float64)
+    gram = products[:-1, :-1]
+    gram = gram + np.diag(1e-4 * np.diag(gram) + 1e-9)
+    return np.asarray(np.linalg.solve(gram, products[:-1, -1]) / bump.amplitude)
+
+
+def _offsets(frames: HeadFrames, bump: Bump) -> FloatArray:
+    """(n, t, 2) distances of the taxels from the lump, in widths of the bump."""
+    return frames.offset_mm.reshape(len(frames.kpa), -1, 2) / bump.sigma_mm

@@ -17,9 +17,9 @@ from scipy.optimize import minimize
 
 from tactile_bayes.geometry import FloatArray
 
-LINE_SD = 3.0
+LINE_SD = 1.0
 """Prior SD of the straight line's slopes, over features of SD 1 and a target of SD 1."""
-LOG_LENGTH, LOG_LENGTH_SD = np.log(3.0), 1.0
+LOG_LENGTH, LOG_LENGTH_SD = np.log(5.0), 1.5
 LOG_HEIGHT, LOG_HEIGHT_SD = np.log(0.3), 1.0
 SLOPE_SD = 0.3
 _JITTER = 1e-8
