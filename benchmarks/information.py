@@ -17,7 +17,7 @@ import json
 import pickle
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,15 @@ from tactile_bayes.studies.population import MassRow, measure_exam
 NORMALISE = "gain"
 WINSOR_SD = 4.0
 """Figures further from the median, in robust SDs, are moved to there."""
-ROWS = ("rows_middle_amplitude", "rows_middle_sigma_x", "rows_middle_sigma_y")
-ROWS = (*ROWS, "rows_outer_amplitude", "rows_outer_sigma_x", "rows_outer_sigma_y", "rows_apart_x")
+ROWS = (
+    "rows_middle_amplitude",
+    "rows_middle_sigma_x",
+    "rows_middle_sigma_y",
+    "rows_outer_amplitude",
+    "rows_outer_sigma_x",
+    "rows_outer_sigma_y",
+    "rows_apart_x",
+)
 CANDIDATES: Mapping[str, Sequence[str]] = {
     "mean pressure": ("mean_kpa",),
     "bump against pressure": ("amplitude_pressure", "profile_pressure"),
@@ -134,7 +141,9 @@ def measure(row: MassRow, scene: Scene, scan: Scan) -> dict[str, float] | None:
     """All figures of one exam; None where no lump or no profile of the head was measured."""
     if not row.detected or row.head_profile_x2 is None:
         return None
-    assert row.amplitude is not None and row.sigma_x_mm is not None and row.sigma_y_mm is not None
+    assert row.amplitude is not None
+    assert row.sigma_x_mm is not None
+    assert row.sigma_y_mm is not None
     assert row.mean_kpa is not None
     lump, widths = scene.solid_lumps[0], (row.sigma_x_mm, row.sigma_y_mm)
     tactile_map = build_map(scan, normalise=NORMALISE)
@@ -178,7 +187,8 @@ def base_features(exams: Sequence[Measured]) -> FloatArray:
     sigma = np.log(np.array([[row.sigma_x_mm, row.sigma_y_mm] for row in rows], dtype=np.float64))
     profile = np.array([[getattr(row, name) for name in HEAD_PROFILE] for row in rows], dtype=np.float64)
     amplitude = np.log(np.array([row.amplitude for row in rows], dtype=np.float64))
-    return np.c_[amplitude, sigma.mean(axis=1), (sigma[:, 0] - sigma[:, 1]) / 2, profile]
+    found: FloatArray = np.c_[amplitude, sigma.mean(axis=1), (sigma[:, 0] - sigma[:, 1]) / 2, profile]
+    return found
 
 
 def columns(exams: Sequence[Measured], names: Sequence[str]) -> FloatArray:
@@ -186,7 +196,7 @@ def columns(exams: Sequence[Measured], names: Sequence[str]) -> FloatArray:
     values = np.array([[exam.figures[name] for name in names] for exam in exams])
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
     width = WINSOR_SD * (high - low) / 1.35
-    return np.clip(values, middle - width, middle + width)
+    return np.asarray(np.clip(values, middle - width, middle + width))
 
 
 class _Study:
@@ -199,7 +209,7 @@ class _Study:
 
     def _size(self, error: FloatArray) -> FloatArray:
         """Absolute errors: of a size in per cent of it."""
-        return 100 * np.abs(np.expm1(error)) if self.target == "d_mm" else np.abs(error)
+        return np.asarray(100 * np.abs(np.expm1(error)) if self.target == "d_mm" else np.abs(error))
 
     def describe(self, error: FloatArray) -> str:
         return f"{error.mean():.2f} %" if self.target == "d_mm" else f"{error.mean():.3f}"

@@ -30,7 +30,7 @@ FLAT_SD = 1e3
 def changed(scene: Scene, number: int, step: float) -> Scene:
     """The scene with one property of body or lump changed."""
     lump, body = scene.solid_lumps[0], scene.body
-    assert body is not None and lump.depth_ratio is not None
+    assert body is not None
     name, factor = PROPERTIES[number].removeprefix("ln "), float(np.exp(step))
     if name in ("fat_kpa", "gland_ratio"):
         return replace(scene, body=replace(body, **{name: getattr(body, name) * factor}))
@@ -91,7 +91,8 @@ def differentiate(scene: Scene, *, every: int = 10) -> Exam:
 
     def felt(one: Scene, turn: FloatArray, place: FloatArray) -> FloatArray:
         kpa, depth = frames_at_poses(one, turn, place, mean_kpa=level)
-        return np.c_[kpa.reshape(len(kpa), -1), depth]
+        both: FloatArray = np.c_[kpa.reshape(len(kpa), -1), depth]
+        return both
 
     here = felt(scene, rotation, origin)
     by_property = []
@@ -143,7 +144,8 @@ def posterior_sd(
     information = np.diag(prior_sd() ** -2.0)
     for exam in exams:
         information = information + _information(exam, depth, frames, model_share, gain_share)
-    return np.asarray(np.sqrt(np.diag(np.linalg.inv(information))))
+    found: FloatArray = np.sqrt(np.diag(np.linalg.inv(information)))
+    return found
 
 
 def _information(exam: Exam, depth: bool, frames: bool, model_share: float, gain_share: float) -> FloatArray:
@@ -185,4 +187,5 @@ def _patterns(exam: Exam) -> FloatArray:
     over = np.einsum("ra,cb->rcab", rows, columns).reshape(exam.kpa.shape[1], 9)
     square = np.minimum((exam.place_mm / (0.5 * head.pitch_mm * np.array([head.rows, head.columns]))) ** 2, 2.0)
     by_place = np.c_[np.ones(len(square)), square]
-    return np.einsum("nt,tj,nk->ntjk", exam.lump_kpa, over, by_place).reshape(*exam.kpa.shape, -1)
+    patterns: FloatArray = np.einsum("nt,tj,nk->ntjk", exam.lump_kpa, over, by_place).reshape(*exam.kpa.shape, -1)
+    return patterns

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from benchmarks.information_frames import Bump, HeadFrames
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM
+
+Floats = NDArray[np.floating[Any]]
 
 EXPANDED_EVERY = 2
 """One frame in so many is expanded."""
@@ -15,8 +20,14 @@ NEAR = (1.6, 1.3)
 """Frames with the lump further from the head's middle, across and along in halves of its size, are left out."""
 MOST_SQUARE = 2.0
 """Beyond the head's edge the square of the place stays at this."""
-CHOSEN = ("by_place_height", "by_place_height_across", "by_place_width", "by_place_width_across")
-CHOSEN = (*CHOSEN, "by_place_shift_across", "by_place_shift_along")
+CHOSEN = (
+    "by_place_height",
+    "by_place_height_across",
+    "by_place_width",
+    "by_place_width_across",
+    "by_place_shift_across",
+    "by_place_shift_along",
+)
 """Names of the six figures, in the order of `expansion_columns`."""
 USUAL = (1.03, -0.42, -0.21, 0.17, -0.57, -0.23)
 """Medians over simulated exams of clear lumps: what a faint lump's figures are shrunk to."""
@@ -24,7 +35,7 @@ SHRINKAGE = 10.0
 """Over the square of the amplitude it is added to the normal equations' diagonal."""
 
 
-def expansion_columns(u: FloatArray, v: FloatArray, place: FloatArray) -> list[FloatArray]:
+def expansion_columns(u: Floats, v: Floats, place: Floats) -> list[Floats]:
     """Functions of the taxels' distances from the lump and of the lump's place.
 
     Parameters
@@ -119,7 +130,8 @@ def _part_fit(ratio: FloatArray, offset_mm: FloatArray, bump: Bump) -> FloatArra
         u = place / bump.sigma_mm - theta[1:3]
         shape = np.exp(theta[0] - 0.5 * np.sum((u / np.exp(theta[3:5])) ** 2, axis=1))
         model = bump.amplitude * shape + theta[5] + place @ theta[6:8] / 15.0
-        return np.r_[root * (model - value) / 0.05, theta[:5] / soft]
+        residual: FloatArray = np.r_[root * (model - value) / 0.05, theta[:5] / soft]
+        return residual
 
     start = np.r_[np.zeros(5), 1.0, 0.0, 0.0]
     return np.asarray(least_squares(left, start, method="lm", max_nfev=400).x[:5])

@@ -88,7 +88,8 @@ class BodyProcess:
     def start(self) -> FloatArray:
         """Parameters to begin with: log lengths, log height, coefficients of the log variance."""
         lengths = np.full(self.exams.features.shape[1], LOG_LENGTH)
-        return np.r_[lengths, LOG_HEIGHT, np.log(0.02), np.zeros(self.exams.noise_features)]
+        start: FloatArray = np.r_[lengths, LOG_HEIGHT, np.log(0.02), np.zeros(self.exams.noise_features)]
+        return start
 
     def covariance(self, theta: FloatArray) -> _Parts:
         """Covariance of the process between exams, and between the means of bodies."""
@@ -112,7 +113,7 @@ class BodyProcess:
         inverse = cho_solve((root, True), np.eye(len(index)))
         alpha = inverse @ self.y[index]
         inner = 0.5 * (inverse - np.outer(alpha, alpha))
-        value = 0.5 * self.y[index] @ alpha + float(np.log(np.diag(root)).sum())
+        value = 0.5 * float(self.y[index] @ alpha) + float(np.log(np.diag(root)).sum())
         gradient = np.zeros_like(theta)
         wide = np.zeros((len(self.y), len(self.y)))
         wide[np.ix_(index, index)] = inner
