@@ -2,19 +2,19 @@
 
 What is changed, and how it is derived:
 
-- `depth_mm` of a `VaryingLayers`: fat or chest wall whose depth varies along one direction. The skin's compliance between
-  two squares is that of even layers of the depth half way between them, the leading term where depths change little over
-  a head. The lump's own perturbation stays that of the depth above it.
+- `depth_mm` of a `VaryingLayers`: fat or chest wall whose depth varies along one direction. The skin's compliance
+  between two squares is that of even layers of the depth half way between them, the leading term where depths change
+  little over a head. The lump's own perturbation stays that of the depth above it.
 - `skin_radius_mm`: a convex skin. In the contact only the relative curvature of head and skin counts (Johnson 1985,
   ch. 4), so the head's face falls away by r^2 / (2 R) more. The examiner keeps the head square to the skin, so that the
   tracker's poses follow the curve.
 - `lag_mm`: the lump is dragged along by this much in each stroke's direction.
 - `friction`: the sliding head pulls the skin along with mu times the pressure (Coulomb). The skin's sinking under this
   shear is exact for the layers; the pressures that cause it are those of the frame before.
-- `local_stiffening` k: the modulus under a square is E (1 - k + k p / 9.5 kPa), within half and twice E, with p the mean
-  pressure within some 5 mm: a secant modulus, found in two steps from the frame before. All tissue stiffens alike.
-- `gland_stiffening` k: gland and lump, but not fat, have E (1 - k + k p / 9.5 kPa) with p the frame's mean. Krouskop et al.
-  (1998, Ultrasonic Imaging 20) found fat's modulus nearly constant between 5 and 20 % of compression, that of gland
+- `local_stiffening` k: the modulus under a square is E (1 - k + k p / 9.5 kPa), within half and twice E, with p the
+  mean pressure within some 5 mm: a secant modulus, found in two steps from the frame before. All tissue stiffens alike.
+- `gland_stiffening` k: gland and lump, but not fat, have E (1 - k + k p / 9.5 kPa) with p the frame's mean. Krouskop et
+  al. (1998, Ultrasonic Imaging 20) found fat's modulus nearly constant between 5 and 20 % of compression, that of gland
   doubled and those of carcinomas several-fold.
 """
 
@@ -99,7 +99,7 @@ def stressed_scan(scene: Scene, physics: Physics) -> Scan:
 
 
 def _on_sphere(scene: Scene, scan: Scan, radius_mm: float) -> Scan:
-    """The scan with its strokes bent onto a sphere that touches the scene's `plane` from below, arc length for length."""
+    """The scan with its strokes bent onto a sphere that touches the scene's `plane`, arc length for length."""
     base, lever = scene.tracker.base_from_plane(), scene.tracker.scanhead_from_tracker()
     to_plane = inverse(base)
     attitude = to_plane[:3, :3] @ rotation_from_quaternion(scan.poses.quaternion_wxyz) @ lever[:3, :3].T
@@ -190,9 +190,7 @@ class _Model:
 
         def solved(head: SolidHead, lumps: Sequence[Any]) -> SolidFrame:
             touching = None if before is None else before.contact.touching
-            return head.frame(
-                lumps, rotation=rotation, x_mm=origin[0], y_mm=origin[1], mean_kpa=kpa, touching=touching
-            )
+            return head.frame(lumps, rotation=rotation, x_mm=origin[0], y_mm=origin[1], mean_kpa=kpa, touching=touching)
 
         k = self.physics.local_stiffening
         if not k or kpa <= 0:
@@ -219,10 +217,15 @@ class _Model:
         return replace(low, plain=replace(low.plain, plain=plain)), lumps
 
     def _on_grid(self, origin: FloatArray) -> SolidHead:
-        assert self.grid is not None and self.physics.varying is not None
+        assert self.grid is not None
+        assert self.physics.varying is not None
         place, heads = self.grid
         angle = self.physics.varying.angle_rad
-        at = float(np.clip((np.cos(angle) * origin[0] + np.sin(angle) * origin[1] - place[0]) / _GRID_MM, 0, len(place) - 1.001))
+        at = float(
+            np.clip(
+                (np.cos(angle) * origin[0] + np.sin(angle) * origin[1] - place[0]) / _GRID_MM, 0, len(place) - 1.001
+            )
+        )
         below, share = int(at), at - int(at)
         plain = (1.0 - share) * heads[below].plain.plain + share * heads[below + 1].plain.plain
         return replace(heads[below], plain=replace(heads[below].plain, plain=plain))
@@ -296,7 +299,9 @@ def _grid(
     ends = depth(np.linspace(place[0] + across.min(), place[-1] + across.max(), 400))
     table_mm = np.geomspace(ends.min() * 0.999, ends.max() * 1.001, _DEPTHS)
     rows, columns = face.sensing.shape
-    table = np.stack([_by_offset(_with_depth(body, fat_mm, varying.layer, one), rows, columns, face.pitch_mm) for one in table_mm])
+    table = np.stack(
+        [_by_offset(_with_depth(body, fat_mm, varying.layer, one), rows, columns, face.pitch_mm) for one in table_mm]
+    )
     row, column = np.divmod(np.arange(rows * columns), columns)
     offset = np.abs(row[:, None] - row) * columns + np.abs(column[:, None] - column)
     heads = []

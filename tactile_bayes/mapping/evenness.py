@@ -1,14 +1,15 @@
 r"""Figures of how even a scan's surroundings were: the head's profile from place to place and stroke to stroke.
 
 Where no lump is felt, the profile of the head depends on the layers below it (`tactile_bayes.mapping.head_profile`). A
-profile that changes with the head's place means layers whose depth changes; one that is skewed along the stroke, to the
-other side in strokes the other way, means that the skin is dragged along. How the head's normal turns as it moves is the
-curvature of the skin, to which an examiner keeps the head square.
+profile that changes with the head's place means layers whose depth changes; one that is skewed along the stroke, to
+the other side in strokes the other way, means that the skin is dragged along. How the head's normal turns as it moves is
+the curvature of the skin, to which an examiner keeps the head square.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,8 @@ def evenness_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict
         on convex skin. ``profile_change``, ``profile_change_sd``: change of `head_profile_x2` over `SPAN_MM` in the
         direction in which it changes most. ``stroke_skew``, ``stroke_skew_sd``: first-order coefficient of the
         profile along the strokes, half the difference between strokes towards +x and towards -x; not given where all
-        strokes went one way. The last four are missing where too few frames are free of a lump or the head hardly moved.
+        strokes went one way. The last four are missing where too few frames are free of a lump or the head hardly
+        moved.
     """
     parts = [_Frames.of(part, plane) for part in selections if part.used.any()]
     figures = _curvature(parts)
@@ -87,7 +89,7 @@ class _Frames:
 def _ways(x_mm: FloatArray) -> FloatArray:
     """(n,) 1 in strokes towards +x, -1 in others."""
     way, starts = np.ones(len(x_mm)), stroke_starts(x_mm)
-    for start, stop in zip(starts[:-1], starts[1:], strict=True):
+    for start, stop in pairwise(starts):
         way[start:stop] = 1.0 if x_mm[min(stop, len(x_mm) - 1)] >= x_mm[start] else -1.0
     return way
 
@@ -107,7 +109,11 @@ def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int
     free = lump_free(rows[:, -1])
     if np.count_nonzero(free) < LEAST_FRAMES:
         return {}
-    rows, design, group = rows[free], design[free] - design[free].mean(axis=0) * (np.arange(design.shape[1]) > 0), group[free]
+    rows, design, group = (
+        rows[free],
+        design[free] - design[free].mean(axis=0) * (np.arange(design.shape[1]) > 0),
+        group[free],
+    )
     if min(np.std(design[:, _X]), np.std(design[:, _Y])) * SPAN_MM < _LEAST_SPREAD_MM:
         return {}
     both_ways = np.std(design[:, _WAY]) > 0
@@ -126,9 +132,7 @@ def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int
     return figures
 
 
-def _regression(
-    design: FloatArray, rows: FloatArray, group: NDArray[np.int64]
-) -> tuple[FloatArray, FloatArray]:
+def _regression(design: FloatArray, rows: FloatArray, group: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
     """(c, k) coefficients of (n, k) rows on an (n, c) design, and their standard errors by a grouped jackknife."""
     normal = np.stack([design[group == g].T @ design[group == g] for g in range(_GROUPS)])
     right = np.stack([design[group == g].T @ rows[group == g] for g in range(_GROUPS)])

@@ -1,4 +1,4 @@
-"""How far apart strokes in opposite directions see the lump: a lump that is dragged along, or a latency left in the poses.
+"""How far apart strokes in opposite directions see the lump: one that is dragged along, or poses that come late.
 
 Either puts the lump's image ahead in one direction and behind in the other, and the map, which holds both, is too wide.
 One unknown of the regression in `tactile_bayes.mapping.shift_fit`, in one round: enough for a warning.
@@ -17,8 +17,8 @@ from tactile_bayes.mapping.shift_fit import ShiftFit
 from tactile_bayes.mapping.source import Source
 from tactile_bayes.mapping.strokes import find_strokes
 
-# Averaged frames that are used, spread evenly: those of 8 s.
-MOST_FRAMES = 400
+# Averaged frames that are used, spread evenly: more would cost as much as the map itself.
+MOST_FRAMES = 160
 
 
 def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
@@ -29,8 +29,8 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
 
     Notes
     -----
-    One linear step from no shift, so a figure above 1 mm is rough. The standard error holds errors that frames share over
-    0.2 s.
+    One linear step from no shift, so a figure above 1 mm is rough. The standard error holds errors that frames share
+    over 0.2 s.
     """
     total = sum(len(source.frames) for source in sources)
     slots = sum(np.ptp(source.selection.scan.frames.time_s[source.frames]) for source in sources if len(source.frames))
