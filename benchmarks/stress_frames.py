@@ -95,10 +95,10 @@ def stressed_scan(scene: Scene, physics: Physics) -> Scan:
         truth={"lumps": []},
         rng=np.random.default_rng(scene.seed),
     )
-    return done.scan if np.isinf(physics.skin_radius_mm) else _on_sphere(scene, done.scan, physics.skin_radius_mm)
+    return done.scan if np.isinf(physics.skin_radius_mm) else on_sphere(scene, done.scan, physics.skin_radius_mm)
 
 
-def _on_sphere(scene: Scene, scan: Scan, radius_mm: float) -> Scan:
+def on_sphere(scene: Scene, scan: Scan, radius_mm: float) -> Scan:
     """The scan with its strokes bent onto a sphere that touches the scene's `plane`, arc length for length."""
     base, lever = scene.tracker.base_from_plane(), scene.tracker.scanhead_from_tracker()
     to_plane = inverse(base)

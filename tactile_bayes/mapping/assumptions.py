@@ -54,8 +54,8 @@ def _curved(quality: Mapping[str, float]) -> str:
         return ""
     shape = "convex" if curvature > 0 else "hollow"
     return (
-        f"the head turned as on {shape} skin of radius {1000 / abs(curvature):.0f} mm, and sizes are for flat skin: the "
-        "size may be off by more than its interval"
+        f"the head turned as on {shape} skin of radius {1000 / abs(curvature):.0f} mm, and sizes are for flat skin: "
+        "the size may be off by more than its interval"
     )
 
 
@@ -64,8 +64,8 @@ def _uneven(quality: Mapping[str, float]) -> str:
     if change is None:
         return ""
     return (
-        f"the head's pressure profile changes over the map (by {change:.3f} in 30 mm): the fat is of uneven depth, or a "
-        "rib or another lump lies near; the size is for even fat"
+        f"the head's pressure profile changes over the map (by {change:.3f} in 30 mm): the fat is of uneven depth, or "
+        "a rib or another lump lies near; the size is for even fat"
     )
 
 
