@@ -24,6 +24,7 @@ from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.forward.population import BodyPrior, draw_mass
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions, skewed
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.pipeline.one_map import answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
@@ -165,10 +166,107 @@ def simulate(folder: Path, bodies: int) -> None:
         partial.rename(path)
 
 
+@dataclass(frozen=True, slots=True)
+class Exam:
+    """What one exam gave.
+
+    Parameters
+    ----------
+    name, body
+        Its stress, and the number of its body.
+    log_error
+        ln of the largest size over the true one; NaN without a size.
+    covered, another_covered
+        Whether the intervals hold the true size.
+    half_width
+        Of the interval of this exam, as a share of the size.
+    flags
+        Which of `FLAGS` spoke.
+    """
+
+    name: str
+    body: int
+    log_error: float
+    covered: bool
+    another_covered: bool
+    half_width: float
+    flags: frozenset[str]
+
+
+FLAGS = ("lag", "curved", "uneven", "skewed", "range", "no depth")
+"""Those of `mapping.assumptions`; the map outside the calibration's range; a head profile that gives no depth of fat."""
+
+
+def exam_of(kept: dict[str, Any]) -> Exam:
+    """Figures of a kept scan and report; the map is built anew, so that flags are those of the present program."""
+    document, quality = kept["document"], build_map(kept["scan"]).quality
+    diagnostics, true = document.get("diagnostics") or {}, kept["d_mm"]
+    spoken = {
+        "lag": any("opposite" in text for text in broken_assumptions(quality)),
+        "curved": any("skin of radius" in text for text in broken_assumptions(quality)),
+        "uneven": bool(assumptions_to_check(quality)),
+        "skewed": bool(skewed(quality)),
+        "range": bool(diagnostics.get("outside_calibration")),
+        "no depth": diagnostics.get("fat_mm") is None,
+    }
+    flags = frozenset(name for name in FLAGS if spoken[name])
+    size = document.get("max_size_mm")
+    if not size:
+        return Exam(kept["name"], kept["body"], np.nan, False, False, np.nan, flags)
+    another = document["another_exam"]["max_size_mm"]
+    return Exam(
+        kept["name"],
+        kept["body"],
+        float(np.log(size["median"] / true)),
+        size["low"] <= true <= size["high"],
+        another["low"] <= true <= another["high"],
+        (size["high"] - size["low"]) / 2 / size["median"],
+        flags,
+    )
+
+
+def exams_in(folder: Path) -> list[Exam]:
+    """All exams of a folder that could be mapped; the others are named on standard output."""
+    found = []
+    for path in sorted(folder.glob("*.pickle")):
+        kept = pickle.loads(path.read_bytes())
+        if "error" in kept:
+            print(f"{kept['name']}, body {kept['body']}: {kept['error']}")
+            continue
+        found.append(exam_of(kept))
+    return found
+
+
+def table(exams: list[Exam]) -> Iterator[str]:
+    """A line for each stress: errors, coverage, and how often each flag speaks."""
+    control = {one.body: one.log_error for one in exams if one.name == CONTROL}
+    yield (
+        f"{'stress':22}{'n':>4}{'sized':>6}{'MAE %':>7}{'bias %':>8}{'moved %':>8}{'half %':>7}{'cover':>7}{'another':>8}  "
+        + (" ".join(f"{flag:>8}" for flag in FLAGS))
+    )
+    for name in STRESSES:
+        own = [one for one in exams if one.name == name]
+        sized = [one for one in own if np.isfinite(one.log_error)]
+        if not sized:
+            continue
+        error = np.expm1([one.log_error for one in sized])
+        moved = np.expm1([abs(one.log_error - control[one.body]) for one in sized if one.body in control])
+        half = np.median([one.half_width for one in sized])
+        covered, another = (sum(getattr(one, key) for one in sized) for key in ("covered", "another_covered"))
+        shares = " ".join(f"{sum(flag in one.flags for one in own):>8}" for flag in FLAGS)
+        yield (
+            f"{name:22}{len(own):>4}{len(sized):>6}{100 * np.abs(error).mean():>7.1f}{100 * error.mean():>+8.1f}"
+            f"{100 * np.nanmean(moved):>8.1f}{100 * half:>7.1f}{covered:>7}{another:>8}  {shares}"
+        )
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", choices=["simulate"])
+    parser.add_argument("step", choices=["simulate", "table"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--bodies", type=int, default=16)
     given = parser.parse_args()
-    simulate(given.folder, given.bodies)
+    if given.step == "simulate":
+        simulate(given.folder, given.bodies)
+    else:
+        print("\n".join(table(exams_in(given.folder))))
