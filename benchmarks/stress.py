@@ -193,8 +193,9 @@ class Exam:
     flags: frozenset[str]
 
 
-FLAGS = ("lag", "curved", "uneven", "skewed", "range", "no depth")
-"""Those of `mapping.assumptions`; the map outside the calibration's range; a head profile that gives no depth of fat."""
+FLAGS = ("lag", "curved", "uneven", "UNEVEN", "skewed", "range", "no depth")
+"""Those of `mapping.assumptions`, a change of the profile by whether the report asks to check it or cautions; the map
+outside the calibration's range; a head profile that gives no depth of fat."""
 
 
 def exam_of(kept: dict[str, Any]) -> Exam:
@@ -205,6 +206,7 @@ def exam_of(kept: dict[str, Any]) -> Exam:
         "lag": any("opposite" in text for text in broken_assumptions(quality)),
         "curved": any("skin of radius" in text for text in broken_assumptions(quality)),
         "uneven": bool(assumptions_to_check(quality)),
+        "UNEVEN": any("profile changes" in text for text in broken_assumptions(quality)),
         "skewed": bool(skewed(quality)),
         "range": bool(diagnostics.get("outside_calibration")),
         "no depth": diagnostics.get("fat_mm") is None,
@@ -240,10 +242,9 @@ def exams_in(folder: Path) -> list[Exam]:
 def table(exams: list[Exam]) -> Iterator[str]:
     """A line for each stress: errors, coverage, and how often each flag speaks."""
     control = {one.body: one.log_error for one in exams if one.name == CONTROL}
-    yield (
-        f"{'stress':22}{'n':>4}{'sized':>6}{'MAE %':>7}{'bias %':>8}{'moved %':>8}{'half %':>7}{'cover':>7}{'another':>8}  "
-        + (" ".join(f"{flag:>8}" for flag in FLAGS))
-    )
+    heads = f"{'n':>4}{'sized':>6}{'MAE %':>7}{'bias %':>8}{'moved %':>8}{'half %':>7}{'cover':>7}{'another':>8}  "
+    flags = " ".join(f"{flag:>8}" for flag in FLAGS)
+    yield f"{'stress':22}{heads}{flags}"
     for name in STRESSES:
         own = [one for one in exams if one.name == name]
         sized = [one for one in own if np.isfinite(one.log_error)]

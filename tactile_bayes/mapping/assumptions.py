@@ -10,6 +10,8 @@ from collections.abc import Mapping
 
 MOST_PROFILE_CHANGE = 0.01
 """Of the head profile's second order across, over 30 mm: fat that deepens by 1 mm in 20 changes it by 0.01 to 0.06."""
+BROKEN_PROFILE_CHANGE = 0.07
+"""From here on sizes of simulated bodies lay outside their intervals: 1 mm in 5, or a step of 6 mm in thin fat."""
 MOST_SKEW = 0.01
 """First order of the head profile, to one side along strokes: a friction coefficient of 0.1 gives 0.011 to 0.035."""
 MOST_CURVATURE_PER_M = 4.0
@@ -28,12 +30,12 @@ def broken_assumptions(quality: Mapping[str, float]) -> tuple[str, ...]:
     quality
         A map's figures, see `evenness.evenness_figures` and `stroke_lag.stroke_lag_figures`; missing ones say nothing.
     """
-    return tuple(text for text in (_lag(quality), _curved(quality)) if text)
+    return tuple(text for text in (_lag(quality), _curved(quality), *_uneven(quality, far=True)) if text)
 
 
 def assumptions_to_check(quality: Mapping[str, float]) -> tuple[str, ...]:
     """What differs from the calibration's bodies and moves a size by less than its interval, most often; as above."""
-    return tuple(text for text in (_uneven(quality),) if text)
+    return _uneven(quality, far=False)
 
 
 def _lag(quality: Mapping[str, float]) -> str:
@@ -59,13 +61,15 @@ def _curved(quality: Mapping[str, float]) -> str:
     )
 
 
-def _uneven(quality: Mapping[str, float]) -> str:
+def _uneven(quality: Mapping[str, float], *, far: bool) -> tuple[str, ...]:
+    """The sentence on a profile that changes so far that sizes fail, or on one that changes less."""
     change = _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE)
-    if change is None:
-        return ""
+    if change is None or (change > BROKEN_PROFILE_CHANGE) != far:
+        return ()
+    end = "the size may be off by more than its interval" if far else "the size is for even fat"
     return (
         f"the head's pressure profile changes over the map (by {change:.3f} in 30 mm): the fat is of uneven depth, or "
-        "a rib or another lump lies near; the size is for even fat"
+        f"a rib or another lump lies near; {end}",
     )
 
 

@@ -106,6 +106,8 @@ def _curvature(parts: Sequence[_Frames]) -> dict[str, float]:
 
 def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int64]) -> dict[str, float]:
     """Changes of the profile with place and stroke, by least squares over the lump-free frames."""
+    if len(rows) < LEAST_FRAMES:
+        return {}
     free = lump_free(rows[:, -1])
     if np.count_nonzero(free) < LEAST_FRAMES:
         return {}
