@@ -204,8 +204,8 @@ def exam_of(kept: dict[str, Any]) -> Exam:
     diagnostics, true = document.get("diagnostics") or {}, kept["d_mm"]
     spoken = {
         "lag": any("opposite" in text for text in broken_assumptions(quality)),
-        "curved": any("skin of radius" in text for text in broken_assumptions(quality)),
-        "uneven": bool(assumptions_to_check(quality)),
+        "curved": any("skin of radius" in text for text in assumptions_to_check(quality)),
+        "uneven": any("profile changes" in text for text in assumptions_to_check(quality)),
         "UNEVEN": any("profile changes" in text for text in broken_assumptions(quality)),
         "skewed": bool(skewed(quality)),
         "range": bool(diagnostics.get("outside_calibration")),
