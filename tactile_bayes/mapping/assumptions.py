@@ -45,8 +45,8 @@ def _lag(quality: Mapping[str, float]) -> str:
     cause = "each dragged it along" if lag > 0 else "poses came late against the frames"
     remedy = "--register-strokes" if lag > 0 else "--latency-ms auto"
     return (
-        f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size may be off "
-        f"by more than its interval; map again with {remedy}"
+        f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size may be "
+        f"off by more than its interval; map again with {remedy}"
     )
 
 
