@@ -13,6 +13,7 @@ from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.accumulate import Accumulated, accumulate
 from tactile_bayes.mapping.convention import check_convention, hint
 from tactile_bayes.mapping.engine import Engine, choose_engine
+from tactile_bayes.mapping.evenness import evenness_figures
 from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
 from tactile_bayes.mapping.head_profile import head_profile_figures
@@ -24,6 +25,7 @@ from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.quality import cell_figures, frame_figures, plane_figures, stroke_figures
 from tactile_bayes.mapping.shared_frames import shared_frame_figures
 from tactile_bayes.mapping.source import Progress, no_progress, sources_of
+from tactile_bayes.mapping.stroke_lag import stroke_lag_figures
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.mapping.thinning import every_nth
@@ -124,6 +126,7 @@ def build_map(
         figures.update(stroke_figures(strokes))
     done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
     figures.update(shared_frame_figures(sources, done.levels, done.sums))
+    figures |= evenness_figures(selections, plane) | stroke_lag_figures(sources)
     recipe = MapRecipe("scan", normalise, float(cell_mm), rules.window_kpa, late_ms, flat_field, register_strokes)
     return _as_map(done, selections, plane, recipe, figures)
 

@@ -36,6 +36,8 @@ LEAST_FRAMES = 50
 # Orders across and along the head, those of `HEAD_PROFILE` first. Odd and mixed ones take up how the head was tilted.
 # The fourth across hangs on the head's very rim: two simulations with one body differ in it by half its range.
 _ORDERS = ((2, 0), (0, 2), (0, 4), (0, 0), (4, 0), (1, 0), (0, 1), (1, 1), (2, 2))
+SKEW = _ORDERS.index((1, 0))
+"""Which of `ProfileReader.whole` is the first order across the head."""
 _HIGHEST = 4
 _COLUMNS = len(HEAD_PROFILE) + 1
 
@@ -65,7 +67,7 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
     """
     if len(rows) < LEAST_FRAMES:
         return {}
-    smooth = rows[rows[:, -1] <= SMOOTH_FACTOR * _tenth(rows[:, -1]), :-1]
+    smooth = rows[lump_free(rows[:, -1]), :-1]
     if len(smooth) < LEAST_FRAMES:
         return {}
     # Sums of whole steps have no rounding: neither the order of the frames nor a matrix product leaves a trace.
@@ -74,6 +76,19 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
         **{name: float(value) for name, value in zip(HEAD_PROFILE, mean, strict=True)},
         "head_profile_frames": float(len(smooth)),
     }
+
+
+def lump_free(left: FloatArray) -> BoolArray:
+    """(f,) which of at least two frames feel no lump, by the (f,) residuals of their smooth profiles."""
+    free: BoolArray = left <= SMOOTH_FACTOR * _tenth(left)
+    return free
+
+
+def profile_frames(part: SelectedFrames) -> NDArray[np.intp]:
+    """Frames of one scan that are read: those that are whole, at most `MOST_FRAMES` of them, in the order of time."""
+    frames = np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels))
+    marks = frame_marks(part.level_kpa[frames])
+    return frames[marks < marks_limit(marks, MOST_FRAMES)]
 
 
 def _tenth(values: FloatArray) -> float:
@@ -239,16 +254,22 @@ class ProfileReader:
             `HEAD_PROFILE`, and the root mean square of the residual of the nine terms. NaN where the array has too few
             rows or columns.
         """
+        whole = self.whole(pressure_kpa, level_kpa)
+        return np.ascontiguousarray(np.delete(whole, np.s_[len(HEAD_PROFILE) : -1], axis=1))
+
+    def whole(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
+        """(f, 10) coefficients of all nine terms over the frames' means, and residuals; otherwise as `read`."""
+        terms = len(_ORDERS)
         if not self.solve.size:
-            return np.full((len(pressure_kpa), _COLUMNS), np.nan)
+            return np.full((len(pressure_kpa), terms + 1), np.nan)
         # One matrix times vector per frame: a product of all frames would be rounded by how many there are.
         found = np.matmul(self.solve, pressure_kpa[:, :, None])[:, :, 0]
         # The residual's square by Pythagoras: the residual itself would cost as much as the map.
         fitted = np.matmul(self.gram, found[:, :, None])[:, :, 0]
         square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,fi->f", found, fitted)
         left = np.sqrt(np.maximum(square, 0.0) / self.solve.shape[1])
-        rows = np.empty((len(found), _COLUMNS))
-        rows[:, :-1], rows[:, -1] = found[:, : len(HEAD_PROFILE)], left
+        rows = np.empty((len(found), terms + 1))
+        rows[:, :-1], rows[:, -1] = found, left
         rows /= level_kpa[:, None]
         return rows
 

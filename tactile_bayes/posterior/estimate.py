@@ -9,6 +9,7 @@ import numpy as np
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
+from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
 from tactile_bayes.posterior.assessment import MapDraws
@@ -203,6 +204,8 @@ def _diagnostics(
         covered_share=made.fit.covered_share,
         coarse_cells=tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(medians[1:]),
         outside_calibration=() if calibration is None else tuple(calibration.outside(*medians)),
+        broken_assumptions=broken_assumptions(tactile_map.quality),
+        assumptions_to_check=assumptions_to_check(tactile_map.quality),
         fat_mm=None if calibration is None else calibration.fat_mm,
         method=made.draws.method,
         sampler=made.draws.diagnostics,

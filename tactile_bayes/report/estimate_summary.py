@@ -47,8 +47,7 @@ def _nothing(estimate: Estimate) -> list[str]:
 
 
 def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probability: float) -> list[str]:
-    outside = () if estimate.diagnostics is None else estimate.diagnostics.outside_calibration
-    lines = joined(outside, most=MOST_CAUTIONS, lead="CAUTION: outside the calibration's range: ")
+    lines = _cautions(estimate)
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
     table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
     lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
@@ -61,6 +60,16 @@ def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probabili
     lines += _quality(estimate, {name: quantities[name] for name in shown})
     doubts = [text.rstrip(".") for text in warnings(estimate)]
     return [*lines, *joined(doubts, most=2, lead="Check: ")]
+
+
+def _cautions(estimate: Estimate) -> list[str]:
+    """One line on broken assumptions and on a map outside the calibration's range; none without either."""
+    found = estimate.diagnostics
+    if found is None:
+        return []
+    outside = joined(found.outside_calibration, most=MOST_CAUTIONS, lead="outside the calibration's range: ")
+    texts = [*found.broken_assumptions, *(line.rstrip(".") for line in outside)]
+    return joined(texts, most=MOST_CAUTIONS, lead="CAUTION: ")
 
 
 def _lump(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:

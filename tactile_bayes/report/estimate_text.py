@@ -199,12 +199,15 @@ def _scene(estimate: Estimate) -> list[str]:
 
 
 def _cautions(estimate: Estimate) -> list[str]:
-    """Lines that must be read before any number: the map lies outside the calibration's range."""
-    return [] if estimate.diagnostics is None else range_cautions(estimate.diagnostics.outside_calibration)
+    """Lines that must be read before any number: a broken assumption, a map outside the calibration's range."""
+    found = estimate.diagnostics
+    if found is None:
+        return []
+    return [*(f"CAUTION: {text}." for text in found.broken_assumptions), *range_cautions(found.outside_calibration)]
 
 
 def warnings(estimate: Estimate) -> list[str]:
-    """Reasons why the size is less certain than its interval says: coarse cells, an unexpected level."""
+    """Reasons why the size is less certain than its interval says: coarse cells, an unexpected level, uneven fat."""
     found, lines = estimate.diagnostics, []
     if found is not None and found.coarse_cells:
         lines.append("The cells are coarse for this width: map again with a smaller --cell-mm.")
@@ -214,7 +217,8 @@ def warnings(estimate: Estimate) -> list[str]:
             f"The level about the bump is {offset:+.3f} off the fixed background: something else bears on the head "
             "(a rib, a second mass), or the lump is large for it; the size is less certain than the interval says."
         )
-    return lines
+    checks = () if found is None else found.assumptions_to_check
+    return [*lines, *(f"{text[0].upper()}{text[1:]}." for text in checks)]
 
 
 def passed_over(estimate: Estimate) -> list[str]:

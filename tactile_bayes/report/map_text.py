@@ -7,7 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from tactile_bayes.mapping.advice import advise_cell
+from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions, skewed
 from tactile_bayes.mapping.convention import CONVENTIONS
+from tactile_bayes.mapping.evenness import SPAN_MM
 from tactile_bayes.mapping.shared_frames import LEAST_SHARE
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE
@@ -115,6 +117,17 @@ def _strokes(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         across, along = (quality[f"head_profile_{axis}2"] for axis in "xy")
         frames = f"from {quality['head_profile_frames']:.0f} frames without a lump"
         yield "head profile", f"second order {across:+.3f} across, {along:+.3f} along, {frames}"
+    if "profile_change" in quality:
+        change, sd = quality["profile_change"], quality["profile_change_sd"]
+        skew = ""
+        if "stroke_skew" in quality:
+            skew = f"; skewed along the strokes by {quality['stroke_skew']:+.3f} +- {quality['stroke_skew_sd']:.3f}"
+        yield "  evenness", f"changes by {change:.3f} +- {sd:.3f} over {SPAN_MM:g} mm{skew}"
+    if "skin_curvature_per_m" in quality:
+        yield "skin", f"curved by {quality['skin_curvature_per_m']:+.1f} per m along the head's path (convex above 0)"
+    if "stroke_lag_mm" in quality:
+        lag = f"{quality['stroke_lag_mm']:+.2f} +- {quality['stroke_lag_sd_mm']:.2f} mm"
+        yield "stroke lag", f"lump ahead by {lag} along the strokes (below 0: a latency left in the poses)"
     if "flat_field_frames" in quality:
         spread = 100 * quality["flat_field_sd"]
         yield (
@@ -210,5 +223,8 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
         yield f"check the quaternions: {other}, face and motion would agree to {agreement:.3f}; widths may be wrong"
     elif "normal_agreement" not in quality and "plane_rms_mm" in quality:
         yield "the motion does not tell whether the quaternions are scalar first and from sensor to base: check them"
+    yield from (*broken_assumptions(quality), *assumptions_to_check(quality))
+    if text := skewed(quality):
+        yield text
     if quality.get("yaw_sd_deg", 0.0) > _HIGH_YAW_DEG:
         yield "the head was turned while scanning: widths across and along it are mixed"

@@ -96,6 +96,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
         "detected_probability": document["detected_probability"],
         "log_size": _round(pooled.centres[index]) if index in pooled.centres else None,
         "outlying": index in pooled.outlying,
+        "broken_assumptions": list(document["diagnostics"].get("broken_assumptions", [])),
     }
 
 
@@ -103,7 +104,7 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
     """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
     outside = document["outside_calibration"]
     lines = [*_bodies(document), *joined(outside, most=2, lead="CAUTION: outside the calibration's range: ")]
-    lines += _maps_lines(document["maps"])
+    lines += joined(_broken(document["maps"]), most=1, lead="CAUTION: ") + _maps_lines(document["maps"])
     if document["status"] == "no_estimate":
         lines.append(f"No estimate: {document['reason']}.")
     else:
@@ -127,9 +128,17 @@ def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines + joined(rises, most=1, lead="")
 
 
+def _broken(maps: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Broken assumptions of the maps in which a lump was found, with the map's name."""
+    found = [one for one in maps if one["log_size"] is not None]
+    return [f"{one['map']}: {text}" for one in found for text in one["broken_assumptions"]]
+
+
 def pooled_text(document: Mapping[str, Any]) -> str:
     """Full report of a mass."""
-    lines = [*_bodies(document), *range_cautions(document["outside_calibration"]), *map(_map_line, document["maps"])]
+    lines = [*_bodies(document), *range_cautions(document["outside_calibration"])]
+    lines += [f"CAUTION: {text}." for text in _broken(document["maps"])]
+    lines += [_map_line(one) for one in document["maps"]]
     lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"

@@ -128,6 +128,34 @@ def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show(
     assert whole.count("Another rise stands at") == 9
 
 
+def test_a_broken_assumption_stands_first_and_one_to_check_after_the_size() -> None:
+    full, quantities = crowded()
+    assert full.diagnostics is not None
+    words = {"broken_assumptions": ("the lump lags",), "assumptions_to_check": ("the skin is curved",)}
+    marked = replace(full, diagnostics=replace(full.diagnostics, **words))
+    short = estimate_summary(marked, quantities, probability=0.9).splitlines()
+    assert short[0].startswith("CAUTION: the lump lags; outside the calibration's range: reason 0; ")
+    assert len(short) <= MOST_LINES
+    assert any(line.startswith("Check: ") for line in short)
+    whole = estimate_text(marked, MAPS["clear.nc"], probability=0.9).splitlines()
+    assert whole[0] == "CAUTION: the lump lags."
+    assert "The skin is curved." in whole[1:]
+    # the control: an even scan's report has neither
+    for line in estimate_text(full, MAPS["clear.nc"], probability=0.9).splitlines():
+        assert not line.startswith(("CAUTION: the", "The skin"))
+
+
+def test_a_pool_names_the_map_whose_strokes_see_the_lump_apart(folder: Path) -> None:
+    lagging = replace(MAPS["again.nc"], quality={"stroke_lag_mm": 3.0, "stroke_lag_sd_mm": 0.1})
+    write_map(folder / "lagging.nc", lagging, provenance=Provenance("import", {}))
+    for more in ((), ("-v",)):
+        words = ("--pool", "--method", "laplace", *more)
+        text = run_here("estimate", "clear.nc", "lagging.nc", *words, cwd=folder).stdout
+        assert "CAUTION: lagging.nc: strokes in opposite directions see the lump some 6 mm apart" in text
+        assert "CAUTION: clear.nc" not in text
+        assert "CAUTION" not in run_here("estimate", "clear.nc", "again.nc", *words, cwd=folder).stdout
+
+
 def test_a_calibration_is_named_whole_whatever_its_name_holds() -> None:
     """A file "size (2).json" was called "size": the name was cut at the first bracket."""
     full, quantities = crowded()

@@ -74,6 +74,24 @@ def surface_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArra
     -------
     (n,) array
         :math:`2(1-\nu^2)/(E k)` for a half-space.
+    """
+    return np.asarray(skin_flexibility(wave_number, body)[:, 1, 1], dtype=np.float64)
+
+
+def skin_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArray:
+    r"""Displacements of the skin under shear and pressure of one wave number, in mm per kPa.
+
+    Parameters
+    ----------
+    wave_number : (n,) array
+        k in 1/mm, above 0.
+
+    Returns
+    -------
+    (n, 2, 2) array
+        From the factors of a radial shear traction :math:`J_1(kr)` and a pressure :math:`J_0(kr)` to those of the
+        radial displacement and the sinking. Entry (1, 0), sinking under shear, is :math:`-(1-2\nu)(1+\nu)/(E k)` for a
+        half-space.
 
     Notes
     -----
@@ -96,7 +114,7 @@ def surface_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArra
             lower = stiffness[:, 2:, 2:] + below
             below = np.asarray(upper - across @ np.linalg.solve(lower, stiffness[:, 2:, :2]), dtype=np.float64)
     assert below is not None
-    return np.asarray(np.linalg.inv(below)[:, 1, 1], dtype=np.float64)
+    return np.asarray(np.linalg.inv(below), dtype=np.float64)
 
 
 def _waves(depth: FloatArray, nu: float) -> tuple[FloatArray, FloatArray]:

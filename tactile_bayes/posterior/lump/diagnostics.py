@@ -68,6 +68,10 @@ class Diagnostics:
         Name of the calibration that gave the size, in words; not in the JSON.
     size_calibration
         Which calibration gave the size and what it cannot know, in words.
+    broken_assumptions
+        What in the scan may put the size outside its interval, in words, see `mapping.assumptions`.
+    assumptions_to_check
+        What in it differs from the calibration's bodies, in words.
     convergence
         Of chains: R-hat, effective draws and Monte-Carlo errors of each size and width, see `arviz_data.convergence`.
     """
@@ -82,6 +86,8 @@ class Diagnostics:
     noise: NoiseFigures
     calibration: str = ""
     size_calibration: str = ""
+    broken_assumptions: tuple[str, ...] = ()
+    assumptions_to_check: tuple[str, ...] = ()
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
@@ -94,6 +100,8 @@ class Diagnostics:
             "covered_share": self.covered_share,
             "coarse_cells": self.coarse_cells,
             "outside_calibration": list(self.outside_calibration),
+            "broken_assumptions": list(self.broken_assumptions),
+            "assumptions_to_check": list(self.assumptions_to_check),
             "fat_mm": self.fat_mm,
             **self.sampler,
             **self.noise.as_dict(),

@@ -15,6 +15,7 @@ from tactile_bayes.forward.plane.layers import surface_transfer
 from tactile_bayes.forward.solid.layers import (
     LayeredBody,
     layering_compliance,
+    skin_flexibility,
     square_compliance,
     surface_flexibility,
     taxel_compliance,
@@ -134,3 +135,15 @@ def test_a_body_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(BadDataError, match=words):
         LayeredBody(moduli, thicknesses, nu)
+
+
+def test_shear_sinks_a_half_space_ahead_by_the_closed_form_and_shears_what_pressure_sinks() -> None:
+    """Johnson (1985) eq. 3.75 in wave numbers; by Betti's theorem the matrix is symmetric up to the waves' signs."""
+    found = skin_flexibility(WAVES, LayeredBody((5.0,), (), 0.3))
+    np.testing.assert_allclose(found[:, 1, 0], -(1 - 2 * 0.3) * (1 + 0.3) / (5.0 * WAVES), rtol=1e-9)
+    layered = skin_flexibility(WAVES, BREAST)
+    np.testing.assert_allclose(layered[:, 0, 1], layered[:, 1, 0], rtol=1e-7, atol=1e-12)
+    # the control: an incompressible half-space does not sink under shear, a layered body does
+    rubber = skin_flexibility(WAVES, LayeredBody((5.0,), (), 0.5))
+    assert np.abs(rubber[:, 1, 0]).max() < 1e-9 * np.abs(rubber[:, 1, 1]).max()
+    assert np.abs(layered[:, 1, 0]).max() > 1e-3 * np.abs(layered[:, 1, 1]).max()
