@@ -12,6 +12,7 @@ SECTIONS = {
     "Trial (CSV)": "trial.table.json",
     "Excision (CSV)": "excision.table.json",
     "Size table (CSV)": "size_table.table.json",
+    "Phantom maps (CSV)": "phantom_maps.table.json",
     "Study grid (CSV)": "study_grid.table.json",
     "Measured frames (CSV)": "measured_frames.table.json",
     "Population (CSV)": "population.table.json",

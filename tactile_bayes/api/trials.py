@@ -103,6 +103,7 @@ def calibrate_size(
     table: PathLike | pandas.DataFrame,
     *,
     form: str = "eq6",
+    correct: PathLike | None = None,
     fit: str = "joint",
     least_stiffness_ratio: float = 0.0,
     seed: int = 1,
@@ -118,6 +119,8 @@ def calibrate_size(
         A row for each lump: d_mm, amplitude, sigma_x_mm...; or a table of `population`, a row for each exam.
     form
         ``"eq6"`` as printed; ``"log-quadratic"`` or ``"gaussian-process"`` for a table of `population`.
+    correct
+        Name or path of a calibration over bodies that the table's lumps correct; the table may also list map files.
     fit
         Eq 6 of lumps: ``"joint"``, the posterior from all rows, or ``"two-stage"``, the paper's.
     least_stiffness_ratio
@@ -145,6 +148,7 @@ def calibrate_size(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_body_calibration, write_size_calibration
     from tactile_bayes.files.tables import read_table
+    from tactile_bayes.pipeline.site_correction import correct_size
     from tactile_bayes.pipeline.size_calibration import FORMS, is_population, learn_eq6, learn_population
 
     if form not in FORMS:
@@ -152,13 +156,21 @@ def calibrate_size(
     if fit not in ("joint", "two-stage"):
         raise TypeError(f"fit is {fit!r}; it is 'joint' or 'two-stage'")
     source = _table(table, "table")
-    inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
-    over_bodies_alone = form != "eq6" or is_population(source)
+    over_bodies_alone = form != "eq6" or (correct is None and is_population(source))
     names = ("normalise",) if over_bodies_alone else ("normalise", "background", "fit_radius_mm", "noise")
     for name in declared:
         if name not in names:
             what = f"form {form!r} and this table"
             raise TypeError(f"calibrate_size has no setting {name!r} for {what}; it has {', '.join(names)}")
+    given = {name: declared.get(name) for name in names}
+    if correct is not None:
+        if form != "eq6" or fit != "joint" or least_stiffness_ratio:
+            raise TypeError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
+        corrected = correct_size(source, str(correct), given, seed=seed)
+        if path is not None:
+            corrected.write(path_of(path), force=force)
+        return corrected.calibration
+    inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
     if over_bodies_alone:
         if fit != "joint":
             raise TypeError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
@@ -170,7 +182,6 @@ def calibrate_size(
             write_body_calibration(path_of(path), over_bodies, provenance=provenance, force=force)
         return over_bodies
     rows = read_table(source, "size_table.table.json")
-    given = {name: declared.get(name) for name in names}
     learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)
     if path is not None:
         provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)

@@ -9,7 +9,7 @@ import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 if TYPE_CHECKING:
@@ -34,6 +34,12 @@ def command() -> None:
     default="eq6",
     show_default=True,
     help="eq6: as printed, from a table of lumps, or of bodies made by `population`; the others: of bodies only.",
+)
+@click.option(
+    "--correct",
+    metavar="CALIBRATION",
+    help="Correct this calibration (solid, solid-mean, eq6 or a file learned over bodies) by the table's lumps instead "
+    "of learning one.",
 )
 @click.option(
     "--fit",
@@ -87,6 +93,7 @@ def size(
     table: Path,
     output: Path,
     form: PopulationForm,
+    correct: str | None,
     fit: EqSixFit,
     normalise: str | None,
     background: str | None,
@@ -123,6 +130,11 @@ def size(
     ln sigma and that pressure profile, with a spread between bodies that is wide for deep, faint and soft lumps; it is
     the form of the shipped `solid`. A map without the profile gets the log-quadratic.
 
+    --correct keeps a calibration and learns from 3 lumps or more, better 5 to 20, by how much sizes at this site
+    differ from it: few lumps change it little, and the uncertainty of the correction goes into every size. TABLE.csv
+    has the columns above, with depth_ratio, seat and stiffness_ratio where they are known, and phantom where a lump has
+    several maps; or it lists map files: file, d_mm and the same. The maps must be made as the calibration's.
+
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
     from tactile_bayes.commands.progress import progress_bar
@@ -136,11 +148,15 @@ def size(
 
     for path in filter(None, (output, figure)):
         refuse_existing(path, force=force)
+    declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
+    if correct is not None:
+        _refuse_with_correct(ctx)
+        click.echo(_corrected(table, output, correct, declared, seed=seed, force=force), nl=False)
+        return
     if form != "eq6" or is_population(table):
         _refuse_declared(ctx)
         click.echo(_over_bodies(table, output, form, normalise, force=force), nl=False)
         return
-    declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     rows = read_table(table, "size_table.table.json")
     with progress_bar("effective draws") as progress:
         learned = learn_eq6(
@@ -159,6 +175,29 @@ def size(
         other_fit=learned.other_fit,
     )
     click.echo(words, nl=False)
+
+
+def _refuse_with_correct(ctx: click.Context) -> None:
+    from tactile_bayes.errors import UsageError
+
+    for name in ("form", "fit", "least_stiffness_ratio", "figure"):
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option} is for learning a calibration; leave it out with --correct")
+
+
+def _corrected(
+    table: Path, output: Path, base: str, declared: dict[str, str | float | None], *, seed: int, force: bool
+) -> str:
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.pipeline.site_correction import correct_size
+    from tactile_bayes.report.site_text import site_calibration_text
+
+    with progress_bar("maps") as progress:
+        found = correct_size(table, base, declared, seed=seed, progress=progress)
+    also_read(*found.inputs.values())
+    found.write(output, force=force)
+    return site_calibration_text(found.calibration)
 
 
 def _refuse_declared(ctx: click.Context) -> None:

@@ -134,6 +134,8 @@ def estimate_one(
     NotConvergedError
         When the method asked for does not converge.
     """
+    import math
+
     import numpy as np
 
     from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -143,7 +145,8 @@ def estimate_one(
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
     from tactile_bayes.posterior.other_rises import other_rises
     from tactile_bayes.report.population_text import calibration_line
-    from tactile_bayes.size.body_calibration import mean_width_mm
+    from tactile_bayes.report.site_text import site_words
+    from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
 
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
@@ -171,8 +174,10 @@ def estimate_one(
     if posterior is not None and used is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
         by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"
-        widths = posterior.medians[1:]
-        words = calibration_line(by, used, sigma_mm=mean_width_mm(*widths))
+        sigma_mm = mean_width_mm(*posterior.medians[1:])
+        if isinstance(used, BodyCalibration) and used.site is not None:
+            by += f" ({site_words(used.site, math.log(sigma_mm))})"
+        words = calibration_line(by, used, sigma_mm=sigma_mm)
         assert estimate.diagnostics is not None
         diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words)
         estimate = replace(estimate, diagnostics=diagnostics)
@@ -348,11 +353,11 @@ def answer_of(outcome: Outcome) -> Answer:
     text = estimate_summary(estimate, quantities, probability=settings.interval)
     full_text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
-    shape, normalise = _shape(tactile_map, estimate), tactile_map.recipe.normalise
+    shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
     return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)
 
 
-def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
+def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
     import math
 

@@ -12,6 +12,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
+from tactile_bayes.report.site_text import site_words
 from tactile_bayes.report.size_text import (
     SIZE_DECIMALS,
     decimals,
@@ -64,6 +65,7 @@ def pooled_document(
         "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
         "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
+        "site": None if used.site is None else site_words(used.site),
         "outside_calibration": list(pooled.outside),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
@@ -108,7 +110,8 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         largest, spread = document["max_size_mm"], document["figures"]["between_map_sd"]
         lines += _table(document) + width_lines(document["variance_share"])
         ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
-        lines.append(f"Quality: {ends}the maps of this mass differ by {100 * spread:.0f} %.")
+        by = f"sizes by {document['site']}; " if document["site"] else ""
+        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %.")
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
@@ -137,6 +140,8 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
     lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
+    if document["site"]:
+        lines.append(f"Sizes by {document['site']}.")
     if document["left_out"]:
         lines.append(f"Left out: {'; '.join(document['left_out'])}.")
     if document["reason"]:

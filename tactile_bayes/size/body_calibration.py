@@ -31,6 +31,7 @@ from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import FatTerms
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
 from tactile_bayes.size.polynomials import monomials
+from tactile_bayes.size.site_shift import SiteShift
 
 UNLIKE = "is unlike any body of the table"
 SPREAD_PARAMETERS = ("log_body_sd", "body_sd_slope", "log_exam_sd")
@@ -76,6 +77,8 @@ class BodyCalibration:
         Why the depth is not used though the calibration could; empty otherwise.
     any_depth
         Of a calibration for one depth, that for any.
+    site
+        Correction by a site's own phantoms; `pooling` adds it, no method of this class does.
     """
 
     centre: tuple[float, float]
@@ -94,6 +97,7 @@ class BodyCalibration:
     fat_mm: float | None = None
     fat_note: str = ""
     any_depth: BodyCalibration | None = None
+    site: SiteShift | None = None
 
     def __post_init__(self) -> None:
         k = self.coefficients + len(self.spread_powers) + 1

@@ -25,6 +25,7 @@ from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, turned
 from tactile_bayes.size.posterior import SizePosterior, shares
+from tactile_bayes.size.site_shift import site_log_shift, site_slope, site_variance
 
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
@@ -120,6 +121,12 @@ class ShapeDraws:
         return replace(self, **drawn, labels=None)
 
 
+def corrected_log_size(calibration: BodyCalibration, shape: ShapeDraws) -> FloatArray:
+    """(n,) ln d of a map's draws without B and E, with the site's correction where there is one."""
+    size = calibration.log_size(shape.log_amplitude, shape.log_width)
+    return size + site_log_shift(calibration.site, shape.log_width)
+
+
 def pooled_size(
     maps: Sequence[ShapeDraws],
     *,
@@ -151,8 +158,8 @@ def pooled_size(
     """
     calibration = calibration.at_fat([one.profile for one in maps])
     used, replicates = _matched(maps, number, rng)
-    by_map = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
-    log_size = by_map if used is maps else [calibration.log_size(m.log_amplitude, m.log_width) for m in maps]
+    by_map = np.stack([corrected_log_size(calibration, m) for m in used])
+    log_size = by_map if used is maps else [corrected_log_size(calibration, m) for m in maps]
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
     oval, slope = _elongation(maps, calibration, priors.shape)
     points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
@@ -246,6 +253,7 @@ class _Pool:
             "between_maps": np.sum(weight**2, axis=0) * tau**2,
             "calibration": error,
             "body": (left * body_sd) ** 2,
+            **site_variance(self.calibration.site, middle_width),
         }
 
     def _evened(
@@ -342,8 +350,7 @@ def pool_maps(
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     centres = {
-        i: float(np.nanmean(calibration.log_size(shape.log_amplitude, shape.log_width)))
-        for i, shape in zip(found, used, strict=True)
+        i: float(np.nanmean(corrected_log_size(calibration, shape))) for i, shape in zip(found, used, strict=True)
     }
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
@@ -383,6 +390,7 @@ def _elongation(
         excess += both.mean(axis=0) / k
         covariance += np.cov(both.T) / k**2
         slope += float(np.nanmean(calibration.width_slope(m.log_amplitude, m.log_width))) / k
+    slope += site_slope(calibration.site)
     balls = calibration.round_lumps
     covariance += (balls.body_sd**2 + balls.exam_sd**2 / k + 1e-12) * np.eye(2)
     return elongation(excess, covariance, slope=slope, prior=prior), slope

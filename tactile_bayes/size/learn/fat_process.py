@@ -1,8 +1,9 @@
 r"""Learning of the Gaussian process over a population's maps, see `size.fat_process`.
 
-Given the kernel and the spread of B, the coefficients have a normal posterior in closed form, and with them the
-evidence of the bodies' means. Its maximum, with weak priors, gives the kernel's lengths and scale and the coefficients
-of ln SD(B) (Rasmussen & Williams 2006, sec. 5.4.1). The spread between exams comes from how the exams of one body
+Given the kernel and the spread of B, the coefficients have a normal posterior in closed form, and with them a lower
+bound of the evidence of the bodies' means: less than the evidence by what the points do not explain of the process, so
+that lengths too short for the points do not pay (Titsias 2009, eq. 9). Its maximum, with weak priors, gives the
+kernel's lengths and scale and the coefficients of ln SD(B). The spread between exams comes from how the exams of one body
 differ, as in `regression`.
 """
 
@@ -92,6 +93,7 @@ class Fitted:
     variance : (b,) array
         Of each body's mean ln d about the process.
     log_evidence
+        Lower bound of the log evidence, without what no parameter changes.
     """
 
     kernel: Kernel
@@ -206,6 +208,8 @@ def given(rows: ProcessRows, points: FloatArray, theta: FloatArray, *, exam_sd: 
     mean = covariance @ (scaled.T @ left)
     misfit = left @ left - mean @ (scaled.T @ left)
     evidence = -0.5 * misfit - 0.5 * np.log(variance).sum() - np.log(np.diag(factor)).sum()
+    unexplained = kernel.scale**2 - np.sum(terms[:, len(LINEAR_POWERS) :] ** 2, axis=1)
+    evidence -= 0.5 * np.sum(np.maximum(unexplained, 0.0) / variance)
     return Fitted(kernel, theta[k + 1 :], mean, covariance, terms, variance, float(evidence))
 
 
