@@ -122,7 +122,8 @@ class BodyCalibration:
         log_depth, why_not = fat.log_depth(profiles)
         if log_depth is None:
             return replace(self, with_fat=None, fat_note=why_not)
-        return fat.at(self, log_depth, profiles)
+        found: BodyCalibration = fat.at(self, log_depth, profiles)
+        return found
 
     def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> BodyCalibration:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth.

@@ -23,7 +23,7 @@ from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
 from tactile_bayes.size.polynomials import monomials, powers
 
 if TYPE_CHECKING:
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from _typeshed import DataclassInstance
 
 ORDER = 3
 POWERS = tuple((i, j, k) for k in range(ORDER + 1) for i, j in powers(ORDER - k))
@@ -156,16 +156,16 @@ class FatTerms:
 
     def at(
         self,
-        base: BodyCalibration,
+        base: DataclassInstance,
         log_depth: float,
         profiles: Sequence[tuple[float, ...] | None],  # noqa: ARG002, for forms that depend on it
-    ) -> BodyCalibration:
-        """The calibration for one depth of fat, and one profile where the form depends on it.
+    ) -> Any:
+        """The `BodyCalibration` for one depth of fat, and one profile where the form depends on it.
 
         Parameters
         ----------
         base
-            The calibration for any depth.
+            The `BodyCalibration` for any depth.
         log_depth
             ln F of the mass.
         profiles
@@ -173,7 +173,7 @@ class FatTerms:
         """
         return replace(base, **self.fields_at(base, log_depth))
 
-    def fields_at(self, base: BodyCalibration, log_depth: float) -> dict[str, Any]:
+    def fields_at(self, base: DataclassInstance, log_depth: float) -> dict[str, Any]:
         """The fields in which the calibration for one depth differs from `base`."""
         whole = _block_diagonal(self.contraction(log_depth), self._contracted(self.spread_powers, log_depth), np.eye(1))
         of_features, hidden = self.feature_contraction(log_depth), self.hidden

@@ -28,6 +28,8 @@ from tactile_bayes.size.polynomials import monomials, powers
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from _typeshed import DataclassInstance
+
 AT_ONE_DEPTH = ((0, 0), (1, 0), (0, 1))
 """Powers of u and v in the part without the process, at one depth of fat."""
 LINEAR_POWERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
@@ -142,8 +144,8 @@ class FatProcess(FatTerms):
         return whole
 
     def at(
-        self, base: BodyCalibration, log_depth: float, profiles: Sequence[tuple[float, ...] | None]
-    ) -> BodyCalibration:
+        self, base: DataclassInstance, log_depth: float, profiles: Sequence[tuple[float, ...] | None]
+    ) -> ProcessAtProfile:
         """The calibration at the mean of the profiles."""
         fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
         profile = (self.alike(profiles).mean(axis=0) - self.depth.centre) / self.depth.scale

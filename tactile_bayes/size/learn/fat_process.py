@@ -3,8 +3,8 @@ r"""Learning of the Gaussian process over a population's maps, see `size.fat_pro
 Given the kernel and the spread of B, the coefficients have a normal posterior in closed form, and with them a lower
 bound of the evidence of the bodies' means: less than the evidence by what the points do not explain of the process, so
 that lengths too short for the points do not pay (Titsias 2009, eq. 9). Its maximum, with weak priors, gives the
-kernel's lengths and scale and the coefficients of ln SD(B). The spread between exams comes from how the exams of one body
-differ, as in `regression`.
+kernel's lengths and scale and the coefficients of ln SD(B). The spread between exams comes from how the exams of one
+body differ, as in `regression`.
 """
 
 from __future__ import annotations
