@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.presets import HEAD_RADIUS_MM, LEAST_HARD_RATIO
+from tactile_bayes.presets import LEAST_HARD_RATIO
 
 if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet, Table
@@ -147,7 +147,7 @@ def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Ma
 
     rows = read_table(source, "size_table.table.json")
     _check_recipe(rows, calibration, declared)
-    _check_head(rows)
+    _check_head(rows, calibration)
     columns, maps, left_out = rows.columns, [], []
     for i, name in enumerate(_names(rows, [f"line {line}" for line in rows.line_numbers])):
         if columns["sigma_y_mm"][i] is None:
@@ -247,6 +247,7 @@ def _check_recipe(rows: Table, calibration: BodyCalibration, declared: Mapping[s
         radius_mm=recipe.radius_mm,
         noise=recipe.noise,
         flat_field=recipe.flat_field,
+        head=recipe.head,
     )
     if differs:
         raise BadDataError(
@@ -256,9 +257,13 @@ def _check_recipe(rows: Table, calibration: BodyCalibration, declared: Mapping[s
         )
 
 
-def _check_head(rows: Table) -> None:
-    """Refuse a table of maps from another head than that of the simulated bodies."""
+def _check_head(rows: Table, calibration: BodyCalibration) -> None:
+    """Refuse a table of maps from a head with another radius than the calibration's, where it names no more of it."""
+    head = calibration.recipe.head
+    if head is None:
+        return
+    ours = "that is flat" if head.radius_mm is None else f"with a radius of {head.radius_mm:g} mm"
     for i, radius_mm in enumerate(rows.columns["head_radius_mm"]):
-        if radius_mm is not None and radius_mm != HEAD_RADIUS_MM:
-            what = f"is {radius_mm:g}, and the calibration is for a head with a radius of {HEAD_RADIUS_MM:g} mm"
+        if radius_mm is not None and head.differences(replace(head, radius_mm=radius_mm)):
+            what = f"is {radius_mm:g}, and the calibration is for a head {ours}"
             raise rows.error(i, "head_radius_mm", what, way_out="learn a calibration for this head")
