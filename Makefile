@@ -49,14 +49,14 @@ bench-trial: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check statsmodels pingouin
 	$(BIN)/python -m benchmarks.trial
 
-# The size calibrations that come with the program, made again: an hour on two cores for each population's scans.
+# The size calibrations that come with the program, made again: an hour and a half on two cores for the population's scans.
 calibrations: $(VENV)/.installed
 	mkdir -p build
 	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 1500 --centred 750 --seed 7 --workers 2 \
 		--normalise gain --normalise mean -o build/population.csv --force
-	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise gain --form log-quadratic \
+	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise gain --form gaussian-process \
 		-o tactile_bayes/calibrations/solid.json --force
-	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise mean --form log-quadratic \
+	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise mean --form gaussian-process \
 		-o tactile_bayes/calibrations/solid_mean.json --force
 	$(BIN)/tactile-bayes calibrate size build/population.csv --normalise gain --form eq6 \
 		-o tactile_bayes/calibrations/eq6.json --force

@@ -271,7 +271,8 @@ def _read_tomls(path: Path) -> object:
 
 
 def _read_jsons(path: Path) -> object:
-    from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
+    from tactile_bayes.files.head_json import read_head_geometry
+    from tactile_bayes.files.instrument_json import read_array_calibration, read_landmarks
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.files.size_posterior import read_stated_size
 

@@ -12,9 +12,12 @@ SECTIONS = {
     "Trial (CSV)": "trial.table.json",
     "Excision (CSV)": "excision.table.json",
     "Size table (CSV)": "size_table.table.json",
+    "Phantom maps (CSV)": "phantom_maps.table.json",
     "Study grid (CSV)": "study_grid.table.json",
     "Measured frames (CSV)": "measured_frames.table.json",
     "Population (CSV)": "population.table.json",
+    "Head (JSON)": "head.schema.json",
+    "Bodies of population (TOML)": "bodies.schema.json",
     "Scene (TOML)": "scene.schema.json",
     "Settings of estimate (TOML)": "settings.schema.json",
     "Session (TOML)": "scan_session.schema.json",
@@ -84,7 +87,7 @@ def _value(rule: Mapping[str, Any]) -> str:
     if "anyOf" in rule:
         return " or ".join(_value(one) for one in rule["anyOf"])
     if "const" in rule:
-        return str(rule["const"])
+        return "null" if rule["const"] is None else str(rule["const"])
     if "enum" in rule:
         return " or ".join(str(one) for one in rule["enum"])
     if rule.get("type") == "array":

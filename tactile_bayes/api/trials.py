@@ -103,6 +103,7 @@ def calibrate_size(
     table: PathLike | pandas.DataFrame,
     *,
     form: str = "eq6",
+    correct: PathLike | None = None,
     fit: str = "joint",
     least_stiffness_ratio: float = 0.0,
     seed: int = 1,
@@ -117,7 +118,9 @@ def calibrate_size(
     table
         A row for each lump: d_mm, amplitude, sigma_x_mm...; or a table of `population`, a row for each exam.
     form
-        ``"eq6"`` as printed, or ``"log-quadratic"`` for a table of `population`.
+        ``"eq6"`` as printed; ``"log-quadratic"`` or ``"gaussian-process"`` for a table of `population`.
+    correct
+        Name or path of a calibration over bodies that the table's lumps correct; the table may also list map files.
     fit
         Eq 6 of lumps: ``"joint"``, the posterior from all rows, or ``"two-stage"``, the paper's.
     least_stiffness_ratio
@@ -127,7 +130,8 @@ def calibrate_size(
     path
         Also write the calibration there.
     **declared
-        Eq 6: normalise, background, fit_radius_mm, noise of the table's maps, where it does not say.
+        Eq 6: normalise, background, fit_radius_mm, noise of the table's maps, where it does not say. Of a table of
+        `population`, normalise: which rows to learn from.
 
     Returns
     -------
@@ -144,28 +148,40 @@ def calibrate_size(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_body_calibration, write_size_calibration
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.pipeline.size_calibration import is_population, learn_eq6, learn_population
+    from tactile_bayes.pipeline.site_correction import correct_size
+    from tactile_bayes.pipeline.size_calibration import FORMS, is_population, learn_eq6, learn_population
 
-    names = ("normalise", "background", "fit_radius_mm", "noise")
-    for name in declared:
-        if name not in names or form != "eq6":
-            raise TypeError(f"calibrate_size has no setting {name!r} for form {form!r}; Eq 6 has {', '.join(names)}")
-    if form not in ("eq6", "log-quadratic"):
-        raise TypeError(f"form is {form!r}; it is 'eq6' or 'log-quadratic'")
+    if form not in FORMS:
+        raise TypeError(f"form is {form!r}; it is one of {', '.join(FORMS)}")
     if fit not in ("joint", "two-stage"):
         raise TypeError(f"fit is {fit!r}; it is 'joint' or 'two-stage'")
     source = _table(table, "table")
+    over_bodies_alone = form != "eq6" or (correct is None and is_population(source))
+    names = ("normalise",) if over_bodies_alone else ("normalise", "background", "fit_radius_mm", "noise")
+    for name in declared:
+        if name not in names:
+            what = f"form {form!r} and this table"
+            raise TypeError(f"calibrate_size has no setting {name!r} for {what}; it has {', '.join(names)}")
+    given = {name: declared.get(name) for name in names}
+    if correct is not None:
+        if form != "eq6" or fit != "joint" or least_stiffness_ratio:
+            raise TypeError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
+        corrected = correct_size(source, str(correct), given, seed=seed)
+        if path is not None:
+            corrected.write(path_of(path), force=force)
+        return corrected.calibration
     inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
-    if form == "log-quadratic" or is_population(source):
+    if over_bodies_alone:
         if fit != "joint":
             raise TypeError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
-        over_bodies, settings = learn_population(read_table(source, "population.table.json"), form)
+        over_bodies, settings = learn_population(
+            read_table(source, "population.table.json"), form, declared.get("normalise")
+        )
         if path is not None:
             provenance = Provenance("calibrate size", settings, inputs)
             write_body_calibration(path_of(path), over_bodies, provenance=provenance, force=force)
         return over_bodies
     rows = read_table(source, "size_table.table.json")
-    given = {name: declared.get(name) for name in names}
     learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)
     if path is not None:
         provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)

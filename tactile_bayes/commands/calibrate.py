@@ -9,13 +9,13 @@ import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
 from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.presets import FIT_RADIUS_MM, NOISE, NORMALISE
 
 if TYPE_CHECKING:
     from datetime import datetime
 
-    from tactile_bayes.pipeline.size_calibration import EqSixFit
+    from tactile_bayes.pipeline.size_calibration import EqSixFit, PopulationForm
 
 _FILE = FilePath()
 
@@ -30,10 +30,16 @@ def command() -> None:
 @click.option("-o", "--output", required=True, metavar="SIZE.json", type=_FILE, help="Where to write the calibration.")
 @click.option(
     "--form",
-    type=click.Choice(["eq6", "log-quadratic"]),
+    type=click.Choice(["eq6", "log-quadratic", "gaussian-process"]),
     default="eq6",
     show_default=True,
-    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; log-quadratic: of bodies only.",
+    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; the others: of bodies only.",
+)
+@click.option(
+    "--correct",
+    metavar="CALIBRATION",
+    help="Correct this calibration (solid, solid-mean, eq6 or a file learned over bodies) by the table's lumps instead "
+    "of learning one.",
 )
 @click.option(
     "--fit",
@@ -86,7 +92,8 @@ def size(
     /,
     table: Path,
     output: Path,
-    form: str,
+    form: PopulationForm,
+    correct: str | None,
     fit: EqSixFit,
     normalise: str | None,
     background: str | None,
@@ -115,11 +122,18 @@ def size(
     head_radius_mm vary in it, the report tells what each does to the size that Eq 6 gives, and how much of its scatter
     would go if it were known; `estimate` does not use that.
 
-    From a table of `population`, which has a row for each exam of a body, either form tells apart what differs between
+    From a table of `population`, which has a row for each exam of a body, every form tells apart what differs between
     bodies and between exams of one body. `population` made the maps: nothing is declared, and --normalise chooses among
     a table's rows. From the pressure over the
     head where it felt no lump it also learns how deep the fat is, and sizes that go with it. The log-quadratic form is
-    ln d as a quadratic in ln a and ln sigma, or a cubic with the depth of fat.
+    ln d as a quadratic in ln a and ln sigma, or a cubic with the depth of fat. The Gaussian process takes ln a,
+    ln sigma and that pressure profile, with a spread between bodies that is wide for deep, faint and soft lumps; it is
+    the form of the shipped `solid`. A map without the profile gets the log-quadratic.
+
+    --correct keeps a calibration and learns from 3 lumps or more, better 5 to 20, by how much sizes at this site
+    differ from it: few lumps change it little, and the uncertainty of the correction goes into every size. TABLE.csv
+    has the columns above, with depth_ratio, seat and stiffness_ratio where they are known, and phantom where a lump has
+    several maps; or it lists map files: file, d_mm and the same. The maps must be made as the calibration's.
 
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
@@ -134,11 +148,15 @@ def size(
 
     for path in filter(None, (output, figure)):
         refuse_existing(path, force=force)
-    if form == "log-quadratic" or is_population(table):
+    declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
+    if correct is not None:
+        _refuse_with_correct(ctx)
+        click.echo(_corrected(table, output, correct, declared, seed=seed, force=force), nl=False)
+        return
+    if form != "eq6" or is_population(table):
         _refuse_declared(ctx)
         click.echo(_over_bodies(table, output, form, normalise, force=force), nl=False)
         return
-    declared = {"normalise": normalise, "background": background, "fit_radius_mm": fit_radius_mm, "noise": noise}
     rows = read_table(table, "size_table.table.json")
     with progress_bar("effective draws") as progress:
         learned = learn_eq6(
@@ -159,6 +177,29 @@ def size(
     click.echo(words, nl=False)
 
 
+def _refuse_with_correct(ctx: click.Context) -> None:
+    from tactile_bayes.errors import UsageError
+
+    for name in ("form", "fit", "least_stiffness_ratio", "figure"):
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option} is for learning a calibration; leave it out with --correct")
+
+
+def _corrected(
+    table: Path, output: Path, base: str, declared: dict[str, str | float | None], *, seed: int, force: bool
+) -> str:
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.pipeline.site_correction import correct_size
+    from tactile_bayes.report.site_text import site_calibration_text
+
+    with progress_bar("maps") as progress:
+        found = correct_size(table, base, declared, seed=seed, progress=progress)
+    also_read(*found.inputs.values())
+    found.write(output, force=force)
+    return site_calibration_text(found.calibration)
+
+
 def _refuse_declared(ctx: click.Context) -> None:
     from tactile_bayes.errors import UsageError
 
@@ -168,7 +209,7 @@ def _refuse_declared(ctx: click.Context) -> None:
             raise UsageError(f"--{option} is for tables of lumps: a table of `population` fixes how its maps were made")
 
 
-def _over_bodies(table: Path, output: Path, form: str, normalise: str | None, *, force: bool) -> str:
+def _over_bodies(table: Path, output: Path, form: PopulationForm, normalise: str | None, *, force: bool) -> str:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_body_calibration
     from tactile_bayes.files.tables import read_table

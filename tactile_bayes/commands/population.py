@@ -13,6 +13,8 @@ from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
 if TYPE_CHECKING:
+    from tactile_bayes.forward.population import BodyPrior, ExamPrior
+    from tactile_bayes.forward.scene import Head
     from tactile_bayes.studies.population import MassRow
 
 _FILE = FilePath()
@@ -40,6 +42,21 @@ _FILE = FilePath()
     help="Normalisation of the maps, as in `map`; the calibration is for maps made the same way. Give it twice for a "
     "row by each from one scan.",
 )
+@click.option(
+    "--head",
+    metavar="HEAD.json",
+    type=_FILE,
+    help="The head, as for `record`: its taxels or their grid and arc. Default: 16 by 26 taxels 1.5 mm apart, arc of "
+    "35 mm.",
+)
+@click.option(
+    "--bodies",
+    "bodies_file",
+    metavar="BODIES.toml",
+    type=_FILE,
+    help="Ranges of lumps, bodies and exams, in the tables [bodies] and [exams]. Default: those of the shipped "
+    "calibrations.",
+)
 @seed_option(7)
 @WORKERS
 @scheduler_option("the masses")
@@ -50,6 +67,8 @@ def command(
     centred: int,
     scans: int,
     normalise: tuple[str, ...],
+    head: Path | None,
+    bodies_file: Path | None,
     seed: int,
     workers: int,
     scheduler: str | None,
@@ -60,11 +79,12 @@ def command(
     Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
     pressure, strokes, head yaw, tilt, noise, tracker errors and latency. The solid model makes the scans; maps are
     built and fitted as `map` and `estimate` do it. A mass takes about two seconds. An interrupted run goes on where it
-    stopped. `calibrate size` learns Eq 6 from the table, or with
-    --form log-quadratic a calibration of the default's kind.
+    stopped. `calibrate size` learns Eq 6 from the table, or with --form gaussian-process a calibration of the default's
+    kind. The table names its head: a calibration learned from it sizes maps of such a head only.
 
-    Example: tactile-bayes population --masses 100 --workers 4 -o population.csv
+    Example: tactile-bayes population --head head.json --masses 100 --workers 4 -o population.csv
     """
+    from dataclasses import asdict
     from functools import partial
 
     from tactile_bayes.batch import fault_lines, open_store, run_batch
@@ -72,17 +92,23 @@ def command(
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
+    from tactile_bayes.files.bodies_toml import read_bodies
+    from tactile_bayes.files.head_json import read_simulated_head
     from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from tactile_bayes.forward.scene import Head
     from tactile_bayes.presets import RESEARCH_USE
 
     refuse_existing(output, force=force)
+    simulated = read_simulated_head(head) if head else Head()
+    bodies, exams = read_bodies(bodies_file) if bodies_file else (BodyPrior(), ExamPrior())
     # results are kept by number: where the centred ones begin decides what a number is
     settings = {
         "scans": scans,
         "seed": seed,
         "first_centred": masses if centred else None,
         "normalise": list(dict.fromkeys(normalise)),
-        **as_settings(BodyPrior(), ExamPrior()),
+        **as_settings(bodies, exams),
+        "head": asdict(simulated),
     }
     kept = output.with_name(f"{output.name}.unfinished")
     with (
@@ -97,6 +123,9 @@ def command(
                 seed=seed,
                 first_centred=masses,
                 normalise=tuple(dict.fromkeys(normalise)),
+                bodies=bodies,
+                exams=exams,
+                head=simulated,
             ),
             range(masses + centred),
             key=str,
@@ -122,9 +151,29 @@ def command(
 
 
 def rows_of_mass(
-    index: int, *, scans: int, seed: int, first_centred: int, normalise: Sequence[str] = (DEFAULT_NORMALISE,)
+    index: int,
+    *,
+    scans: int,
+    seed: int,
+    first_centred: int,
+    normalise: Sequence[str] = (DEFAULT_NORMALISE,),
+    bodies: BodyPrior | None = None,
+    exams: ExamPrior | None = None,
+    head: Head | None = None,
 ) -> list[MassRow]:
-    """Rows of one mass, in any process."""
+    """Rows of one mass, in any process.
+
+    Parameters
+    ----------
+    index
+        Number of the mass.
+    scans, seed, bodies, exams, head
+        As `forward.population.draw_mass`'s.
+    first_centred
+        From this mass on the lumps are centred on the gland's surface.
+    normalise
+        As `studies.population.measure_mass`'s.
+    """
     import numpy as np
 
     from tactile_bayes.forward.population import BodyPrior, draw_mass
@@ -132,8 +181,9 @@ def rows_of_mass(
     from tactile_bayes.forward.simulate import simulate
     from tactile_bayes.studies.population import measure_mass
 
-    bodies = on_the_boundary(BodyPrior()) if index >= first_centred else BodyPrior()
-    scenes = draw_mass(index, scans=scans, seed=seed, bodies=bodies)
+    prior = bodies or BodyPrior()
+    prior = on_the_boundary(prior) if index >= first_centred else prior
+    scenes = draw_mass(index, scans=scans, seed=seed, bodies=prior, exams=exams, head=head)
     return measure_mass(
         scenes,
         body=index,

@@ -24,7 +24,7 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, L
     UsageError
         When one is missing or given twice.
     """
-    from tactile_bayes.files.instrument_json import read_head_geometry
+    from tactile_bayes.files.head_json import read_head_geometry
     from tactile_bayes.files.scan_mcap import read_scan
 
     like = read_scan(request.like) if request.like else None

@@ -15,8 +15,9 @@ from tactile_bayes.files.reading import open_input
 if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
     from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.size.calibration import Calibration
 
-_TABLES = ("trial.table.json", "excision.table.json", "size_table.table.json")
+_TABLES = ("trial.table.json", "excision.table.json", "size_table.table.json", "phantom_maps.table.json")
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -98,6 +99,7 @@ def _map(path: Path) -> dict[str, Any]:
         "frames": tactile_map.frame_count,
         "patient_frame": tactile_map.patient_from_plane is not None,
         "recipe": asdict(tactile_map.recipe),
+        **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
         "quality": dict(tactile_map.quality),
         "masked_taxels": list(tactile_map.masked_taxels),
         "provenance": header["provenance"],
@@ -113,20 +115,52 @@ def _json(path: Path) -> dict[str, Any]:
         raise _foreign(path)
     if schema.startswith("tactile-bayes/size-calibration/"):
         return _size_calibration(path, document)
+    if schema.startswith("tactile-bayes/site-calibration/"):
+        return _site_calibration(path, document)
     kept = {name: value for name, value in document.items() if name not in ("schema", "modalities")}
     return {"schema": schema, "kind": schema.split("/")[1], **kept}
 
 
-def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
+def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.size.body_calibration import BodyCalibration
 
     calibration = read_size_calibration(path)
+    assert isinstance(calibration, BodyCalibration)
+    assert calibration.site is not None
+    site = calibration.site
+    middle, low, high = site.percent(site.phantoms_log_width)
+    kept = ("base", "phantoms", "maps", "mean", "covariance", "uses_fat", "fit", "cautions", "left_out")
+    return {
+        "schema": document["schema"],
+        "kind": "size calibration corrected by phantoms",
+        "correction": {
+            "percent": middle,
+            "percent_interval": [low, high],
+            **{name: document["site"][name] for name in kept},
+        },
+        "base": _described(calibration, document["base"]),
+        "provenance": document["provenance"],
+    }
+
+
+def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
+    from tactile_bayes.files.size_json import read_size_calibration
+
+    return _described(read_size_calibration(path), document)
+
+
+def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, Any]:
+    """What a calibration's document says of it, without its long arrays."""
+    from tactile_bayes.size.body_calibration import BodyCalibration
+
     if isinstance(calibration, BodyCalibration):
-        kept = ("form", "source", "recipe", "parameters", "centre", "mean", "domain", "fit", "provenance")
+        kept = ["form", "source", "recipe", "parameters", "centre", "mean", "domain", "fit", "provenance"]
+        kept += ["bodies"] if "bodies" in document else []
         return {
             "schema": document["schema"],
             "kind": "size calibration",
+            "head": str(calibration.recipe.head),
             "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
             **{name: document[name] for name in kept},
             "variance_taken_away_by_knowing": calibration.unknowns,

@@ -1,4 +1,4 @@
-"""Instrument files of `record`, as JSON: head geometry, array calibration, landmarks."""
+"""Instrument files of `record`, as JSON: array calibration and landmarks."""
 
 from __future__ import annotations
 
@@ -17,12 +17,10 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_parts import (
     calibration_document,
     calibration_from_document,
-    head_from_document,
 )
 from tactile_bayes.files.schema import dump_json
-from tactile_bayes.scan import ElementCalibration, HeadGeometry, Landmarks
+from tactile_bayes.scan import ElementCalibration, Landmarks
 
-HEAD_SCHEMA: Final = "tactile-bayes/head/1"
 ARRAY_SCHEMA: Final = "tactile-bayes/array-calibration/1"
 LANDMARKS_SCHEMA: Final = "tactile-bayes/landmarks/1"
 
@@ -85,15 +83,6 @@ def read_array_calibration(path: Path) -> ArrayCalibrationFile:
         raise error.at(path) from None
     except (KeyError, TypeError, ValueError) as error:
         raise BadDataError(f"lacks a head_id or a date ({error})", way_out="calibrate again", path=str(path)) from None
-
-
-def read_head_geometry(path: Path) -> HeadGeometry:
-    """Read the places of the taxels and the mounting of the tracker."""
-    document = _read(path, HEAD_SCHEMA, way_out="give surface_mm, pitch_mm and scanhead_from_tracker")
-    try:
-        return head_from_document(document)
-    except BadDataError as error:
-        raise error.at(path) from None
 
 
 def read_landmarks(path: Path) -> Landmarks:

@@ -27,6 +27,7 @@ _KINDS = {
     "estimate": "an estimate (JSON)",
     "pooled": "a pooled estimate (JSON)",
     "size-calibration": "a size calibration (JSON)",
+    "site-calibration": "a size calibration corrected by phantoms (JSON)",
     "validate": "a trial report (JSON)",
     "plan": "a trial plan (JSON)",
 }

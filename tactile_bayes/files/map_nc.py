@@ -21,6 +21,7 @@ from tactile_bayes.files.netcdf import Group, Variable, netcdf_bytes, open_netcd
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.geometry import check_rigid
+from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.presets import NORMALISE
 
@@ -123,6 +124,7 @@ def read_map(path: Path) -> TactileMap:
             frame_count=header["frame_count"],
             quality=header["quality"],
             masked_taxels=tuple(header["masked_taxels"]),
+            head=header["head"],
         )
 
 
@@ -131,8 +133,8 @@ def read_map_header(path: Path) -> dict[str, Any]:
 
     Returns
     -------
-    dict with ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``provenance``, ``background``,
-    ``frame_count`` and ``shape`` (ny, nx).
+    dict with ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``head``, ``provenance``,
+    ``background``, ``frame_count`` and ``shape`` (ny, nx).
     """
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         shape = tuple(_dimension(file, name) for name in ("y", "x"))
@@ -163,6 +165,7 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
         "frame_count": _json(int(tactile_map.frame_count)),
         "quality": _json({name: _finite(value) for name, value in tactile_map.quality.items()}),
         "masked_taxels": _json(list(tactile_map.masked_taxels)),
+        **({} if tactile_map.head is None else {"head": _json(tactile_map.head.as_dict())}),
         "provenance": _json(provenance.as_dict()),
     }
 
@@ -190,6 +193,7 @@ def _header(file: Group) -> dict[str, Any]:
         "frame_count": _decoded(texts, "frame_count", int),
         "quality": _quality(_decoded(texts, "quality", dict)),
         "masked_taxels": [str(line) for line in _decoded(texts, "masked_taxels", list)],
+        "head": _head(texts),
         "provenance": _decoded(texts, "provenance", dict),
     }
 
@@ -252,6 +256,16 @@ def _recipe(fields: dict[str, Any]) -> MapRecipe:
         **later,
         units=units,
     )
+
+
+def _head(texts: Mapping[str, str]) -> HeadShape | None:
+    """The head's shape; None in an imported grid and in files of earlier versions."""
+    if "head" not in texts:
+        return None
+    try:
+        return HeadShape.from_document(_decoded(texts, "head", dict))
+    except BadDataError as error:
+        raise BadDataError(f"attribute head: {error.what}", way_out=_WAY_OUT) from None
 
 
 def _is_number(value: object) -> bool:

@@ -5,15 +5,43 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.fat_depth import ROUND, FatDepth, FatTerms
+from tactile_bayes.size.fat_process import LINEAR_POWERS, SPREAD, FatProcess, Kernel
 
 Terms = TypeVar("Terms", bound=FatTerms)
 
 
 def fat_document(fat: FatTerms, powers: Sequence[Sequence[int]]) -> dict[str, Any]:
     """As plain data, see ``fat_cubic`` in data_schema/size_quadratic.schema.json; `powers` are the coefficients'."""
+    return {**_shared_document(fat, powers), "covariance": numbers(fat.covariance)}
+
+
+def process_document(fat: FatProcess) -> dict[str, Any]:
+    """As plain data, see ``fat_process`` in data_schema/size_quadratic.schema.json.
+
+    The covariance is kept as its Cholesky factor's rows, which stay one's own however they are rounded.
+    """
+    kernel = fat.kernel
+    assert kernel is not None
+    factor = np.linalg.cholesky(fat.covariance)
+    return {
+        **_shared_document(fat, LINEAR_POWERS),
+        "spread_powers": [list(one) for one in SPREAD],
+        "kernel": {
+            "points": numbers(kernel.points),
+            "lengths": numbers(kernel.lengths),
+            "scale": number(kernel.scale),
+        },
+        "covariance_factor": [[float(f"{value:.6g}") for value in row[: i + 1]] for i, row in enumerate(factor)],
+    }
+
+
+def _shared_document(fat: FatTerms, powers: Sequence[Sequence[int]]) -> dict[str, Any]:
     depth, (alpha, p0, w0) = fat.depth, fat.centre
     return {
         "depth": {
@@ -29,7 +57,6 @@ def fat_document(fat: FatTerms, powers: Sequence[Sequence[int]]) -> dict[str, An
         "round_powers": [list(one) for one in ROUND],
         "centre": {"log_amplitude": alpha, "log_width": p0, "log_fat": w0},
         "mean": numbers(fat.mean),
-        "covariance": numbers(fat.covariance),
         "round_lumps": {
             "coefficients": numbers(fat.round_coefficients),
             "body_sd": number(fat.round_sd[0]),
@@ -51,24 +78,43 @@ def parse_fat(document: dict[str, Any], form: type[Terms]) -> Terms:
     BadDataError
         When its numbers cannot be those of a calibration.
     """
+    return form(**_shared_fields(document), covariance=array_of(document, "covariance"))
+
+
+def parse_process(document: dict[str, Any]) -> FatProcess:
+    """From plain data that keeps the schema; raises as `parse_fat`."""
+    kernel, rows = document["kernel"], document["covariance_factor"]
+    factor = np.zeros((len(rows), len(rows)))
+    for i, row in enumerate(rows):
+        if len(row) != i + 1:
+            raise BadDataError(f"row {i + 1} of covariance_factor has {len(row)} numbers", way_out="learn it anew")
+        factor[i, : i + 1] = row
+    points, lengths = array_of(kernel, "points"), array_of(kernel, "lengths")
+    return FatProcess(
+        **_shared_fields(document),
+        covariance=factor @ factor.T,
+        kernel=Kernel(points, lengths, float(kernel["scale"])),
+    )
+
+
+def _shared_fields(document: dict[str, Any]) -> dict[str, Any]:
     depth, balls, centre = document["depth"], document["round_lumps"], document["centre"]
     low, high = document["fat_mm"]
     arrays = {name: array_of(depth, name) for name in ("centre", "scale", "coefficients")}
-    return form(
-        depth=FatDepth(
+    return {
+        "depth": FatDepth(
             **arrays,
             information_inverse=array_of(depth, "information_inverse"),
             most_leverage=float(depth["most_leverage"]),
             log_sd=float(depth["log_sd"]),
         ),
-        centre=(float(centre["log_amplitude"]), float(centre["log_width"]), float(centre["log_fat"])),
-        mean=array_of(document, "mean"),
-        covariance=array_of(document, "covariance"),
-        round_coefficients=array_of(balls, "coefficients"),
-        round_sd=(float(balls["body_sd"]), float(balls["exam_sd"])),
-        information_inverse=array_of(document, "information_inverse"),
-        most_leverage=float(document["most_leverage"]),
-        fat_mm=(float(low), float(high)),
-        hidden=parse_hidden(document["hidden"], terms=len(document["information_inverse"])),
-        fit={name: float(value) for name, value in document["fit"].items()},
-    )
+        "centre": (float(centre["log_amplitude"]), float(centre["log_width"]), float(centre["log_fat"])),
+        "mean": array_of(document, "mean"),
+        "round_coefficients": array_of(balls, "coefficients"),
+        "round_sd": (float(balls["body_sd"]), float(balls["exam_sd"])),
+        "information_inverse": array_of(document, "information_inverse"),
+        "most_leverage": float(document["most_leverage"]),
+        "fat_mm": (float(low), float(high)),
+        "hidden": parse_hidden(document["hidden"], terms=len(document["information_inverse"])),
+        "fit": {name: float(value) for name, value in document["fit"].items()},
+    }

@@ -62,8 +62,24 @@ def read_size_calibration(path: Path) -> Calibration:
         When the file is not one, or a field breaks the schema.
     """
     document: Any = load_json(path)
+    if isinstance(document, dict) and document.get("form") == "site":
+        from tactile_bayes.files import size_site_json as site
+
+        _check(document, site.SCHEMA_FILE, path)
+        return site.parse_site_calibration(document, parse_size_calibration(document["base"], path=path), path=path)
+    return parse_size_calibration(document, path=path)
+
+
+def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
+    """Parse a calibration of any form but a corrected one.
+
+    Raises
+    ------
+    BadDataError
+        When the document is not one, or a field breaks the schema.
+    """
     form = document.get("form") if isinstance(document, dict) else None
-    if form == "log-quadratic":
+    if form in ("log-quadratic", "gaussian-process"):
         from tactile_bayes.files import size_quadratic_json as quadratic
 
         _check(document, quadratic.SCHEMA_FILE, path)
@@ -106,7 +122,7 @@ def _eq6(document: Any, *, path: Path) -> SizeCalibration:
             x=_axis(document["x"]),
             y=_axis(document["y"]),
             residual_correlation=float(document["residual_correlation"]),
-            recipe=Recipe(**document["recipe"]),
+            recipe=Recipe.from_document(document["recipe"]),
             axes=tuple(document["axes"]),
             left_out=_left_out(document.get("left_out")),
             cautions=tuple(document.get("cautions", ())),

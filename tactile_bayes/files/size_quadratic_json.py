@@ -10,9 +10,10 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.files.size_bodies_json import bodies_document, parse_bodies
-from tactile_bayes.files.size_fat_json import fat_document, parse_fat
+from tactile_bayes.files.size_fat_json import fat_document, parse_fat, parse_process, process_document
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.fat_depth import POWERS, FatCubic
+from tactile_bayes.size.fat_depth import POWERS, FatCubic, FatTerms
+from tactile_bayes.size.fat_process import FatProcess
 from tactile_bayes.size.log_quadratic import PARAMETERS, LogQuadratic
 
 SCHEMA = "tactile-bayes/size-calibration/2"
@@ -28,13 +29,18 @@ def write_log_quadratic(path: Path, calibration: LogQuadratic, *, provenance: Pr
 
 def log_quadratic_document(calibration: LogQuadratic, provenance: Provenance) -> dict[str, Any]:
     """The calibration as plain data, see data_schema/size_quadratic.schema.json."""
+    fat, part = calibration.with_fat, {}
+    if isinstance(fat, FatProcess):
+        part = {fat.file_key: process_document(fat)}
+    elif fat is not None:
+        part = {fat.file_key: fat_document(fat, POWERS)}
     return {
         "schema": SCHEMA,
         "research_use": RESEARCH_USE,
-        "form": "log-quadratic",
+        "form": "gaussian-process" if isinstance(fat, FatProcess) else "log-quadratic",
         "parameters": list(PARAMETERS),
         **bodies_document(calibration),
-        **({} if calibration.with_fat is None else {"fat_cubic": fat_document(calibration.with_fat, POWERS)}),
+        **part,
         "provenance": provenance.as_dict(),
     }
 
@@ -48,7 +54,11 @@ def parse_log_quadratic(document: dict[str, Any], *, path: Path) -> LogQuadratic
         When its numbers cannot be those of a calibration.
     """
     try:
-        fat = parse_fat(document["fat_cubic"], FatCubic) if "fat_cubic" in document else None
+        fat: FatTerms | None = None
+        if "fat_process" in document:
+            fat = parse_process(document["fat_process"])
+        elif "fat_cubic" in document:
+            fat = parse_fat(document["fat_cubic"], FatCubic)
         return LogQuadratic(**parse_bodies(document), with_fat=fat)
     except BadDataError as error:
         raise error.at(path) from None

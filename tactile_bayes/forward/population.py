@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes, Tracker
+from tactile_bayes.forward.scene import Background, Head, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 
 Range = tuple[float, float]
@@ -124,18 +124,38 @@ def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
     )
 
 
-def draw_mass(index: int, *, scans: int, seed: int, bodies: BodyPrior | None = None) -> list[Scene]:
-    """Draw the scenes of one mass, examined several times; they depend only on index and seed."""
+def draw_mass(
+    index: int,
+    *,
+    scans: int,
+    seed: int,
+    bodies: BodyPrior | None = None,
+    exams: ExamPrior | None = None,
+    head: Head | None = None,
+) -> list[Scene]:
+    """Draw the scenes of one mass, examined several times; they depend only on index, seed, priors and head.
+
+    Parameters
+    ----------
+    index
+        Number of the mass.
+    scans
+        Exams of it.
+    bodies, exams
+        Priors; None for the defaults.
+    head
+        None for the paper's.
+    """
     rng = np.random.default_rng([seed, index])
     body, lump = draw_body(bodies or BodyPrior(), rng)
-    exam_prior = ExamPrior()
+    exam_prior = exams or ExamPrior()
     scenes = []
     for number in range(scans):
         exam = draw_exam(exam_prior, rng)
         x, y = rng.uniform(*exam_prior.off_centre_mm, size=2)
         placed = replace(lump, x_mm=float(x), y_mm=float(y))
         scene_seed = int(np.random.SeedSequence([seed, index, number]).generate_state(1)[0])
-        scenes.append(replace(exam, seed=scene_seed, body=body, solid_lumps=(placed,)))
+        scenes.append(replace(exam, seed=scene_seed, body=body, solid_lumps=(placed,), head=head or Head()))
     return scenes
 
 

@@ -8,6 +8,7 @@ follows from them as for a real scan. `data_schema/scene.schema.json` holds the 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Final
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from tactile_bayes.presets import (
 
 Point = tuple[float, float, float]
 Taxel = tuple[int, int]
+
+FLAT_MM: Final = 100_000.0
+"""Radius that stands for a flat head, the largest of a scene: over 24 mm it rises by 0.7 um."""
 
 
 @dataclass(frozen=True, slots=True)

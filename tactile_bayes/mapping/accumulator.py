@@ -9,6 +9,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray, Plane, check_rigid
+from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.cells import CellSums
 from tactile_bayes.mapping.elements import TaxelFault
 from tactile_bayes.mapping.engine import Engine, NumpyEngine
@@ -297,4 +298,5 @@ class MapAccumulator:
             frame_count=self._tally["frames_used"],
             quality=self.figures | self._profile.figures(),
             masked_taxels=tuple(str(fault) for fault in instrument.faults),
+            head=HeadShape.of(instrument.head.surface_mm, instrument.head.pitch_mm),
         )

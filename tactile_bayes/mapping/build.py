@@ -9,6 +9,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import FloatArray, Plane, patient_from_plane
+from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.accumulate import Accumulated, accumulate
 from tactile_bayes.mapping.convention import check_convention, hint
 from tactile_bayes.mapping.engine import Engine, choose_engine
@@ -263,7 +264,20 @@ def _as_map(
         frame_count=int(quality["frames_used"]),
         quality=quality,
         masked_taxels=_masked(selections),
+        head=_head(scans),
     )
+
+
+def _head(scans: list[Scan]) -> HeadShape:
+    """Shape of the scans' head; an error where they are of different ones."""
+    first, *others = [HeadShape.of(scan.head.surface_mm, scan.head.pitch_mm) for scan in scans]
+    for number, other in enumerate(others, start=2):
+        if first.differences(other):
+            raise BadDataError(
+                f"scan {number} was made by another head ({other}) than scan 1 ({first})",
+                way_out="build one map per head",
+            )
+    return first
 
 
 def _masked(selections: list[SelectedFrames]) -> tuple[str, ...]:

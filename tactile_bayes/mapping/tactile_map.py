@@ -10,6 +10,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.records import dataclass
 
 # A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
@@ -98,6 +99,8 @@ class TactileMap:
         Counts and figures for the report (frames dropped low/high, tilt, rms...).
     masked_taxels
         Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
+    head
+        Shape of the head that made the scan; None for an imported grid and for files of earlier versions.
     """
 
     mean: FloatArray
@@ -112,6 +115,7 @@ class TactileMap:
     frame_count: int = 0
     quality: Mapping[str, float] = field(default_factory=dict)
     masked_taxels: tuple[str, ...] = ()
+    head: HeadShape | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))

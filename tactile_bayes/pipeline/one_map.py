@@ -14,6 +14,7 @@ from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.head_shape import HeadShape
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.result import Estimate
@@ -29,8 +30,8 @@ class Answer:
     """Answer for one map: its JSON object and its text, or an error with its exit code.
 
     `text` is the report in at most 12 lines, `full_text` all of it. `shape` holds what pooling
-    needs of a map on which a lump was found, `normalise` how the map's frames were, `fingerprint` what its values seed
-    random numbers with.
+    needs of a map on which a lump was found, `normalise` how the map's frames were, `head` what it was made with,
+    `fingerprint` what its values seed random numbers with.
     """
 
     document: dict[str, Any] | None
@@ -40,6 +41,7 @@ class Answer:
     normalise: str = ""
     fingerprint: int = 0
     full_text: str = ""
+    head: HeadShape | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +134,8 @@ def estimate_one(
     NotConvergedError
         When the method asked for does not converge.
     """
+    import math
+
     import numpy as np
 
     from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -141,7 +145,8 @@ def estimate_one(
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
     from tactile_bayes.posterior.other_rises import other_rises
     from tactile_bayes.report.population_text import calibration_line
-    from tactile_bayes.size.body_calibration import mean_width_mm
+    from tactile_bayes.report.site_text import site_words
+    from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
 
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
@@ -169,8 +174,10 @@ def estimate_one(
     if posterior is not None and used is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
         by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"
-        widths = posterior.medians[1:]
-        words = calibration_line(by, used, sigma_mm=mean_width_mm(*widths))
+        sigma_mm = mean_width_mm(*posterior.medians[1:])
+        if isinstance(used, BodyCalibration) and used.site is not None:
+            by += f" ({site_words(used.site, math.log(sigma_mm))})"
+        words = calibration_line(by, used, sigma_mm=sigma_mm)
         assert estimate.diagnostics is not None
         diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words)
         estimate = replace(estimate, diagnostics=diagnostics)
@@ -214,7 +221,7 @@ def choose_calibration(
     """
     from tactile_bayes.files.shipped import default_for, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.posterior.estimate import recipe_differences
+    from tactile_bayes.posterior.estimate import OTHER_HEAD, recipe_differences
 
     if settings.calibration is None or isinstance(settings.calibration, str):
         path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
@@ -235,7 +242,8 @@ def choose_calibration(
     if settings.method == "optimise":
         return None, None, _LEAST_SQUARES
     if differs:
-        return None, None, NoSize(f"the shipped calibration does not fit: {'; '.join(differs)}; widths only")
+        advice = OTHER_HEAD if calibration.recipe.head_differences(tactile_map.head) else ""
+        return None, None, NoSize(f"the shipped calibration does not fit: {'; '.join(differs)}; widths only", advice)
     return path, calibration, None
 
 
@@ -345,11 +353,11 @@ def answer_of(outcome: Outcome) -> Answer:
     text = estimate_summary(estimate, quantities, probability=settings.interval)
     full_text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
-    shape, normalise = _shape(tactile_map, estimate), tactile_map.recipe.normalise
-    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text)
+    shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
+    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)
 
 
-def _shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
+def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
     """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
     import math
 

@@ -44,7 +44,7 @@ def pool_answers(
     Raises
     ------
     BadDataError
-        When the maps were normalised in several ways.
+        When the maps were normalised in several ways, or one was made with another head than the calibration's.
     UsageError
         When the calibration cannot pool maps.
     """
@@ -55,6 +55,7 @@ def pool_answers(
     from tactile_bayes.size.pooling import pool_maps
 
     path, calibration = _calibration(answers, settings)
+    _check_heads(answers, calibration, names)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
     pooled = _too_far(answers) or pool_maps(
@@ -113,6 +114,17 @@ def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | 
             f"--pool needs a calibration learned over bodies; {what} is of a study or phantoms: use solid or eq6"
         )
     return path, calibration
+
+
+def _check_heads(answers: Sequence[Answer], calibration: BodyCalibration, names: Sequence[str]) -> None:
+    """Refuse a map that was made with another head than the calibration's."""
+    from tactile_bayes.posterior.estimate import way_to_head
+
+    for answer, name in zip(answers, names, strict=True):
+        differs = calibration.recipe.head_differences(answer.head)
+        if differs:
+            what = f"{name}: the calibration is for another head: {'; '.join(differs)}"
+            raise BadDataError(what, way_out=way_to_head(answer.head))
 
 
 def _plain(settings: Settings) -> dict[str, Any]:

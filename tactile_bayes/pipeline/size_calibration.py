@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, assert_never
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
@@ -14,6 +15,7 @@ _SOURCE = "balls in a population of bodies, scanned by the solid model"
 
 if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet, Table
+    from tactile_bayes.head_shape import HeadShape
     from tactile_bayes.pipeline.one_map import Progress
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.eq6 import LeftOutErrors, Recipe, SizeCalibration
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from tactile_bayes.size.learn.eq6_two_stage import OtherFit
 
 EqSixFit = Literal["joint", "two-stage"]
+PopulationForm = Literal["eq6", "log-quadratic", "gaussian-process"]
+FORMS: tuple[PopulationForm, ...] = ("eq6", "log-quadratic", "gaussian-process")
+"""What can be learned from a table of `population`; only the first from a table of lumps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,13 +124,15 @@ def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_rati
     return tuple(found)
 
 
-def learn_population(rows: Table, form: str, normalise: str | None = None) -> tuple[BodyCalibration, dict[str, Any]]:
+def learn_population(
+    rows: Table, form: PopulationForm, normalise: str | None = None
+) -> tuple[BodyCalibration, dict[str, Any]]:
     """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
 
     Parameters
     ----------
     form
-        ``"log-quadratic"`` or ``"eq6"``.
+        One of `FORMS`.
     normalise
         Of the rows to learn from; may be left out where all are alike.
 
@@ -136,22 +143,56 @@ def learn_population(rows: Table, form: str, normalise: str | None = None) -> tu
     NotConvergedError
         When the posterior has no mode.
     """
-    from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from dataclasses import replace
+
     from tactile_bayes.size.eq6 import Recipe
-    from tactile_bayes.size.learn.eq6_population import learn_population_eq6
-    from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
-    from tactile_bayes.studies.population import measuring_options, population_table
+    from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
     fit = measuring_options().fit
-    way, columns = _of_one_way(rows, normalise)
-    recipe = Recipe(way, fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False)
-    learn = learn_log_quadratic if form == "log-quadratic" else learn_population_eq6
+    way, columns = rows_of_one_way(rows, normalise)
     try:
-        calibration = learn(population_table(columns), recipe=recipe, source=_SOURCE)
+        recipe = Recipe(
+            way,
+            fit.background,
+            fit.radius_mm,
+            declared=False,
+            noise=fit.noise,
+            flat_field=False,
+            head=table_head(columns),
+        )
+        calibration = population_learner(form)(population_table(columns), recipe=recipe, source=_SOURCE)
     except BadDataError as error:
         raise error.at(rows.path) from None
-    masses = len(set(columns["body"]))
-    return calibration, {"form": form, "masses": masses, **as_settings(BodyPrior(), ExamPrior())}
+    if form == "gaussian-process" and calibration.with_fat is None:
+        from tactile_bayes.size.learn.fat_depth import LEAST_BODIES
+
+        raise BadDataError(
+            f"fewer than {LEAST_BODIES} bodies have a lump and a head profile: too few for a Gaussian process",
+            way_out="give a larger population, or --form log-quadratic",
+            path=str(rows.path),
+        )
+    bodies = table_bodies(columns)
+    settings = {"form": form, "masses": len(set(columns["body"])), "bodies": bodies}
+    return replace(calibration, bodies=bodies), settings
+
+
+def population_learner(form: PopulationForm) -> Callable[..., BodyCalibration]:
+    """The function that learns a calibration of a form from a `PopulationTable` and a `Recipe`."""
+    match form:
+        case "eq6":
+            from tactile_bayes.size.learn.eq6_population import learn_population_eq6
+
+            return learn_population_eq6
+        case "log-quadratic":
+            from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+
+            return learn_log_quadratic
+        case "gaussian-process":
+            from tactile_bayes.size.learn.fat_process import learn_fat_process
+            from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+
+            return partial(learn_log_quadratic, learn_fat=learn_fat_process)
+    assert_never(form)
 
 
 def is_population(source: Path | Sheet) -> bool:
@@ -196,7 +237,29 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
     radius_mm = found["fit_radius_mm"] or FIT_RADIUS_MM
     noise: Noise = found["noise"] or "independent"
     by_hand = any(said[name] is None for name in declared)
-    return Recipe(normalise, background, radius_mm, declared=by_hand, noise=noise, flat_field=said["flat_field"])
+    return Recipe(
+        normalise,
+        background,
+        radius_mm,
+        declared=by_hand,
+        noise=noise,
+        flat_field=said["flat_field"],
+        head=_named_head(table),
+    )
+
+
+def _named_head(table: Table) -> HeadShape | None:
+    """Head that a table of lumps names; None where it does not."""
+    from tactile_bayes.head_shape import HeadShape
+
+    names = ("head_rows", "head_columns", "head_pitch_mm")
+    values = [_alike(table, name) for name in names]
+    if values == [None, None, None]:
+        return None
+    if None in values:
+        what = f"names a head without {names[values.index(None)]}"
+        raise BadDataError(what, way_out=f"give {', '.join(names)} and head_radius_mm", path=str(table.path))
+    return HeadShape(values[0], values[1], values[2], _alike(table, "head_radius_mm"))
 
 
 def _alike(table: Table, name: str) -> Any:
@@ -231,7 +294,7 @@ def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) 
         return None, str(error)
 
 
-def _of_one_way(rows: Table, normalise: str | None) -> tuple[str, dict[str, list[Any]]]:
+def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[str, dict[str, list[Any]]]:
     """How a `population` table's maps were normalised, and its columns for the rows that were.
 
     Tables without the column, and empty cells, are of maps normalised by the mean.

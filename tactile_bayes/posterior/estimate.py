@@ -8,6 +8,7 @@ import numpy as np
 
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
+from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
 from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
@@ -30,6 +31,11 @@ from tactile_bayes.size.fat_depth import head_profile
 from tactile_bayes.size.posterior import SizePosterior
 
 MOST_INVALID = 0.05
+OTHER_HEAD = (
+    "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
+    "calibrate size population.csv --form log-quadratic -o size.json`, and give --size-calibration size.json"
+)
+"""How to make a calibration for another head."""
 
 
 def estimate_map(
@@ -153,6 +159,7 @@ def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: F
         radius_mm=fit.radius_mm,
         noise=fit.noise,
         flat_field=tactile_map.recipe.flat_field_known,
+        head=tactile_map.head,
     )
 
 
@@ -166,8 +173,16 @@ def check_recipe(tactile_map: TactileMap, calibration: Calibration, fit: FitOpti
         )
 
 
+def way_to_head(head: HeadShape | None) -> str:
+    """What gives a calibration for a map's head."""
+    shipped = head is not None and not DEFAULT_HEAD.differences(head)
+    return f"give --size-calibration solid or eq6, which are for this head; or {OTHER_HEAD}" if shipped else OTHER_HEAD
+
+
 def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
     """What makes a map fit a calibration: its map command where the map differs, else the fit's options."""
+    if recipe.head_differences(tactile_map.head):
+        return way_to_head(tactile_map.head)
     made = (tactile_map.recipe.normalise, tactile_map.recipe.flat_field_known)
     wanted = (recipe.normalise, made[1] if recipe.flat_field is None else recipe.flat_field)
     if made[0] != wanted[0] or (made[1] is not None and made[1] != wanted[1]):
@@ -228,4 +243,6 @@ def _left_out(
         return (*notes, omissions.SPREAD)
     stated = options.size_priors.another_exam or options.size_priors.between_maps
     notes += [] if stated is None or stated.sd > 0 else [omissions.SPREAD]
+    head = calibration.recipe.head
+    notes += [] if head is None or tactile_map.head is not None else [omissions.head(head)]
     return (*notes, *calibration.omissions())

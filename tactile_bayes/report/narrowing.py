@@ -13,6 +13,7 @@ NARROWED_BY = {
     "between_maps": "more exams of this mass, pooled (estimate --pool)",
     "calibration": "a size calibration learned from more lumps",
     "residual": "a size calibration learned with this head and bodies like this one",
+    "site": "more phantoms of known size, depth, seat and stiffness (calibrate size --correct)",
     "body": "knowing the lump's depth, seat or stiffness (estimate --known)",
 }
 WORTH_NARROWING = 10.0

@@ -12,6 +12,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
+from tactile_bayes.report.site_text import site_words
 from tactile_bayes.report.size_text import (
     SIZE_DECIMALS,
     decimals,
@@ -60,14 +61,22 @@ def pooled_document(
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
-        "left_out": [omissions.fat_depth(used.fat_note)] if used.fat_note else [],
+        "left_out": _omitted(used, documents),
         "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
         "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
+        "site": None if used.site is None else site_words(used.site),
         "outside_calibration": list(pooled.outside),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
     }
+
+
+def _omitted(used: BodyCalibration, documents: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the pooled size does not contain, in words."""
+    head = omissions.head(used.recipe.head)
+    unknown = any(head in document["left_out"] for document in documents)
+    return [*([head] if unknown else []), *([omissions.fat_depth(used.fat_note)] if used.fat_note else [])]
 
 
 def _another_exam(size: SizePosterior | None, probability: float) -> dict[str, Any] | None:
@@ -102,7 +111,8 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         largest, spread = document["max_size_mm"], document["figures"]["between_map_sd"]
         lines += _table(document) + width_lines(document["variance_share"])
         ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
-        lines.append(f"Quality: {ends}the maps of this mass differ by {100 * spread:.0f} %.")
+        by = f"sizes by {document['site']}; " if document["site"] else ""
+        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %.")
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
@@ -139,6 +149,8 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
     lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
+    if document["site"]:
+        lines.append(f"Sizes by {document['site']}.")
     if document["left_out"]:
         lines.append(f"Left out: {'; '.join(document['left_out'])}.")
     if document["reason"]:

@@ -9,7 +9,8 @@ import numpy as np
 from tactile_bayes.presets import HELD, RESEARCH_USE
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.size.fat_depth import SPREADS, FatTerms
+from tactile_bayes.size.fat_depth import FatTerms
+from tactile_bayes.size.fat_process import FatProcess
 from tactile_bayes.size.log_quadratic import QUADRATIC
 from tactile_bayes.size.population_eq6 import PopulationEq6
 
@@ -22,11 +23,21 @@ UNKNOWN_NAMES = {
     "thickness_mm": "thickness of the tissue",
 }
 
+BODY_NAMES = {
+    "d_mm": "d (mm)",
+    "depth_ratio": "h/d",
+    "stiffness_ratio": "E2/E1",
+    "seat": "seat",
+    "fat_kpa": "fat (kPa)",
+    "gland_ratio": "gland over fat",
+    "thickness_mm": "thickness (mm)",
+}
+
 
 def body_calibration_text(calibration: BodyCalibration) -> str:
     """Coefficients, spreads, what the unknowns cost, and the errors on masses left out."""
     fit = calibration.fit
-    body_sd, slope, exam_sd = calibration.mean[-SPREADS:]
+    body_sd, slope, exam_sd = calibration.mean[calibration.coefficients :]
     lines = [
         *(_eq6_lines(calibration) if isinstance(calibration, PopulationEq6) else _quadratic_lines(calibration)),
         f"between bodies, SD of ln d {np.exp(body_sd):.3f} (times e^({slope:+.2f} u)), "
@@ -37,11 +48,18 @@ def body_calibration_text(calibration: BodyCalibration) -> str:
     for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
         low, high = calibration.domain[name]
         lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
+    lines += _bodies_lines(calibration.bodies)
     lines.append(f"recipe: {calibration.recipe}")
     lines.append(f"for maps made with {calibration.recipe.map_command}")
     if calibration.with_fat is not None:
         lines += _fat_lines(calibration, calibration.with_fat)
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _bodies_lines(bodies: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Ranges of the bodies in one line; none where a file of an earlier version does not name them."""
+    parts = [f"{BODY_NAMES.get(name, name)} {low:.3g} to {high:.3g}" for name, (low, high) in bodies.items()]
+    return [f"bodies: {', '.join(parts)}"] if parts else []
 
 
 def _quadratic_lines(calibration: BodyCalibration) -> list[str]:
@@ -84,7 +102,11 @@ def _left_out_text(fit: Mapping[str, float]) -> str:
 def _fat_lines(calibration: BodyCalibration, fat: FatTerms) -> list[str]:
     """What knowing the depth of the fat, from the pressure over the head, does to all that."""
     low, high = fat.fat_mm
-    how = "m and f by its logarithm and v" if isinstance(calibration, PopulationEq6) else "a cubic in u, v and its log"
+    how = "a cubic in u, v and its log"
+    if isinstance(calibration, PopulationEq6):
+        how = "m and f by its logarithm and v"
+    elif isinstance(fat, FatProcess):
+        how = "a Gaussian process in u, v and the pressure profile; ln SD between bodies a quadratic"
     return [
         f"for maps that give the depth of the fat, {low:.3g} to {high:.3g} mm, "
         f"to {100 * fat.depth.log_sd:.1f} %: {how}",
@@ -97,7 +119,8 @@ def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) ->
     """Which calibration gave the size of a map with this mean width, and what it cannot know."""
     line = f"Sizes by the {name}"
     if isinstance(calibration, BodyCalibration):
-        line += f" ({calibration.source}); "
+        head = "" if calibration.recipe.head is None else f"; for a head of {calibration.recipe.head}"
+        line += f" ({calibration.source}{head}); "
         if isinstance(calibration, PopulationEq6):
             line += f"Eq 6 for this map: {constants_text(calibration.constants(sigma_mm))}; "
         line += f"{fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"

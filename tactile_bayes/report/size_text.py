@@ -13,6 +13,7 @@ SOURCES = {
     "calibration": "the calibration's coefficients",
     "residual": "the scatter about Eq 6",
     "body": "properties of the body that no map shows",
+    "site": "the correction by the site's phantoms",
     "shape": "whether the lump is round or oval",
 }
 

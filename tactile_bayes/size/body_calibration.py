@@ -4,9 +4,11 @@ With :math:`u = \ln a - \alpha_0` and :math:`v = p - p_0`, where p is the log of
 
 .. math:: \ln d = g(u, v; \beta) + B + E
 
-g is the form: a polynomial (`log_quadratic`) or Eq 6 (`population_eq6`). B differs from body to body,
-:math:`N(0, s\,e^{g u})`: what a map does not show (seat, stiffness, moduli). E differs from exam to exam of one body. A
-ball under the oblong head gives an oval map; its half log axis ratio is
+g is the form: a polynomial (`log_quadratic`), Eq 6 (`population_eq6`) or a Gaussian process (`fat_process`). B differs
+from body to body by what a map does not show (seat, stiffness, moduli): :math:`N(0, s^2)`, with ln s a polynomial in u
+and v. E differs from exam to exam of one body.
+
+A ball under the oblong head gives an oval map; its half log axis ratio is
 :math:`q_0 = \gamma_0 + \gamma_1 u + \gamma_2 v`, and only what exceeds it says that a lump is not round.
 
 Where the depth F of the fat under the head is known, the coefficients are those at that depth, `fat_depth.FatTerms`.
@@ -16,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
-from typing import Self
 
 import numpy as np
 
@@ -27,8 +28,10 @@ from tactile_bayes.size import omissions
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.calibration_range import outside_domain, too_far
 from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.fat_depth import SPREADS, FatTerms
+from tactile_bayes.size.fat_depth import FatTerms
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.polynomials import monomials
+from tactile_bayes.size.site_shift import SiteShift
 
 UNLIKE = "is unlike any body of the table"
 SPREAD_PARAMETERS = ("log_body_sd", "body_sd_slope", "log_exam_sd")
@@ -46,8 +49,8 @@ class BodyCalibration:
     ----------
     centre
         alpha_0 and p_0.
-    mean, covariance : (k + 3,), (k + 3, k + 3) arrays
-        Posterior of the k coefficients and of `SPREAD_PARAMETERS`, taken as normal.
+    mean, covariance : (k + s + 1,), (k + s + 1, k + s + 1) arrays
+        Posterior of the k coefficients, the s of ln SD(B) and ln SD(E), taken as normal.
     round_lumps
         What a ball's map looks like.
     information_inverse : (c, c) array
@@ -64,6 +67,8 @@ class BodyCalibration:
         Figures of the fit.
     source
         In words: what the table was made of.
+    bodies
+        Ranges of the table's lumps and bodies, by their columns; empty in files of earlier versions.
     with_fat
         The same for maps that tell how deep the fat under the head is; None where the table did not.
     fat_mm
@@ -72,6 +77,8 @@ class BodyCalibration:
         Why the depth is not used though the calibration could; empty otherwise.
     any_depth
         Of a calibration for one depth, that for any.
+    site
+        Correction by a site's own phantoms; `pooling` adds it, no method of this class does.
     """
 
     centre: tuple[float, float]
@@ -85,13 +92,15 @@ class BodyCalibration:
     hidden: HiddenTerms | None = None
     fit: Mapping[str, float] = field(default_factory=dict)
     source: str = ""
+    bodies: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     with_fat: FatTerms | None = None
     fat_mm: float | None = None
     fat_note: str = ""
-    any_depth: Self | None = None
+    any_depth: BodyCalibration | None = None
+    site: SiteShift | None = None
 
     def __post_init__(self) -> None:
-        k = self.coefficients + SPREADS
+        k = self.coefficients + len(self.spread_powers) + 1
         if self.mean.shape != (k,) or self.covariance.shape != (k, k):
             raise BadDataError(
                 f"mean and covariance have shapes {self.mean.shape} and {self.covariance.shape}",
@@ -102,7 +111,7 @@ class BodyCalibration:
         if np.linalg.eigvalsh(self.covariance)[0] < -1e-9 * np.trace(self.covariance):
             raise BadDataError("the covariance has a negative eigenvalue", way_out="learn the calibration anew")
 
-    def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> Self:
+    def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
         """The calibration for a mass whose maps have these `presets.HEAD_PROFILE`, None for a map without one.
 
         Where they tell no depth it is this one, with the reason in `fat_note`.
@@ -113,25 +122,10 @@ class BodyCalibration:
         log_depth, why_not = fat.log_depth(profiles)
         if log_depth is None:
             return replace(self, with_fat=None, fat_note=why_not)
-        at, of_features = fat.contraction(log_depth), fat.feature_contraction(log_depth)
-        whole = np.block([[at, np.zeros((len(at), SPREADS))], [np.zeros((SPREADS, at.shape[1])), np.eye(SPREADS)]])
-        hidden = fat.hidden
-        return replace(
-            self,
-            centre=fat.centre[:2],
-            mean=whole @ fat.mean,
-            covariance=whole @ fat.covariance @ whole.T,
-            round_lumps=fat.round_lumps(log_depth),
-            information_inverse=of_features @ fat.information_inverse @ of_features.T,
-            most_leverage=fat.most_leverage,
-            hidden=None if hidden is None else replace(hidden, expected=hidden.expected @ of_features.T),
-            fit=fat.fit,
-            with_fat=None,
-            fat_mm=float(np.exp(log_depth)),
-            any_depth=replace(self, with_fat=None),
-        )
+        found: BodyCalibration = fat.at(self, log_depth, profiles)
+        return found
 
-    def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> Self:
+    def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> BodyCalibration:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth.
 
         What was learned at one depth says nothing beyond its table: a cubic was wrong there by up to a factor of 11.
@@ -146,6 +140,11 @@ class BodyCalibration:
     def between_exams(self) -> BetweenMaps:
         """How ln d differs between exams of one body of the table."""
         return BetweenMaps(float(np.exp(self.mean[-1])))
+
+    @property
+    def spread_powers(self) -> tuple[tuple[int, int], ...]:
+        """Powers of u and v in ln SD(B)."""
+        return ((0, 0), (1, 0))
 
     @property
     def unknowns(self) -> dict[str, float]:
@@ -184,7 +183,7 @@ class BodyCalibration:
         return np.asarray(c[0] + c[1] * (log_amplitude - self.centre[0]) + c[2] * (log_width - self.centre[1]))
 
     def body_and_error(
-        self, terms: FloatArray, log_amplitude: FloatArray, score: FloatArray
+        self, terms: FloatArray, log_amplitude: FloatArray, log_width: FloatArray, score: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Standard deviation of B, and what the coefficients' error does to ln d given it.
 
@@ -192,7 +191,7 @@ class BodyCalibration:
         ----------
         terms : (n, k) array
             `terms` of the maps.
-        log_amplitude : (n,) array
+        log_amplitude, log_width : (n,) arrays
         score : (n,) array
             Standard normal scores of the uncertain ln SD(B).
 
@@ -202,13 +201,13 @@ class BodyCalibration:
             Given `body_sd`, ln d is off by a normal error with mean `shift` and this variance: all parameters are
             jointly normal.
         """
-        x = np.stack([np.ones_like(log_amplitude), log_amplitude - self.centre[0]], axis=-1)
-        spread = self.covariance[-3:-1, -3:-1]
-        sd = np.sqrt(np.maximum(np.sum(x @ spread * x, axis=-1), 0.0))
-        body_sd = np.exp(x @ self.mean[-3:-1] + sd * score)
-        together = np.sum(terms @ self.covariance[:-SPREADS, -3:-1] * x, axis=-1)
+        x = monomials((log_amplitude - self.centre[0], log_width - self.centre[1]), self.spread_powers)
+        k, spread = self.coefficients, self.covariance
+        sd = np.sqrt(np.maximum(np.sum(x @ spread[k:-1, k:-1] * x, axis=-1), 0.0))
+        body_sd = np.exp(x @ self.mean[k:-1] + sd * score)
+        together = np.sum(terms @ spread[:k, k:-1] * x, axis=-1)
         slope = np.divide(together, sd, out=np.zeros_like(sd), where=sd > 0)
-        whole = np.sum(terms @ self.covariance[:-SPREADS, :-SPREADS] * terms, axis=-1)
+        whole = np.sum(terms @ spread[:k, :k] * terms, axis=-1)
         return body_sd, slope * score, np.maximum(whole - slope**2, 0.0)
 
     def leverage(self, amplitude: float, sigma_mm: float) -> float:

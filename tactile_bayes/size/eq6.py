@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, field
+from typing import Any
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.presets import Background, Noise
 from tactile_bayes.records import dataclass
 from tactile_bayes.size import omissions
@@ -35,6 +37,8 @@ class Recipe:
         True when somebody said so for a table made elsewhere, False when the program made the maps itself.
     flat_field
         Whether the head's own response was taken off, as in `MapRecipe`; None where the table does not say.
+    head
+        Head that the maps were made with; None where the table does not say.
     """
 
     normalise: str = "mean"
@@ -43,9 +47,17 @@ class Recipe:
     declared: bool = True
     noise: Noise = "independent"
     flat_field: bool | None = None
+    head: HeadShape | None = None
 
     def differences(
-        self, *, normalise: str, background: str, radius_mm: float, noise: str, flat_field: bool | None = None
+        self,
+        *,
+        normalise: str,
+        background: str,
+        radius_mm: float,
+        noise: str,
+        flat_field: bool | None = None,
+        head: HeadShape | None = None,
     ) -> list[str]:
         """Differences from another recipe in words; empty without any. Unknown settings do not differ."""
         pairs = [
@@ -57,7 +69,12 @@ class Recipe:
         if self.flat_field is not None and flat_field is not None:
             words = {True: "on", False: "off"}
             pairs.append(("flat field", words[self.flat_field], words[flat_field]))
-        return [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
+        found = [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
+        return found + self.head_differences(head)
+
+    def head_differences(self, head: HeadShape | None) -> list[str]:
+        """In what a map's head departs from the calibration's; empty where one of them is unknown."""
+        return [] if self.head is None or head is None else self.head.differences(head)
 
     @property
     def map_command(self) -> str:
@@ -71,11 +88,25 @@ class Recipe:
         parts.append(f"noise {self.noise}")
         if self.flat_field is not None:
             parts.append(f"flat field {'on' if self.flat_field else 'off'}")
+        if self.head is not None:
+            parts.append(f"head {self.head}")
         return ", ".join(parts)
 
     def as_dict(self) -> dict[str, object]:
         """Plain data for a calibration's file; unknown settings are left out."""
         return {name: value for name, value in asdict(self).items() if value is not None}
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], *, head: HeadShape | None = None) -> Recipe:
+        """Undo `as_dict`; `head` is that of files of earlier versions, which do not name one.
+
+        Raises
+        ------
+        BadDataError
+            When a value cannot be that of a head.
+        """
+        named = document.get("head")
+        return cls(**{**document, "head": head if named is None else HeadShape.from_document(named)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,13 +3,15 @@ r"""Size calibration conditional on the depth of fat, which is estimated from th
 Amplitude and width alone leave the lump's seat open: how far it stands out of the gland. Where no lump lies, the
 pressure over the head depends on the depth F of the fat-gland boundary, so the profile tells F. ln d is then a full
 cubic in :math:`u = \ln a - \alpha_0`, :math:`v = p - p_0` and :math:`w = \ln F - w_0`, which at one depth is a cubic in
-u and v. F is found by a quadratic learned over the same bodies; its error is part of what the cubic was learned with.
+u and v, or a Gaussian process in u, v and the profile (`fat_process`). F is found by a quadratic learned over the same
+bodies; its error is part of what the calibration was learned with.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,13 +22,14 @@ from tactile_bayes.records import dataclass
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
 from tactile_bayes.size.polynomials import monomials, powers
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 ORDER = 3
 POWERS = tuple((i, j, k) for k in range(ORDER + 1) for i, j in powers(ORDER - k))
 """Of u, v and w in the twenty terms of the cubic."""
 ROUND = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
 """The same for what makes a ball's map oval."""
-SPREADS = 3
-"""Parameters after the coefficients: those of `log_quadratic.PARAMETERS`."""
 Powers = tuple[tuple[int, int], ...]
 MOST_LEVERAGE = 1.0
 """A profile is unlike the table's where its leverage exceeds this multiple of the table's largest."""
@@ -87,8 +90,8 @@ class FatTerms:
         From profile to F.
     centre
         alpha_0, p_0 and w_0.
-    mean, covariance : (k + 3,), (k + 3, k + 3) arrays
-        Posterior of the k coefficients and of the three spreads.
+    mean, covariance : (k + s + 1,), (k + s + 1, k + s + 1) arrays
+        Posterior of the k coefficients, the s of ln SD(B) and ln SD(E).
     round_coefficients : (6,) array
         Of `ROUND` in q0, see `RoundLumps`.
     round_sd
@@ -118,8 +121,8 @@ class FatTerms:
     fit: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        k, c = len(self.coefficient_powers), len(self.feature_powers)
-        shapes = {"mean": (k + SPREADS,), "covariance": (k + SPREADS, k + SPREADS)}
+        k, c = self.coefficients + len(self.spread_powers) + 1, len(self.feature_powers)
+        shapes = {"mean": (k,), "covariance": (k, k)}
         shapes |= {"round_coefficients": (len(ROUND),), "information_inverse": (c, c)}
         for name, shape in shapes.items():
             values = getattr(self, name)
@@ -140,6 +143,53 @@ class FatTerms:
     def feature_powers(self) -> Powers:
         """The same of the features."""
         raise NotImplementedError
+
+    @property
+    def spread_powers(self) -> Powers:
+        """The same of the coefficients of ln SD(B)."""
+        return ((0, 0), (1, 0))
+
+    @property
+    def coefficients(self) -> int:
+        """How many there are."""
+        return len(self.coefficient_powers)
+
+    def at(
+        self,
+        base: DataclassInstance,
+        log_depth: float,
+        profiles: Sequence[tuple[float, ...] | None],  # noqa: ARG002, for forms that depend on it
+    ) -> Any:
+        """The `BodyCalibration` for one depth of fat, and one profile where the form depends on it.
+
+        Parameters
+        ----------
+        base
+            The `BodyCalibration` for any depth.
+        log_depth
+            ln F of the mass.
+        profiles
+            Of its maps.
+        """
+        return replace(base, **self.fields_at(base, log_depth))
+
+    def fields_at(self, base: DataclassInstance, log_depth: float) -> dict[str, Any]:
+        """The fields in which the calibration for one depth differs from `base`."""
+        whole = _block_diagonal(self.contraction(log_depth), self._contracted(self.spread_powers, log_depth), np.eye(1))
+        of_features, hidden = self.feature_contraction(log_depth), self.hidden
+        return {
+            "centre": self.centre[:2],
+            "mean": whole @ self.mean,
+            "covariance": whole @ self.covariance @ whole.T,
+            "round_lumps": self.round_lumps(log_depth),
+            "information_inverse": of_features @ self.information_inverse @ of_features.T,
+            "most_leverage": self.most_leverage,
+            "hidden": None if hidden is None else replace(hidden, expected=hidden.expected @ of_features.T),
+            "fit": self.fit,
+            "with_fat": None,
+            "fat_mm": float(np.exp(log_depth)),
+            "any_depth": replace(base, with_fat=None),
+        }
 
     def depths_apart(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float, float] | None:
         """Least and largest depth of fat in mm, where maps differ too much to be of one body.
@@ -167,11 +217,15 @@ class FatTerms:
             return None, f"the fat under the head is {fat_mm:.3g} mm deep (table: {low:.3g} to {high:.3g} mm)"
         return log_depth, ""
 
-    def _log_depths(self, profiles: Sequence[tuple[float, ...] | None]) -> FloatArray:
-        """(n,) ln F of the profiles that resemble the table's."""
+    def alike(self, profiles: Sequence[tuple[float, ...] | None]) -> FloatArray:
+        """(n, 3) profiles that resemble the table's."""
         known = np.array([one for one in profiles if one is not None], dtype=np.float64)
         known = known.reshape(-1, len(self.depth.centre))
-        return self.depth.log_depth(known[self.depth.unlike(known) <= MOST_LEVERAGE])
+        return np.asarray(known[self.depth.unlike(known) <= MOST_LEVERAGE])
+
+    def _log_depths(self, profiles: Sequence[tuple[float, ...] | None]) -> FloatArray:
+        """(n,) ln F of the profiles that resemble the table's."""
+        return self.depth.log_depth(self.alike(profiles))
 
     def contraction(self, log_depth: float) -> FloatArray:
         """Matrix that takes the k coefficients to those at one depth."""
@@ -215,6 +269,15 @@ class FatCubic(FatTerms):
 
 
 _CUBIC: Powers = tuple((powers(ORDER).index((i, j)), k) for i, j, k in POWERS)
+
+
+def _block_diagonal(*blocks: FloatArray) -> FloatArray:
+    whole = np.zeros(tuple(np.sum([one.shape for one in blocks], axis=0)))
+    row = column = 0
+    for one in blocks:
+        whole[row : row + len(one), column : column + one.shape[1]] = one
+        row, column = row + len(one), column + one.shape[1]
+    return whole
 
 
 def cubic_terms(u: FloatArray, v: FloatArray, w: FloatArray) -> FloatArray:

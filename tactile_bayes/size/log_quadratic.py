@@ -13,7 +13,6 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.body_calibration import SPREAD_PARAMETERS, BodyCalibration
 from tactile_bayes.size.fat_depth import ORDER as FAT_ORDER
-from tactile_bayes.size.fat_depth import SPREADS
 from tactile_bayes.size.polynomials import monomials, powers
 
 QUADRATIC = ("1", "u", "v", "u2", "uv", "v2")
@@ -51,11 +50,11 @@ class LogQuadratic(BodyCalibration):
 
     def log_size(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) ln d without B and E, with the mean coefficients."""
-        return np.asarray(self.terms(log_amplitude, log_width) @ self.mean[:-SPREADS])
+        return np.asarray(self.terms(log_amplitude, log_width) @ self.mean[: self.coefficients])
 
     def width_slope(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) derivative of ln d by p: the relative growth of size with the map's width."""
-        b = np.array([j for _, j in self._powers]) * self.mean[:-SPREADS]
+        b = np.array([j for _, j in self._powers]) * self.mean[: self.coefficients]
         lower = [(i, max(j - 1, 0)) for i, j in self._powers]
         return np.asarray(monomials((log_amplitude - self.centre[0], log_width - self.centre[1]), lower) @ b)
 

@@ -25,6 +25,7 @@ from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, turned
 from tactile_bayes.size.posterior import SizePosterior, shares
+from tactile_bayes.size.site_shift import site_log_shift, site_slope, site_variance
 
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
@@ -120,6 +121,12 @@ class ShapeDraws:
         return replace(self, **drawn, labels=None)
 
 
+def corrected_log_size(calibration: BodyCalibration, shape: ShapeDraws) -> FloatArray:
+    """(n,) ln d of a map's draws without B and E, with the site's correction where there is one."""
+    size = calibration.log_size(shape.log_amplitude, shape.log_width)
+    return size + site_log_shift(calibration.site, shape.log_width)
+
+
 def pooled_size(
     maps: Sequence[ShapeDraws],
     *,
@@ -151,12 +158,14 @@ def pooled_size(
     """
     calibration = calibration.at_fat([one.profile for one in maps])
     used, replicates = _matched(maps, number, rng)
-    by_map = np.stack([calibration.log_size(m.log_amplitude, m.log_width) for m in used])
-    log_size = by_map if used is maps else [calibration.log_size(m.log_amplitude, m.log_width) for m in maps]
+    by_map = np.stack([corrected_log_size(calibration, m) for m in used])
+    log_size = by_map if used is maps else [corrected_log_size(calibration, m) for m in maps]
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
     oval, slope = _elongation(maps, calibration, priors.shape)
     points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
-    pool = _Pool(used, by_map, centre, noise, points, oval.at(points[:, 3:]), replicates, calibration, priors.known)
+    terms = np.stack([calibration.terms(m.log_amplitude, m.log_width) for m in used])
+    half = oval.at(points[:, 3:])
+    pool = _Pool(used, by_map, terms, centre, noise, points, half, replicates, calibration, priors.known)
     figures = {
         "oval_probability": oval.probability,
         "oval_half_log_ratio": oval.magnitude,
@@ -179,6 +188,8 @@ class _Pool:
     ----------
     by_map : (k, n) array
         ln d by each map.
+    terms : (k, n, t) array
+        The calibration's terms.
     centre, noise : (k,) arrays
         Its mean and variance.
     points : (n, `DIMENSIONS`) array
@@ -188,6 +199,7 @@ class _Pool:
 
     maps: Sequence[ShapeDraws]
     by_map: FloatArray
+    terms: FloatArray
     centre: FloatArray
     noise: FloatArray
     points: FloatArray
@@ -202,7 +214,7 @@ class _Pool:
         weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
         weight /= weight.sum(axis=0)
         z, score = normal_quantile(self.points[:, [0, 2]].T)
-        known, variances = _left_open(self.maps, self.calibration, self.known, tau=tau, weight=weight, score=score)
+        known, variances = self._left_open(tau=tau, weight=weight, score=score)
         map_part = np.sum(weight * self.by_map, axis=0)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
         mean, sd = map_part + known + longer, np.sqrt(sum(variances.values()))
@@ -218,6 +230,31 @@ class _Pool:
             self.replicates,
             {"between_map_sd": float(np.sqrt(np.mean(tau**2))), **figures, **weights},
         )
+
+    def _left_open(
+        self, *, tau: FloatArray, weight: FloatArray, score: FloatArray
+    ) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Distribution of ln d given each draw of the maps, a normal: its mean, and its variances by source.
+
+        Parameters
+        ----------
+        tau : (n,) array
+        weight : (k, n) array
+            Of the maps, for each tau.
+        score : (n,) array
+            Normal scores of the uncertain spread of B.
+        """
+        log_a, log_width = (np.stack([getattr(m, name) for m in self.maps]) for name in ("log_amplitude", "log_width"))
+        middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
+        terms = self.terms[0] if len(weight) == 1 else np.einsum("kn,knt->nt", weight, self.terms)
+        body_sd, shift, error = self.calibration.body_and_error(terms, middle_a, middle_width, score)
+        expected, left = _known_body(self.calibration, self.known, middle_a, middle_width)
+        return expected + shift, {
+            "between_maps": np.sum(weight**2, axis=0) * tau**2,
+            "calibration": error,
+            "body": (left * body_sd) ** 2,
+            **site_variance(self.calibration.site, middle_width),
+        }
 
     def _evened(
         self, mean: FloatArray, sd: FloatArray, z: FloatArray, longer: FloatArray
@@ -248,39 +285,6 @@ def _picked(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
         members = members if len(members) else np.arange(len(have))
         index[places] = rng.permutation(np.resize(rng.permutation(members), len(places)))
     return index
-
-
-def _left_open(
-    maps: Sequence[ShapeDraws],
-    calibration: BodyCalibration,
-    known: Mapping[str, float],
-    *,
-    tau: FloatArray,
-    weight: FloatArray,
-    score: FloatArray,
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Distribution of ln d given each draw of the maps, a normal: its mean, and its variances by source.
-
-    Parameters
-    ----------
-    maps
-        k maps with n draws each.
-    tau : (n,) array
-    weight : (k, n) array
-        Of the maps, for each tau.
-    score : (n,) array
-        Normal scores of the uncertain spread of B.
-    """
-    log_a, log_width = (np.stack([getattr(m, name) for m in maps]) for name in ("log_amplitude", "log_width"))
-    middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
-    terms = np.sum(weight[..., None] * calibration.terms(log_a, log_width), axis=0)
-    body_sd, shift, error = calibration.body_and_error(terms, middle_a, score)
-    expected, left = _known_body(calibration, known, middle_a, middle_width)
-    return expected + shift, {
-        "between_maps": np.sum(weight**2, axis=0) * tau**2,
-        "calibration": error,
-        "body": (left * body_sd) ** 2,
-    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -346,8 +350,7 @@ def pool_maps(
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     centres = {
-        i: float(np.nanmean(calibration.log_size(shape.log_amplitude, shape.log_width)))
-        for i, shape in zip(found, used, strict=True)
+        i: float(np.nanmean(corrected_log_size(calibration, shape))) for i, shape in zip(found, used, strict=True)
     }
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
@@ -387,6 +390,7 @@ def _elongation(
         excess += both.mean(axis=0) / k
         covariance += np.cov(both.T) / k**2
         slope += float(np.nanmean(calibration.width_slope(m.log_amplitude, m.log_width))) / k
+    slope += site_slope(calibration.site)
     balls = calibration.round_lumps
     covariance += (balls.body_sd**2 + balls.exam_sd**2 / k + 1e-12) * np.eye(2)
     return elongation(excess, covariance, slope=slope, prior=prior), slope

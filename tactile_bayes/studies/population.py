@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.forward.scene import Scene
+from tactile_bayes.errors import BadDataError, TactileBayesError
+from tactile_bayes.forward.population import BodyPrior
+from tactile_bayes.forward.scene import FLAT_MM, Head, Scene
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.head_shape import FLAT_RADIUS_MM, HeadShape
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
@@ -26,6 +28,7 @@ UNKNOWNS = ("depth_mm", "stiffness_ratio", "seat", "fat_kpa", "gland_ratio", "th
 SHAPE_COVARIANCE = ("var_log_a", "cov_log_a_p", "cov_log_a_q", "var_p", "cov_p_q", "var_q")
 FIT_RADIUS_MM = 20.0
 _DRAWS_SEED = 1
+BODY_COLUMNS = tuple(one.name for one in fields(BodyPrior))
 
 
 def measuring_options() -> EstimateOptions:
@@ -58,6 +61,8 @@ class MassRow:
         felt one.
     normalise
         How the map's frames were, see `MapRecipe`.
+    head_rows, head_columns, head_pitch_mm, head_radius_mm, head_shoulder_mm, head_rim_mm
+        As in `forward.scene.Head`; the radius is None for a flat head, and all are in rows of earlier versions.
     """
 
     body: int
@@ -84,6 +89,12 @@ class MassRow:
     head_profile_y2: float | None = None
     head_profile_y4: float | None = None
     normalise: str = "mean"
+    head_rows: int | None = None
+    head_columns: int | None = None
+    head_pitch_mm: float | None = None
+    head_radius_mm: float | None = None
+    head_shoulder_mm: float | None = None
+    head_rim_mm: float | None = None
 
 
 def measure_mass(
@@ -126,6 +137,7 @@ def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: s
         tissue.gland_ratio,
         tissue.thickness_mm,
         normalise=normalise,
+        **head_columns(scene.head),
     )
     try:
         tactile_map = build_map(scan, normalise=normalise)
@@ -155,6 +167,40 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
         "sigma_y_mm": float(np.exp(mean[1] - mean[2])),
         **{name: float(value) for name, value in zip(SHAPE_COVARIANCE, upper, strict=True)},
     }
+
+
+def head_columns(head: Head) -> dict[str, Any]:
+    """Columns of a table that name its head."""
+    found: dict[str, Any] = {f"head_{name}": value for name, value in asdict(head).items()}
+    return found | ({"head_radius_mm": None} if head.radius_mm >= FLAT_RADIUS_MM else {})
+
+
+def table_head(columns: Mapping[str, Sequence[Any]]) -> HeadShape:
+    """Head that a table's maps were made with.
+
+    Tables of earlier versions, which do not name it, are of the paper's head: there was no other.
+
+    Raises
+    ------
+    BadDataError
+        When rows differ in it.
+    """
+    names = [f"head_{one.name}" for one in fields(Head)]
+    found = set(zip(*(columns[name] for name in names), strict=True))
+    if len(found) > 1:
+        raise BadDataError("its maps were made with several heads", way_out="learn from the rows of one head")
+    rows, wide, pitch, radius, shoulder, rim = found.pop()
+    if rows is None:
+        head = Head()
+    else:
+        head = Head(rows, wide, pitch, FLAT_MM if radius is None else radius, shoulder or 0.0, rim or 0.0)
+        Scene(head=head)  # refuses what is no head
+    return HeadShape.of(head.surface_mm(), head.pitch_mm, rim_mm=head.rim_mm)
+
+
+def table_bodies(columns: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
+    """Ranges of a table's lumps and bodies, by its columns."""
+    return {name: (min(columns[name]), max(columns[name])) for name in BODY_COLUMNS}
 
 
 def population_table(columns: Mapping[str, Sequence[float | None]]) -> PopulationTable:

@@ -11,6 +11,7 @@ from tactile_bayes.forward.plane.study import StudyRow, learn_as_printed
 from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
 from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.eq6 import SizeCalibration
+from tactile_bayes.size.site_shift import site_log_shift
 from tactile_bayes.studies.forward_tradeoff import Measured
 
 Sizes = Callable[[float, float, float | None], list[float]]
@@ -108,7 +109,8 @@ def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
 
     def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
         width = mean_width_mm(sigma_x_mm, sigma_y_mm)
-        return [float(np.exp(calibration.log_size(np.log(np.array(amplitude)), np.log(np.array(width)))))]
+        log_a, log_width = np.log(np.array(amplitude)), np.log(np.array(width))
+        return [float(np.exp(calibration.log_size(log_a, log_width) + site_log_shift(calibration.site, log_width)))]
 
     scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.mean[-3])))
     return SizeRule(sizes, float(scatter), f"{calibration.form_name} of {name}", calibration.outside)

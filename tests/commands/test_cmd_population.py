@@ -105,6 +105,15 @@ def test_what_the_table_fixes_cannot_be_declared(table: Path, tmp_path: Path, ar
     assert not (tmp_path / "x.json").exists()
 
 
+def test_a_gaussian_process_needs_more_bodies_than_a_quadratic(table: Path, tmp_path: Path) -> None:
+    words = ("calibrate", "size", table, "-o", "size.json", "--form")
+    done = run_here(*words, "gaussian-process", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "fewer than 80 bodies have a lump and a head profile" in done.stderr
+    assert not (tmp_path / "size.json").exists()
+    assert run_here(*words, "log-quadratic", cwd=tmp_path).returncode == 0
+
+
 @pytest.mark.parametrize("way", ["gain", "mean", ""])
 def test_a_calibration_keeps_how_its_maps_were_normalised(tmp_path: Path, way: str) -> None:
     rows = [replace(row(body, exam), normalise=way) for body in range(40) for exam in range(2)]

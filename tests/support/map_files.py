@@ -26,5 +26,5 @@ def assert_same(one: TactileMap, two: TactileMap) -> None:
         else:
             assert a.dtype == b.dtype
             assert a.tobytes() == b.tobytes(), name
-    for name in ("recipe", "background", "frame_count", "quality", "masked_taxels"):
+    for name in ("recipe", "background", "frame_count", "quality", "masked_taxels", "head"):
         assert getattr(one, name) == getattr(two, name), name

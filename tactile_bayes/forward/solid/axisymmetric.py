@@ -156,6 +156,14 @@ def condense_lump(
     return CondensedLump(mesh.node_mm[_skin(mesh), 0], tuple(modes))
 
 
+def condense_twist(geometry: LumpGeometry, tissue: Tissue, *, size: MeshSize | None = None) -> CondensedMode:
+    """Condense twisting about the vertical, u_theta of order 0: no skin sinks, but a lump that is no ball is turned."""
+    mesh = lump_mesh(geometry, size)
+    fat, gland = tissue.fat_kpa, tissue.fat_kpa * tissue.gland_ratio
+    modulus = np.where((mesh.region == EXTERIOR_GLAND) | (mesh.region == INTERIOR_GLAND), gland, fat)
+    return _condense(mesh, element_stiffness(mesh, nu=tissue.nu), modulus, 0, twist=True)
+
+
 def orders_needed(geometry: LumpGeometry) -> int:
     r"""Fourier orders that carry all but 1e-4 of the perturbation.
 
@@ -217,19 +225,24 @@ def _polynomial(factor: FloatArray) -> FloatArray:
 
 def _quadrature(mesh: LumpMesh) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Shape functions (9 points, 9 nodes), gradients (e, 9, 9, 2), points (e, 9, 2) and r dr dz weights (e, 9)."""
-    x, w = np.polynomial.legendre.leggauss(3)
-    value = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
-    slope = np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
-    shape = np.einsum("ai,bj->abij", value, value).reshape(9, 9)
-    local = np.stack([np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)], axis=-1).reshape(
-        9, 9, 2
-    )
+    shape, local, cell = lagrange_points()
     node = mesh.node_mm[mesh.element]
     jacobian = np.einsum("qnk,enx->eqxk", local, node)
     point = np.einsum("qn,enx->eqx", shape, node)
     gradient = np.einsum("qnk,eqkx->eqnx", local, np.linalg.inv(jacobian))
-    weight = np.abs(np.linalg.det(jacobian)) * np.outer(w, w).ravel() * point[..., 0]
+    weight = np.abs(np.linalg.det(jacobian)) * cell * point[..., 0]
     return shape, gradient, point, weight
+
+
+def lagrange_points() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Biquadratic shape functions (9 points, 9 nodes), local gradients (9, 9, 2) and weights (9,) at Gauss points."""
+    x, w = np.polynomial.legendre.leggauss(3)
+    value = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2], axis=-1)
+    slope = np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1)
+    shape = np.einsum("ai,bj->abij", value, value).reshape(9, 9)
+    across, along = np.einsum("ai,bj->abij", slope, value), np.einsum("ai,bj->abij", value, slope)
+    slopes = np.stack([across, along], axis=-1).reshape(9, 9, 2)
+    return shape, slopes, np.outer(w, w).ravel()
 
 
 def _strains(shape: FloatArray, gradient: FloatArray, r_mm: FloatArray) -> FloatArray:
@@ -259,17 +272,20 @@ def _skin(mesh: LumpMesh) -> IntArray:
     return mesh.surface[1:-1]
 
 
-def _unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
+def order_unknowns(mesh: LumpMesh, order: int, *, twist: bool = False) -> tuple[IntArray, FloatArray]:
     """Index (-1: fixed) and sign of the reduced unknown for each of the (n, 3) displacements of one order.
 
     The base and the far rim do not move. On the axis, displacements must be single-valued: order 0 keeps u_z, order 1
-    a sideways motion with u_theta = -u_r, higher orders nothing. Order 0 has no torsion.
+    a sideways motion with u_theta = -u_r, higher orders nothing. Order 0 has no torsion, or with `twist` nothing else.
     """
     r, z = mesh.node_mm.T
     free = np.ones((len(r), 3), dtype=bool)
     free[(z == z.max()) | (r == r.max())] = False
     axis = r == 0
-    if order == 0:
+    if twist:
+        free[:, [0, 2]] = False
+        free[axis] = False
+    elif order == 0:
         free[:, 1] = False
         free[axis, 0] = False
     elif order == 1:
@@ -285,10 +301,12 @@ def _unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
     return number, sign
 
 
-def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int) -> CondensedMode:
+def _condense(
+    mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int, *, twist: bool = False
+) -> CondensedMode:
     from scipy.sparse.linalg import splu
 
-    number, sign = _unknowns(mesh, order)
+    number, sign = order_unknowns(mesh, order, twist=twist)
     inside = mesh.region >= INTERIOR_FAT
     stiffness = elements[0] + order * elements[1] + order**2 * elements[2]
     boundary = np.unique(number[mesh.arc])
@@ -300,7 +318,8 @@ def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, ord
     unit = np.zeros((len(used), len(at)))
     unit[at, np.arange(len(at))] = 1.0
     moved = factor.solve(unit)
-    skin = moved[np.searchsorted(used, number[_skin(mesh), 2])]
+    sinking = number[_skin(mesh), 2]
+    skin = np.zeros((len(sinking), len(at))) if twist else moved[np.searchsorted(used, sinking)]
     flexibility = moved[at]
 
     unit_kpa = np.ones_like(modulus_kpa)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,9 @@ from tactile_bayes.presets import HEAD_PITCH_MM
 # Functions that carry less than this share of the largest are left out.
 RANK_TOLERANCE: Final = 1e-5
 # Step of the tables in r: linear interpolation between entries is then off by less than 1e-4 of a function.
-_STEP_MM: Final = 0.05
+STEP_MM: Final = 0.05
 # Largest r in the tables.
-_REACH_MM: Final = 75.0
+REACH_MM: Final = 75.0
 # Functions with a sum of squares under the face below this share of a square's own compliance are left out of a frame.
 _LEAST_WEIGHT: Final = 1e-6
 # Directions of the ring that stands for a square when a function is averaged over it.
@@ -57,14 +57,14 @@ class SkinPerturbation:
     @property
     def reach_mm(self) -> float:
         """Distance beyond which the change is neglected."""
-        return (len(self.table) - 1) * _STEP_MM
+        return (len(self.table) - 1) * STEP_MM
 
     def vectors(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, c) values at points relative to the axis, and (c,) signs: the change is ``values diag(signs) values^T``.
 
         Orders above 0 give two columns, for the cosine and the sine of the angle.
         """
-        distance = np.hypot(x_mm, y_mm) / _STEP_MM
+        distance = np.hypot(x_mm, y_mm) / STEP_MM
         below = np.minimum(distance.astype(np.int64), len(self.table) - 2)
         share = np.clip(distance - below, 0.0, 1.0)[:, None]
         value = (1.0 - share) * self.table[below] + share * self.table[below + 1]
@@ -98,19 +98,19 @@ def skin_perturbation(
     parts = [(mode.order, *np.linalg.eigh(mode.matrix)) for mode in condensed.perturbation(lump_kpa)]
     largest = max(float(np.abs(value).max()) for _, value, _ in parts)
     r: FloatArray = (
-        np.arange(int(np.ceil(min(_REACH_MM, condensed.radius_mm[-1]) / _STEP_MM)) + 1, dtype=np.float64) * _STEP_MM
+        np.arange(int(np.ceil(min(REACH_MM, condensed.radius_mm[-1]) / STEP_MM)) + 1, dtype=np.float64) * STEP_MM
     )
     tables, orders, signs = [np.zeros((len(r), 0))], [], []
     for order, value, vector in parts:
         kept = np.abs(value) > tolerance * largest
         spline = skin_spline(condensed.radius_mm, vector[:, kept] * np.sqrt(np.abs(value[kept])), order=order)
-        tables.append(_square_mean(spline, r, order=order, square_mm=square_mm, last_mm=float(condensed.radius_mm[-1])))
+        tables.append(square_mean(spline, r, order=order, square_mm=square_mm, last_mm=float(condensed.radius_mm[-1])))
         orders += [order] * int(kept.sum())
         signs += list(np.sign(value[kept]))
     return SkinPerturbation(np.concatenate(tables, axis=1), np.array(orders, dtype=np.int64), np.array(signs))
 
 
-def _square_mean(
+def square_mean(
     function: Callable[[FloatArray], FloatArray], r_mm: FloatArray, *, order: int, square_mm: float, last_mm: float
 ) -> FloatArray:
     """(t, k) means of ``function(r) cos(m theta)`` over a square about a point at angle 0, at distances `r_mm`.
@@ -127,11 +127,19 @@ def _square_mean(
     return mean
 
 
+class SkinChange(Protocol):
+    """A low-rank change of the skin's compliance."""
+
+    def vectors(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, c) values at points relative to the lump's axis and (c,) signs, as `SkinPerturbation.vectors`."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedLump:
     """A perturbation and the place of its axis in the scene's `plane`, mm."""
 
-    perturbation: SkinPerturbation
+    perturbation: SkinChange
     x_mm: float
     y_mm: float
 

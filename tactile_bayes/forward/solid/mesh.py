@@ -19,7 +19,7 @@ from tactile_bayes.geometry import FloatArray
 IntArray = NDArray[np.int64]
 EXTERIOR_FAT, EXTERIOR_GLAND, INTERIOR_FAT, INTERIOR_GLAND = range(4)
 # A layer boundary nearer than this to touching the spheroid (as a share of its vertical half axis) is moved away.
-_LEAST_CAP: Final = 0.04
+LEAST_CAP: Final = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +69,9 @@ class LumpGeometry:
         """Depth of the layer boundary, moved by up to 4 % of the half height where it nearly touches the lump."""
         offset = (self.fat_mm - self.depth_mm) / self.half_height_mm
         gap = abs(offset) - 1.0
-        if abs(gap) >= _LEAST_CAP:
+        if abs(gap) >= LEAST_CAP:
             return self.fat_mm
-        moved = np.sign(offset) * (1.0 + (_LEAST_CAP if gap >= 0 else -_LEAST_CAP))
+        moved = np.sign(offset) * (1.0 + (LEAST_CAP if gap >= 0 else -LEAST_CAP))
         return float(self.depth_mm + moved * self.half_height_mm)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.fat_depth import FatTerms
 from tactile_bayes.size.hidden import RoundLumps
 from tactile_bayes.size.learn.fat_depth import learn_fat_cubic
 from tactile_bayes.size.learn.regression import (
@@ -17,13 +20,21 @@ from tactile_bayes.size.learn.regression import (
 from tactile_bayes.size.log_quadratic import LogQuadratic, quadratic_terms
 
 
-def learn_log_quadratic(table: PopulationTable, *, recipe: Recipe, source: str = "") -> LogQuadratic:
+def learn_log_quadratic(
+    table: PopulationTable,
+    *,
+    recipe: Recipe,
+    source: str = "",
+    learn_fat: Callable[[PopulationTable], FatTerms | None] = learn_fat_cubic,
+) -> LogQuadratic:
     """Learn the calibration; with the part for the depth of fat where the table has head profiles.
 
     Parameters
     ----------
     table
         At least twenty bodies; exams in pairs or more tell the spread between exams.
+    learn_fat
+        Learns that part: `learn_fat_cubic` or `learn_fat_process`.
 
     Raises
     ------
@@ -53,5 +64,5 @@ def learn_log_quadratic(table: PopulationTable, *, recipe: Recipe, source: str =
         hidden=hidden_terms(table, data, mean),
         fit=figures(table, data, mean),
         source=source,
-        with_fat=learn_fat_cubic(table),
+        with_fat=learn_fat(table),
     )

@@ -173,7 +173,7 @@ class BodyRegression:
 
     def body_residuals(self, mode: FloatArray) -> FloatArray:
         """(groups,) residual of each body's mean."""
-        return np.asarray(self.mean_log_d - self.mean_terms @ mode[:-3])
+        return np.asarray(self.mean_log_d - self.mean_terms @ mode[: self.terms.shape[1]])
 
     def posterior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of k coefficients, ln(sd between bodies), its slope, ln(sd between exams), as normal.

@@ -14,9 +14,9 @@ from tactile_bayes.forward.solid.axisymmetric import (
     CondensedLump,
     Tissue,
     _assemble,
-    _unknowns,
     condense_lump,
     element_stiffness,
+    order_unknowns,
     orders_needed,
     skin_spline,
 )
@@ -171,7 +171,7 @@ def test_without_a_lump_the_elements_sink_as_the_exact_layers() -> None:
     """A force on the axis: finite elements against the Hankel transform, through the difference of two bodies."""
     fine = MeshSize(arc=24, rings=8, core=4, grade=1.25, reach_mm=600.0)
     mesh = lump_mesh(CENTRED, fine)
-    number, sign = _unknowns(mesh, 0)
+    number, sign = order_unknowns(mesh, 0)
     k = element_stiffness(mesh, nu=0.495)[0]
     everywhere = np.ones(len(mesh.region), dtype=bool)
     sinkings = []

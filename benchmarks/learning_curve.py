@@ -1,0 +1,116 @@
+"""Errors of a size calibration on bodies that it was not learned from, by the number of bodies and by the form.
+
+    python -m benchmarks.learning_curve POPULATION.csv
+
+POPULATION.csv is a table of `population`. From it, N bodies are drawn at random, each form learns from them, and the
+others are sized by the mean of their exams. Printed: mean absolute error and bias, share of 95 % intervals that hold,
+SD of standardised errors, median half width; then the same of the last form by classes of lumps.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.pipeline.size_calibration import FORMS, population_learner, rows_of_one_way
+from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.learn.regression import PopulationTable
+from tactile_bayes.studies.population import population_table
+
+_STEP = 1e-3
+_NORMAL_95 = 1.959964
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("table", type=Path)
+    parser.add_argument("--normalise", default="gain")
+    parser.add_argument("--bodies", type=int, nargs="+", default=[250, 500, 1000, 2000])
+    parser.add_argument("--forms", nargs="+", choices=FORMS, default=["log-quadratic", "gaussian-process"])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    way, columns = rows_of_one_way(read_table(given.table, "population.table.json"), given.normalise)
+    table = population_table(columns)
+    bodies = np.unique(table.body)
+    for number in given.bodies:
+        if number > len(bodies) - 20:
+            print(f"{number:5d}: the table has {len(bodies)} bodies")
+            continue
+        for form in given.forms:
+            learn = partial(population_learner(form), recipe=Recipe(way, "free", 20.0, noise="field"))
+            found = [_held_out(table, learn, number, given.seed + i) for i in range(given.repeats)]
+            error, variance, body = (np.concatenate([one[i] for one in found]) for i in range(3))
+            print(f"{number:5d} {form:17s} {_figures(error, variance)}", flush=True)
+    _by_class(table, error, variance, body)
+
+
+def _held_out(
+    table: PopulationTable, learn: Callable[..., BodyCalibration], number: int, seed: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(b,) log errors, their variances and the bodies' numbers, of those that took no part."""
+    bodies = np.unique(table.body)
+    taught = np.random.default_rng(seed).permutation(bodies)[:number]
+    calibration = learn(table.rows(np.isin(table.body, taught)))
+    rest = np.setdiff1d(bodies, taught)
+    found = np.array([_sized(calibration, table.rows(table.body == one)) for one in rest])
+    return found[:, 0], found[:, 1], rest
+
+
+def _sized(calibration: BodyCalibration, exams: PopulationTable) -> tuple[float, float]:
+    """Log error of one body by the mean of its exams, and the variance that the calibration states."""
+    profiles: Sequence[tuple[float, ...] | None] = [None] * len(exams)
+    if exams.profile is not None:
+        profiles = [tuple(one) if np.isfinite(one).all() else None for one in exams.profile]
+    at, a, p = calibration.at_fat(profiles), exams.log_amplitude, exams.log_width
+    size = at.log_size(a, p)
+    slope = np.stack([(at.log_size(a + _STEP, p) - at.log_size(a - _STEP, p)) / (2 * _STEP), at.width_slope(a, p)])
+    own = np.einsum("in,nij,jn->n", slope, exams.covariance[:, :2, :2], slope).mean()
+    middle = a.mean(keepdims=True), p.mean(keepdims=True)
+    body, _, error = at.body_and_error(at.terms(a, p).mean(axis=0, keepdims=True), *middle, np.zeros(1))
+    variance = float(body[0] ** 2 + error[0] + (own + np.exp(2 * at.mean[-1])) / len(exams))
+    return float(size.mean() - np.log(exams.d_mm[0])), variance
+
+
+def _figures(error: FloatArray, variance: FloatArray) -> str:
+    standard = error / np.sqrt(variance)
+    return (
+        f"{len(error):5d} bodies  MAE {100 * np.mean(np.abs(np.expm1(error))):5.2f} %  "
+        f"bias {100 * np.mean(np.expm1(error)):+5.2f} %  held {100 * np.mean(np.abs(standard) < _NORMAL_95):5.1f} %  "
+        f"SD of standardised errors {standard.std():.2f}  median half width "
+        f"{100 * np.median(np.expm1(_NORMAL_95 * np.sqrt(variance))):.1f} %"
+    )
+
+
+def _by_class(table: PopulationTable, error: FloatArray, variance: FloatArray, body: FloatArray) -> None:
+    """The last form's figures for soft, centred, deep and faint lumps, and for clear ones."""
+    first = {one: int(np.flatnonzero(table.body == one)[0]) for one in np.unique(table.body)}
+    row = np.array([first[one] for one in body])
+    stiffness, seat = np.exp(table.unknowns["stiffness_ratio"][row]), table.unknowns["seat"][row]
+    ratio = np.exp(table.unknowns["depth_mm"][row]) / table.d_mm[row]
+    amplitude = np.exp(table.log_amplitude[row])
+    classes = {
+        "soft (E2/E1 below 15)": stiffness < 15,
+        "hard (50 and more)": stiffness >= 50,
+        "centred (seat 0)": seat == 0,
+        "out of the gland (seat 0.8 and more)": seat >= 0.8,
+        "deep (h/d 1.4 and more)": ratio >= 1.4,
+        "shallow (h/d below 0.8)": ratio < 0.8,
+        "faint (amplitude below 0.1)": amplitude < 0.1,
+        "clear (amplitude 0.3 and more)": amplitude >= 0.3,
+    }
+    for name, members in classes.items():
+        if members.sum() > 1:
+            print(f"{name:37s} {_figures(error[members], variance[members])}")
+
+
+if __name__ == "__main__":
+    main()

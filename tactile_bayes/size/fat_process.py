@@ -1,0 +1,229 @@
+r"""Size calibration as a Gaussian process in amplitude, width and the head's pressure profile.
+
+With :math:`x = (u, v, z_1, z_2, z_3)`, z the standardised profile, and u, v, w as in `fat_depth`,
+
+.. math:: \ln d = \beta_0 + \beta_1 u + \beta_2 v + \beta_3 w + h(x) + B + E, \quad
+          h \sim GP(0, k), \quad k(x, x') = s_h^2 \exp\Big(-\tfrac12 \sum_i (x_i - x_i')^2 / l_i^2\Big),
+
+by a subset of regressors (Quinonero-Candela & Rasmussen 2005, sec. 3): with the points U and
+:math:`K_{UU} = L L^T`, :math:`h(x) = s_h\, k(x, U) L^{-T} c`, the weights c being standard normal a priori. So the
+calibration is linear in its coefficients, as the others are. ln SD(B) is a full quadratic in u, v and w: a deep or
+faint lump tells less than one that is shallow and hard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.fat_depth import ORDER, POWERS, FatTerms, Powers
+from tactile_bayes.size.polynomials import monomials, powers
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from _typeshed import DataclassInstance
+
+AT_ONE_DEPTH = ((0, 0), (1, 0), (0, 1))
+"""Powers of u and v in the part without the process, at one depth of fat."""
+LINEAR_POWERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+"""Powers of u, v and w in that part: 1, u, v and w."""
+LINEAR: Powers = tuple((AT_ONE_DEPTH.index((i, j)), k) for i, j, k in LINEAR_POWERS)
+SPREAD = tuple((i, j, k) for k in range(3) for i, j in powers(2 - k))
+"""Powers of u, v and w in ln SD(B)."""
+_SPREAD: Powers = tuple((powers(2).index((i, j)), k) for i, j, k in SPREAD)
+_FEATURES: Powers = tuple((powers(ORDER).index((i, j)), k) for i, j, k in POWERS)
+_NUGGET = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kernel:
+    """The process h as functions with standard normal weights.
+
+    Parameters
+    ----------
+    points : (m, 5) array
+        U, in the units of x.
+    lengths : (5,) array
+        l.
+    scale
+        s_h.
+    """
+
+    points: FloatArray
+    lengths: FloatArray
+    scale: float
+
+    def __post_init__(self) -> None:
+        m, k = self.points.shape
+        if self.lengths.shape != (k,) or not (self.lengths > 0).all() or not self.scale > 0:
+            raise BadDataError(f"lengths and scale of a process with {m} points of {k} values must be above 0")
+
+    def whitening(self) -> FloatArray:
+        """(m, m) matrix s_h L^{-T}, from k(x, U) to the functions."""
+        factor = np.linalg.cholesky(self.correlation(self.points) + _NUGGET * np.eye(len(self.points)))
+        return np.asarray(self.scale * np.linalg.inv(factor).T)
+
+    def correlation(self, x: FloatArray) -> FloatArray:
+        """(n, m) k(x, U) over s_h^2 for (n, 5) values."""
+        return squared_exponential(x, self.points, self.lengths)
+
+    def functions(self, x: FloatArray) -> FloatArray:
+        """(n, m) functions of (n, 5) values."""
+        return np.asarray(self.correlation(x) @ self.whitening())
+
+
+def squared_exponential(x: FloatArray, points: FloatArray, lengths: FloatArray) -> FloatArray:
+    """(..., m) correlations of (..., k) values with (m, k) points."""
+    x, points = x / lengths, points / lengths
+    exponent = np.asarray(x @ points.T)
+    exponent -= 0.5 * np.sum(points**2, axis=-1)
+    exponent -= 0.5 * np.sum(x**2, axis=-1, keepdims=True)
+    return np.asarray(np.exp(exponent, out=exponent))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FatProcess(FatTerms):
+    """The calibration for maps with a profile; made by `learn_fat_process`.
+
+    `mean` and `covariance` are of `LINEAR`, the weights c, `SPREAD` and ln SD(E). By the features of a full cubic in u,
+    v and w a map is like or unlike the table's.
+
+    Parameters
+    ----------
+    kernel
+        Of h.
+    """
+
+    kernel: Kernel | None = None
+
+    @property
+    def file_key(self) -> str:
+        """Its name in a calibration's file."""
+        return "fat_process"
+
+    @property
+    def coefficient_powers(self) -> Powers:
+        """The linear part; the weights of the process follow."""
+        return LINEAR
+
+    @property
+    def feature_powers(self) -> Powers:
+        """The terms of a full cubic."""
+        return _FEATURES
+
+    @property
+    def spread_powers(self) -> Powers:
+        """A full quadratic."""
+        return _SPREAD
+
+    @property
+    def coefficients(self) -> int:
+        """Four, and the weights of the process."""
+        return len(LINEAR) + len(self._kernel.points)
+
+    @property
+    def _kernel(self) -> Kernel:
+        if self.kernel is None:
+            raise BadDataError("the calibration has no process", way_out="learn it anew")
+        return self.kernel
+
+    def contraction(self, log_depth: float) -> FloatArray:
+        """Matrix that takes the coefficients to those at one depth; the weights stay."""
+        linear, m = self._contracted(LINEAR, log_depth), len(self._kernel.points)
+        rows, columns = linear.shape
+        whole = np.eye(rows + m, columns + m, k=columns - rows)
+        whole[:rows] = 0.0
+        whole[:rows, :columns] = linear
+        return whole
+
+    def at(
+        self, base: DataclassInstance, log_depth: float, profiles: Sequence[tuple[float, ...] | None]
+    ) -> ProcessAtProfile:
+        """The calibration at the mean of the profiles."""
+        fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
+        profile = (self.alike(profiles).mean(axis=0) - self.depth.centre) / self.depth.scale
+        return ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth)}, kernel=self._kernel, profile=profile)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProcessAtProfile(BodyCalibration):
+    """The calibration for one profile; made by `FatProcess.at`.
+
+    Parameters
+    ----------
+    kernel
+        Of h.
+    profile : (3,) array
+        z of the mass.
+    """
+
+    kernel: Kernel | None = None
+    profile: FloatArray | None = None
+
+    @property
+    def form_name(self) -> str:
+        """The form, for people."""
+        return "the Gaussian process"
+
+    @property
+    def coefficients(self) -> int:
+        """Three, and the weights of the process."""
+        return len(AT_ONE_DEPTH) + len(self._kernel.points)
+
+    @property
+    def spread_powers(self) -> tuple[tuple[int, int], ...]:
+        """At one depth a full quadratic in u and v is left."""
+        return powers(2)
+
+    def terms(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(..., 3 + m) linear terms and functions of the process."""
+        linear = monomials(self._centred(log_amplitude, log_width), AT_ONE_DEPTH)
+        process = self._correlation(log_amplitude, log_width) @ self._kernel.whitening()
+        return np.concatenate([linear, process], axis=-1)
+
+    def features(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(..., 10) terms of a full cubic in u and v."""
+        return monomials(self._centred(log_amplitude, log_width), powers(ORDER))
+
+    def log_size(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(...,) ln d without B and E, with the mean coefficients."""
+        linear = monomials(self._centred(log_amplitude, log_width), AT_ONE_DEPTH) @ self.mean[: len(AT_ONE_DEPTH)]
+        return np.asarray(linear + self._correlation(log_amplitude, log_width) @ self._weights())
+
+    def width_slope(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(...,) derivative of ln d by p: the relative growth of size with the map's width."""
+        kernel, (_, v) = self._kernel, self._centred(log_amplitude, log_width)
+        by_width = -(v[..., None] - kernel.points[:, 1]) / kernel.lengths[1] ** 2
+        process = (self._correlation(log_amplitude, log_width) * by_width) @ self._weights()
+        return np.asarray(self.mean[AT_ONE_DEPTH.index((0, 1))] + process)
+
+    def _centred(self, log_amplitude: FloatArray, log_width: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return np.asarray(log_amplitude - self.centre[0]), np.asarray(log_width - self.centre[1])
+
+    def _correlation(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(..., m) k(x, U) over s_h^2: the factor of the profile is the same for all maps."""
+        points, lengths = self._kernel.points, self._kernel.lengths
+        by_profile = squared_exponential(self._profile, points[:, 2:], lengths[2:])
+        shape = np.stack(self._centred(log_amplitude, log_width), axis=-1)
+        return np.asarray(by_profile * squared_exponential(shape, points[:, :2], lengths[:2]))
+
+    def _weights(self) -> FloatArray:
+        """(m,) weights of the correlations."""
+        return np.asarray(self._kernel.whitening() @ self.mean[len(AT_ONE_DEPTH) : self.coefficients])
+
+    @property
+    def _kernel(self) -> Kernel:
+        assert self.kernel is not None
+        return self.kernel
+
+    @property
+    def _profile(self) -> FloatArray:
+        assert self.profile is not None
+        return self.profile

@@ -1,0 +1,290 @@
+r"""Learning of a site's shift from its own phantoms, lumps of known size.
+
+Phantom i with known properties :math:`k_i` (depth, seat, stiffness, as far as they are stated) has, over its n_i maps,
+
+.. math:: y_i = \overline{\ln d_i - g_{ij}} - E[B_i \mid k_i] = c_0 + c_1 (p_i - p_0) + s_i M + B_i + E_i
+
+:math:`B_i \sim N(0, (k r_i b_i)^2)`: of the calibration's spread between bodies b_i the share that known properties
+leave. M, standard normal, is what phantoms of one set have in common and nobody stated, and what the linear
+expectation of B gets wrong for all of them: it belongs to them, not to the site. :math:`E_i` is the spread between
+exams over n_i, times k, beside the maps' own noise. k is the phantoms' spread over the calibration's. Given k all is
+linear and normal, so c_0 and c_1 have a posterior in closed form; k is summed over a grid, and the mixture is handed on
+as a normal of its mean and covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.learn.site_cautions import cautions_of, no_depth
+from tactile_bayes.size.pooling import ShapeDraws
+from tactile_bayes.size.site_shift import SiteShift, with_site
+
+LEAST_PHANTOMS = 3
+SHARED = ("seat", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
+"""Properties that phantoms of one set may have in common: those made alike, or of one block of material."""
+LACK = 0.5
+"""Share of what all properties leave of B that phantoms of a set have in common: B is not linear in its properties, and
+two sets of the same sizes in two seats differ by 7 % (record 0102)."""
+_GRID = np.geomspace(0.1, 10.0, 81)
+
+
+@dataclass(frozen=True, slots=True)
+class SitePrior:
+    """Prior of a site's shift, as standard deviations; see docs/decisions/0102 for the figures.
+
+    Parameters
+    ----------
+    shift_sd
+        Of c_0: how far off all sizes of a site may be, in ln d.
+    slope_sd
+        Of c_1: how much more wide maps than narrow ones.
+    spread_log_sd
+        Of ln k, about 0.
+    """
+
+    shift_sd: float = 0.15
+    slope_sd: float = 0.10
+    spread_log_sd: float = 0.5
+
+    @property
+    def sd(self) -> FloatArray:
+        """(2,) of c_0 and c_1."""
+        return np.array([self.shift_sd, self.slope_sd])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhantomMap:
+    """One map of a phantom.
+
+    Parameters
+    ----------
+    phantom
+        Its name; maps of one phantom share it.
+    d_mm
+        Its diameter.
+    shape
+        Draws of the map, or a single point.
+    known
+        Its properties, by the names of `HiddenTerms`.
+    """
+
+    phantom: str
+    d_mm: float
+    shape: ShapeDraws
+    known: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """What a calibration leaves of n phantoms, each (n,).
+
+    Parameters
+    ----------
+    residual
+        y.
+    width
+        p - p_0, mean over the maps.
+    spread_variance
+        Of B and E, before the factor k^2.
+    map_variance
+        Of the maps' own noise.
+    common
+        s: loading of what the phantoms share.
+    """
+
+    residual: FloatArray
+    width: FloatArray
+    spread_variance: FloatArray
+    map_variance: FloatArray
+    common: FloatArray
+
+    def without(self, index: int) -> Residuals:
+        """All phantoms but one."""
+        return Residuals(*(np.delete(getattr(self, name), index) for name in self.__match_args__))
+
+    @property
+    def design(self) -> FloatArray:
+        """(n, 3) derivatives of y by c_0, c_1 and M."""
+        return np.stack([np.ones_like(self.width), self.width, self.common], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShiftPosterior:
+    """Posterior of c_0, c_1 and M, and of k.
+
+    Parameters
+    ----------
+    mean, covariance : (3,), (3, 3) arrays
+    spread
+        Posterior mean of k.
+    spread_square
+        Posterior mean of k^2.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    spread: float
+    spread_square: float
+
+
+def shift_posterior(data: Residuals, prior: SitePrior) -> ShiftPosterior:
+    """Posterior of a site's shift given what the calibration leaves of its phantoms."""
+    x, y, precision = data.design, data.residual, np.diag(1.0 / np.append(prior.sd, 1.0) ** 2)
+    weight = 1.0 / (_GRID[:, None] ** 2 * data.spread_variance + data.map_variance)
+    squares = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
+    information = (weight @ squares).reshape(-1, *precision.shape) + precision
+    projected = weight @ (x * y[:, None])
+    covariance = np.linalg.inv(information)
+    mean = (covariance @ projected[..., None])[..., 0]
+    log = 0.5 * (np.log(weight).sum(axis=1) - np.linalg.slogdet(information)[1] - weight @ y**2)
+    log += 0.5 * np.sum(projected * mean, axis=1) - 0.5 * (np.log(_GRID) / prior.spread_log_sd) ** 2
+    share = np.exp(log - log.max())  # even steps in ln k, in which the prior is normal
+    share /= share.sum()
+    centre = share @ mean
+    apart = mean - centre
+    whole = np.tensordot(share, covariance, 1) + (share * apart.T) @ apart
+    return ShiftPosterior(centre, whole, float(share @ _GRID), float(share @ _GRID**2))
+
+
+def correct_calibration(
+    calibration: BodyCalibration,
+    maps: Sequence[PhantomMap],
+    *,
+    base: str,
+    prior: SitePrior | None = None,
+    left_out: Sequence[str] = (),
+) -> BodyCalibration:
+    """The calibration with a site's correction.
+
+    Parameters
+    ----------
+    maps
+        Of at least `LEAST_PHANTOMS` phantoms, made and fitted by the calibration's recipe.
+    base
+        Name of the calibration, for reports.
+    left_out
+        Phantoms that take no part for reasons found before, in words.
+
+    Raises
+    ------
+    BadDataError
+        When too few phantoms lie in the calibration's range, or it is corrected already.
+    """
+    prior = prior or SitePrior()
+    if calibration.site is not None:
+        raise BadDataError(f"{base} is corrected already", way_out="give the calibration that it corrects")
+    groups: dict[str, list[PhantomMap]] = {}
+    for one in maps:
+        groups.setdefault(one.phantom, []).append(one)
+    rows, out = [], list(left_out)
+    for name, group in groups.items():
+        row = _phantom(calibration, group)
+        if isinstance(row, str):
+            out.append(f"{name}: {row}")
+        else:
+            rows.append((name, row))
+    if len(rows) < LEAST_PHANTOMS:
+        why = f" ({'; '.join(out)})" if out else ""
+        raise BadDataError(
+            f"{len(rows)} phantom{'' if len(rows) == 1 else 's'} in the range of {base}{why}",
+            way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
+        )
+    data = Residuals(*(np.array([getattr(row, name) for _, row in rows]) for name in Residuals.__match_args__))
+    uses_fat = 2 * sum(row.uses_fat for _, row in rows) > len(rows)
+    found = shift_posterior(data, prior)
+    site = SiteShift(
+        centre=calibration.centre[1],
+        mean=found.mean[:2],
+        covariance=found.covariance[:2, :2],
+        phantoms=len(rows),
+        maps=sum(row.maps for _, row in rows),
+        base=base,
+        uses_fat=uses_fat,
+        fit=_figures(data, found, calibration.centre[1]),
+        cautions=(
+            *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
+            *cautions_of([name for name, _ in rows], data, found, prior, posterior_of=shift_posterior),
+        ),
+        left_out=tuple(out),
+    )
+    return with_site(calibration, site)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Phantom:
+    residual: float
+    width: float
+    spread_variance: float
+    map_variance: float
+    common: float
+    maps: int
+    uses_fat: bool
+
+
+def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phantom | str:
+    """What the calibration leaves of a phantom, or why it takes no part."""
+    if not all(np.isfinite(one.shape.log_amplitude).any() for one in maps):
+        return "a map does not rise above its background"
+    centre, used = calibration.centre[1], calibration.at_fat([one.shape.profile for one in maps])
+    for one in maps:
+        used = used.fitting(*one.shape.middle)
+    for one in maps:
+        note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
+        if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
+            return "; ".join(outside)
+    log_size = [used.log_size(one.shape.log_amplitude, one.shape.log_width) for one in maps]
+    log_a, log_width = (
+        np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
+    )
+    left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
+    terms = used.terms(log_a, log_width)
+    body_sd = float(used.body_and_error(terms, log_a, log_width, np.zeros(len(maps)))[0].mean())
+    expected, alone, together = _known(used, maps[0].known, float(log_a.mean()), float(log_width.mean()))
+    n = len(maps)
+    exam = used.between_exams.sd**2 / n
+    noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
+    return _Phantom(
+        residual=float(left.mean()) - expected,
+        width=float(log_width.mean()) - centre,
+        spread_variance=alone * body_sd**2 + exam,
+        map_variance=noise,
+        common=body_sd * float(np.sqrt(together)),
+        maps=n,
+        uses_fat=used.fat_mm is not None or calibration.with_fat is None,
+    )
+
+
+def _known(
+    calibration: BodyCalibration, known: Mapping[str, float], log_amplitude: float, log_width: float
+) -> tuple[float, float, float]:
+    """E[B] given known properties, and of the variance of B the shares that are the phantom's own and the set's."""
+    hidden = calibration.hidden
+    if hidden is None:
+        return 0.0, 1.0, 0.0
+    stated = {name: value for name, value in known.items() if name in hidden.names}
+    shared = [name for name in SHARED if name in hidden.names and name not in stated]
+    by_stated = hidden.share(*stated) if stated else 0.0
+    by_both = hidden.share(*stated, *shared) if stated or shared else 0.0
+    lack = LACK * (1.0 - hidden.share(*hidden.names))
+    own, common = 1.0 - by_both - lack, by_both - by_stated + lack
+    if not stated:
+        return 0.0, own, common
+    features = calibration.features(np.array(log_amplitude), np.array(log_width))
+    return float(hidden.expected_body(stated, features)), own, common
+
+
+def _figures(data: Residuals, found: ShiftPosterior, centre: float) -> dict[str, float]:
+    left = data.residual - data.design[:, :2] @ found.mean[:2]
+    return {
+        "log_width": float(data.width.mean() + centre),
+        "spread_factor": found.spread,
+        "sd_before": float(np.sqrt(np.mean(data.residual**2))),
+        "sd_after": float(np.sqrt(np.mean(left**2))),
+    }

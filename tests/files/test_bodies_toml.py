@@ -1,0 +1,65 @@
+"""Ranges of bodies and exams from a file: what is given is used, what is not known or not possible is one line."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.bodies_toml import read_bodies
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_mass
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "bodies.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_schema_has_the_programs_defaults() -> None:
+    tables = load_schema("bodies.schema.json")["properties"]
+    for name, prior in (("bodies", BodyPrior()), ("exams", ExamPrior())):
+        defaults = {key: tuple(rule["default"]) for key, rule in tables[name]["properties"].items()}
+        assert defaults == asdict(prior)
+
+
+def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
+    text = "[bodies]\nd_mm = [8, 9]\nseat = [0, 0]\n[exams]\nlines = [3, 3]\n"
+    bodies, exams = read_bodies(written(tmp_path, text))
+    assert bodies.d_mm == (8, 9)
+    assert bodies.fat_kpa == BodyPrior().fat_kpa
+    for i in range(20):
+        (scene,) = draw_mass(i, scans=1, seed=3, bodies=bodies, exams=exams)
+        assert 8 <= scene.solid_lumps[0].d_mm <= 9
+        assert scene.solid_lumps[0].seat == 0
+        assert scene.strokes.lines == 3
+    assert read_bodies(written(tmp_path, "")) == (BodyPrior(), ExamPrior())
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[bodies]\nd_mm = [30, 5]\n", "bodies.d_mm runs backwards, from 30 to 5; give the lower end first"),
+        ("[bodies]\nd_cm = [1, 2]\n", "bodies.d_cm is not known"),
+        ("[body]\nd_mm = [1, 2]\n", "body is not known; did you mean bodies"),
+        ("d_mm = [1, 2]\n", "d_mm is not known"),
+        ("[bodies]\nd_mm = [0, 5]\n", "d_mm"),
+        ("[bodies]\nd_mm = 5\n", "d_mm"),
+        ("[bodies]\nd_mm = [5]\n", "d_mm"),
+        ("[bodies]\nseat = ['a', 'b']\n", "seat"),
+        ("[bodies]\ndepth_ratio = [0.2, 1]\n", "depth_ratio"),
+        ("bodies = 3\n", "bodies"),
+        ("[exams]\nlines = [4.5, 5]\n", "lines"),
+        ("[exams]\ndrift_kpa = [1, 8]\n", "keep the drift below the mean pressure"),
+    ],
+)
+def test_what_is_no_range_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(BadDataError) as caught:
+        read_bodies(path)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)

@@ -1,0 +1,228 @@
+"""The Gaussian process over a population, against exact regression, tables made from a known law, and its own file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_quadratic_json import write_log_quadratic
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.fat_process import FatProcess, Kernel, ProcessAtProfile, squared_exponential
+from tactile_bayes.size.learn import fat_process
+from tactile_bayes.size.learn.fat_depth import learn_fat_cubic, table_with_depths
+from tactile_bayes.size.learn.fat_process import ProcessRows, given, learn_fat_process, spread_points
+from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+from tactile_bayes.size.learn.regression import PopulationTable
+from tactile_bayes.size.log_quadratic import LogQuadratic
+
+RECIPE = Recipe("gain", "free", 20.0, False, "field")
+EXAM_SD = 0.01
+
+
+def law(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """ln d of a body, with a ripple that no cubic follows."""
+    return 2.3 + 0.3 * u + v - 0.2 * w + 0.12 * np.sin(3.5 * u) * np.cos(1.5 * w)
+
+
+def body_sd(u: np.ndarray) -> np.ndarray:
+    """Between bodies: ten times as much for the faintest as for the strongest."""
+    return np.asarray(0.03 * np.exp(-0.5 * u))
+
+
+def profile_of(w: np.ndarray) -> np.ndarray:
+    """(n, 3) profiles that tell w by their first figure."""
+    return np.column_stack([0.1 * w, np.random.default_rng(9).normal(0, 0.05, (len(w), 2))])
+
+
+def table(bodies: int = 300, *, seed: int = 1) -> PopulationTable:
+    rng = np.random.default_rng(seed)
+    body = np.repeat(np.arange(bodies), 2)
+    u, v, w = rng.uniform(-2, 2, bodies), rng.normal(0, 0.35, bodies), rng.normal(0, 0.45, bodies)
+    log_d = law(u, v, w) + body_sd(u) * rng.normal(size=bodies)
+    wobble = rng.normal(0, EXAM_SD, len(body))
+    covariance = np.tile(np.diag([1e-6, 1e-6, 1e-4]), (len(body), 1, 1))
+    q = 0.04 - 0.02 * u[body] + rng.normal(0, 0.01, len(body))
+    unknowns = {"seat": rng.uniform(0, 1.2, bodies)[body]}
+    log_a, p = u[body] - 1.0, v[body] + wobble + 1.4
+    return PopulationTable(
+        body, np.exp(log_d[body]), log_a, p, q, covariance, unknowns, profile_of(w[body]), 2.6 + w[body]
+    )
+
+
+@pytest.fixture(scope="module")
+def learned() -> LogQuadratic:
+    return learn_log_quadratic(table(), recipe=RECIPE, learn_fat=learn_fat_process)
+
+
+def rows_of(bodies: int) -> ProcessRows:
+    found = table_with_depths(table(bodies))
+    assert found is not None
+    one, depth, log_depth = found
+    return ProcessRows.of(one, depth, log_depth, (-1.0, 1.4, 2.6))
+
+
+def test_with_a_point_for_each_body_it_is_exact_regression() -> None:
+    """Against Gaussian-process regression by its textbook formula, the linear part as a kernel of its own."""
+    rows, theta = rows_of(80), np.zeros(6)
+    theta = np.concatenate([np.log([1.5, 0.8, 2.0, 2.0, 2.0, 0.3]), [np.log(0.05)], np.zeros(9)])
+    one_each = replace(rows, x=rows.mean(rows.x)[rows.data.group])
+    points = one_each.mean(one_each.x)
+    fitted = given(one_each, points, theta, exam_sd=EXAM_SD)
+    linear, noise = fitted.terms[:, :4], np.full(80, 0.05**2 + EXAM_SD**2 / 2)
+    kernel = 0.3**2 * squared_exponential(points, points, np.exp(theta[:5])) + 100.0 * linear @ linear.T
+    weights = np.linalg.solve(kernel + np.diag(noise), rows.data.mean_log_d)
+    np.testing.assert_allclose(fitted.terms @ fitted.mean, kernel @ weights, atol=2e-5)
+    sign, log_det = np.linalg.slogdet(kernel + np.diag(noise))
+    exact = -0.5 * rows.data.mean_log_d @ weights - 0.5 * log_det
+    # the evidence is kept without the determinant of the prior on the four linear terms
+    assert sign == 1
+    assert fitted.log_evidence == pytest.approx(exact + 0.5 * 4 * np.log(100.0), abs=0.05)
+    # the control: with other lengths it is another regression
+    other = given(one_each, points, theta + np.r_[1.0, np.zeros(len(theta) - 1)], exam_sd=EXAM_SD)
+    assert np.abs(other.terms @ other.mean - kernel @ weights).max() > 1e-3
+
+
+def test_bodies_left_out_are_predicted_as_if_the_fit_had_not_seen_them() -> None:
+    rows = rows_of(80)
+    theta = np.concatenate([np.log([1.5, 0.8, 2.0, 2.0, 2.0, 0.3]), [np.log(0.05)], np.zeros(9)])
+    points = rows.mean(rows.x)[::3]
+    fitted = given(rows, points, theta, exam_sd=EXAM_SD)
+    error, variance = fitted.left_out(rows.data.mean_log_d)
+    for body in (0, 17):
+        weight = np.where(np.arange(80) == body, 1e-12, 1.0)
+        scaled = fitted.terms * np.sqrt(weight / fitted.variance)[:, None]
+        prior = np.diag(np.r_[np.full(4, 1e-2), np.ones(len(points))])
+        covariance = np.linalg.inv(scaled.T @ scaled + prior)
+        mean = covariance @ (scaled.T @ (rows.data.mean_log_d * np.sqrt(weight / fitted.variance)))
+        assert error[body] == pytest.approx(fitted.terms[body] @ mean - rows.data.mean_log_d[body], rel=1e-6)
+        left = fitted.variance[body] + fitted.terms[body] @ covariance @ fitted.terms[body]
+        assert variance[body] == pytest.approx(left, rel=1e-6)
+
+
+def test_points_are_spread_over_the_bodies() -> None:
+    x = np.random.default_rng(3).normal(size=(200, 5))
+    points = spread_points(x, np.ones(5), 40)
+    assert len(np.unique(points, axis=0)) == 40
+    left = 1.0 - squared_exponential(x, points, np.ones(5)).max(axis=1)
+    by_chance = 1.0 - squared_exponential(x, x[:40], np.ones(5)).max(axis=1)
+    assert left.max() < by_chance.max()
+
+
+def test_it_follows_a_law_that_no_cubic_does(learned) -> None:
+    u, v = np.meshgrid(np.linspace(-1.8, 1.8, 13), [-0.3, 0.0, 0.3])
+    by_cubic = replace(learned, with_fat=learn_fat_cubic(table()))
+    for w in (-0.5, 0.0, 0.5):
+        at = learned.at_fat([tuple(profile_of(np.array([w]))[0])])
+        assert isinstance(at, ProcessAtProfile)
+        error = at.log_size(u - 1.0, v + 1.4) - law(u, v, np.full_like(u, w))
+        assert np.sqrt(np.mean(error**2)) < 0.035
+        cubic = by_cubic.at_fat([tuple(profile_of(np.array([w]))[0])])
+        error = cubic.log_size(u - 1.0, v + 1.4) - law(u, v, np.full_like(u, w))
+        assert np.sqrt(np.mean(error**2)) > 0.05
+
+
+def test_the_spread_between_bodies_depends_on_the_place(learned) -> None:
+    at = learned.at_fat([tuple(profile_of(np.array([0.0]))[0])])
+    u = np.array([-1.5, 0.0, 1.5])
+    terms = at.terms(u - 1.0, np.full(3, 1.4))
+    found, _, error = at.body_and_error(terms, u - 1.0, np.full(3, 1.4), np.zeros(3))
+    np.testing.assert_allclose(found, body_sd(u), rtol=0.3)
+    assert (error > 0).all()
+    assert found[0] > 2.5 * found[2]
+
+
+def test_its_intervals_hold_on_bodies_never_seen(learned) -> None:
+    """The control: with half the spreads they do not."""
+    fresh = table(400, seed=77)
+    first = fresh.rows(np.arange(len(fresh)) % 2 == 0)
+    inside, narrow = [], []
+    for i in range(len(first)):
+        at = learned.at_fat([tuple(first.profile[i])])
+        a, p = first.log_amplitude[i : i + 1], first.log_width[i : i + 1]
+        body, _, error = at.body_and_error(at.terms(a, p), a, p, np.zeros(1))
+        sd = float(np.sqrt(body[0] ** 2 + error[0] + np.exp(2 * at.mean[-1])))
+        off = abs(float(at.log_size(a, p)[0]) - np.log(first.d_mm[i]))
+        inside.append(off < 1.96 * sd)
+        narrow.append(off < 0.98 * sd)
+    assert 0.92 <= np.mean(inside) <= 0.985
+    assert np.mean(narrow) < 0.85
+
+
+def test_slopes_and_terms_are_those_of_the_size(learned) -> None:
+    at, h = learned.at_fat([tuple(profile_of(np.array([0.2]))[0])]), 1e-5
+    a, p = np.random.default_rng(5).normal(size=(2, 6)) * [[0.8], [0.3]] + [[-1.0], [1.4]]
+    slope = (at.log_size(a, p + h) - at.log_size(a, p - h)) / (2 * h)
+    np.testing.assert_allclose(at.width_slope(a, p), slope, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(at.terms(a, p) @ at.mean[: at.coefficients], at.log_size(a, p), atol=1e-9)
+    assert np.isnan(at.log_size(np.array([np.nan]), np.array([1.4]))).all()
+
+
+def test_a_draw_far_from_all_bodies_has_the_linear_size(learned) -> None:
+    at = learned.at_fat([tuple(profile_of(np.array([0.0]))[0])])
+    far = np.array([-400.0])
+    linear = at.mean[0] + at.mean[1] * (far - at.centre[0]) + at.mean[2] * (1.4 - at.centre[1])
+    np.testing.assert_allclose(at.log_size(far, np.array([1.4])), linear)
+
+
+def test_maps_of_a_mass_share_their_mean_profile(learned) -> None:
+    one, other = (tuple(profile_of(np.array([w]))[0]) for w in (-0.1, 0.1))
+    between = learned.at_fat([one, other, None])
+    assert isinstance(between, ProcessAtProfile)
+    alone = learned.at_fat([tuple(np.mean([one, other], axis=0))])
+    np.testing.assert_allclose(between.profile, alone.profile, atol=1e-12)
+
+
+def test_few_bodies_have_no_process() -> None:
+    assert learn_fat_process(table(79)) is None
+
+
+def test_a_file_holds_what_was_learned(learned, tmp_path: Path) -> None:
+    write_log_quadratic(tmp_path / "s.json", learned, provenance=Provenance("test", {}, {}))
+    read = read_size_calibration(tmp_path / "s.json")
+    assert isinstance(read, LogQuadratic)
+    assert isinstance(read.with_fat, FatProcess)
+    assert json.loads((tmp_path / "s.json").read_text())["form"] == "gaussian-process"
+    one = [tuple(profile_of(np.array([0.1]))[0])]
+    a, p = np.array([-2.0, -1.0, 0.0]), np.array([1.2, 1.4, 1.6])
+    for got, want in ((read.at_fat(one), learned.at_fat(one)),):
+        np.testing.assert_allclose(got.log_size(a, p), want.log_size(a, p), atol=1e-6)
+        for x, y in zip(
+            got.body_and_error(got.terms(a, p), a, p, np.ones(3)),
+            want.body_and_error(want.terms(a, p), a, p, np.ones(3)),
+            strict=True,
+        ):
+            np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda part: part["covariance_factor"][7].pop(), "row 8 of covariance_factor has 7 numbers"),
+        (lambda part: part["mean"].pop(), "fat_process.mean"),
+        (lambda part: part["kernel"]["points"].pop(), "fat_process.mean"),
+        (lambda part: part["kernel"].update(scale=-1.0), "kernel.scale"),
+    ],
+)
+def test_a_spoilt_file_is_refused_by_the_field(learned, tmp_path: Path, change, words) -> None:
+    path = tmp_path / "s.json"
+    write_log_quadratic(path, learned, provenance=Provenance("test", {}, {}))
+    document = json.loads(path.read_text())
+    change(document["fat_process"])
+    path.write_text(json.dumps(document))
+    with pytest.raises(BadDataError, match=words):
+        read_size_calibration(path)
+
+
+def test_a_kernel_needs_positive_lengths() -> None:
+    make = partial(Kernel, np.zeros((2, 5)))
+    with pytest.raises(BadDataError, match="above 0"):
+        make(np.array([1.0, 1.0, 0.0, 1.0, 1.0]), 1.0)
+    assert fat_process.POINTS >= 20
