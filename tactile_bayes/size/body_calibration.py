@@ -33,7 +33,7 @@ from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
 from tactile_bayes.size.polynomials import monomials
 from tactile_bayes.size.site_shift import SiteShift
 
-UNLIKE = "is unlike any body of the table"
+UNLIKE = "is unlike the bodies of the table"
 SPREAD_PARAMETERS = ("log_body_sd", "body_sd_slope", "log_exam_sd")
 MOST_LEVERAGE = 1.0
 """A map is outside the table where its leverage exceeds this multiple of the table's largest."""
@@ -241,8 +241,8 @@ class BodyCalibration:
 
     def _unlike(self, amplitude: float, sigma_mm: float) -> str:
         return (
-            f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike any of the table "
-            f"(leverage {self.leverage(amplitude, sigma_mm):.1f} times its largest)"
+            f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike those of the table "
+            f"(leverage {self.leverage(amplitude, sigma_mm):.1f} times the limit)"
         )
 
 

@@ -109,7 +109,7 @@ def test_show_describes_the_correction_and_its_base(folder: Path) -> None:
     assert found["correction"]["phantoms"] == 12
     low, high = found["correction"]["percent_interval"]
     assert low < found["correction"]["percent"] < high
-    assert found["base"]["form"] == "log-quadratic"
+    assert found["base"]["form"] == "gaussian-process"
     assert "correction" in run_here("show", "phantoms.json", cwd=folder).stdout
 
 

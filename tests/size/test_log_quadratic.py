@@ -124,7 +124,7 @@ def test_a_balls_oval_map_is_learned_with_its_spread(learned):
 
 @pytest.mark.parametrize(
     ("amplitude", "sigma", "words"),
-    [(0.45, 4.0, None), (50.0, 4.0, "amplitude"), (0.45, 60.0, "sigma"), (0.02, 1.3, "unlike any")],
+    [(0.45, 4.0, None), (50.0, 4.0, "amplitude"), (0.45, 60.0, "sigma"), (0.02, 1.3, "unlike")],
 )
 def test_a_map_unlike_the_table_is_told(learned, amplitude, sigma, words):
     low = {"amplitude": (1e-3, 20.0), "sigma_mm": (1.0, 20.0), "d_mm": (3.0, 40.0)}

@@ -29,6 +29,8 @@ from tactile_bayes.size.polynomials import monomials
 POINTS: Final = 100
 """Points of the kernel; with fewer bodies a quarter of their number."""
 BODIES_PER_POINT: Final = 4
+INSIDE: Final = 0.99
+"""Share of the table's maps that count as inside it: its largest leverage is an outlier's, ten times what is left."""
 ROUNDS: Final = 2
 """Times that points are chosen and the kernel is fitted to them."""
 _LINEAR_SD = 10.0
@@ -131,7 +133,8 @@ def learn_fat_process(table: PopulationTable) -> FatProcess | None:
     rows = ProcessRows.of(table, depth, log_depth, (alpha, p0, w0))
     rows, fitted, exam = fit_process(table, rows)
     features = monomials((rows.x[:, 0], rows.x[:, 1], log_depth - w0), POWERS)
-    inverse, most_leverage = largest_leverage(features)
+    inverse, _ = largest_leverage(features)
+    leverage = np.einsum("ni,ij,nj->n", features, inverse, features)
     coefficients, between, within = rows.data.oval(table, features[:, [POWERS.index(one) for one in ROUND]])
     mean = np.concatenate([fitted.mean, fitted.log_spread, exam[:1]])
     whole = replace(rows.data, terms=all_terms(rows, fitted.kernel), mean_terms=fitted.terms)
@@ -143,7 +146,7 @@ def learn_fat_process(table: PopulationTable) -> FatProcess | None:
         round_coefficients=coefficients,
         round_sd=(between, within),
         information_inverse=inverse,
-        most_leverage=most_leverage,
+        most_leverage=float(np.quantile(leverage, INSIDE)),
         fat_mm=(float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))),
         hidden=hidden_terms(table, whole, mean, features=features),
         fit=_figures(table, rows, fitted, exam),
