@@ -37,6 +37,7 @@ def process_document(fat: FatProcess) -> dict[str, Any]:
             "lengths": numbers(kernel.lengths),
             "scale": number(kernel.scale),
         },
+        "other_sd": number(fat.other_sd),
         "covariance_factor": [[float(f"{value:.6g}") for value in row[: i + 1]] for i, row in enumerate(factor)],
     }
 
@@ -94,6 +95,7 @@ def parse_process(document: dict[str, Any]) -> FatProcess:
         **_shared_fields(document),
         covariance=factor @ factor.T,
         kernel=Kernel(points, lengths, float(kernel["scale"])),
+        other_sd=float(document["other_sd"]),
     )
 
 

@@ -99,9 +99,12 @@ class FatProcess(FatTerms):
     ----------
     kernel
         Of h.
+    other_sd
+        SD of ln d by which a body may differ because it is none of the population's kind; adds to that of B.
     """
 
     kernel: Kernel | None = None
+    other_sd: float = 0.0
 
     @property
     def file_key(self) -> str:
@@ -149,7 +152,8 @@ class FatProcess(FatTerms):
         """The calibration at the mean of the profiles."""
         fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
         profile = (self.alike(profiles).mean(axis=0) - self.depth.centre) / self.depth.scale
-        return ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth)}, kernel=self._kernel, profile=profile)
+        own = {"kernel": self._kernel, "profile": profile, "other_sd": self.other_sd}
+        return ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,10 +166,13 @@ class ProcessAtProfile(BodyCalibration):
         Of h.
     profile : (3,) array
         z of the mass.
+    other_sd
+        As in `FatProcess`.
     """
 
     kernel: Kernel | None = None
     profile: FloatArray | None = None
+    other_sd: float = 0.0
 
     @property
     def form_name(self) -> str:
@@ -187,6 +194,13 @@ class ProcessAtProfile(BodyCalibration):
         linear = monomials(self._centred(log_amplitude, log_width), AT_ONE_DEPTH)
         process = self._correlation(log_amplitude, log_width) @ self._kernel.whitening()
         return np.concatenate([linear, process], axis=-1)
+
+    def body_and_error(
+        self, terms: FloatArray, log_amplitude: FloatArray, log_width: FloatArray, score: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As of every calibration, with `other_sd` in the first."""
+        found = BodyCalibration.body_and_error(self, terms, log_amplitude, log_width, score)
+        return np.hypot(found[0], self.other_sd), *found[1:]
 
     def features(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(..., 10) terms of a full cubic in u and v."""

@@ -59,7 +59,8 @@ def table(bodies: int = 300, *, seed: int = 1) -> PopulationTable:
 
 @pytest.fixture(scope="module")
 def learned() -> LogQuadratic:
-    return learn_log_quadratic(table(), recipe=RECIPE, learn_fat=learn_fat_process)
+    """Of a table whose bodies are all that there are."""
+    return learn_log_quadratic(table(), recipe=RECIPE, learn_fat=partial(learn_fat_process, other_sd=0.0))
 
 
 def rows_of(bodies: int) -> ProcessRows:
@@ -154,6 +155,13 @@ def test_its_intervals_hold_on_bodies_never_seen(learned) -> None:
         narrow.append(off < 0.98 * sd)
     assert 0.92 <= np.mean(inside) <= 0.985
     assert np.mean(narrow) < 0.85
+
+
+def test_bodies_of_another_kind_widen_the_spread(learned) -> None:
+    a, p, one = np.array([0.5]), np.array([1.4]), [tuple(profile_of(np.array([0.0]))[0])]
+    wider = replace(learned, with_fat=replace(learned.with_fat, other_sd=0.05)).at_fat(one)
+    spreads = [at.body_and_error(at.terms(a, p), a, p, np.zeros(1))[0][0] for at in (learned.at_fat(one), wider)]
+    assert spreads[1] == pytest.approx(np.hypot(spreads[0], 0.05))
 
 
 def test_slopes_and_terms_are_those_of_the_size(learned) -> None:
