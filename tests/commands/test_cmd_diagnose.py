@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
-import arviz
 import numpy as np
 import pytest
 from in_process import run_here
 
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.netcdf import Variable, netcdf_bytes
+
+with warnings.catch_warnings():  # its notice of the next major version, once a day
+    warnings.simplefilter("ignore", FutureWarning)
+    import arviz
 
 MAGIC = {".png": b"\x89PNG", ".pdf": b"%PDF", ".svg": b"<?xml"}
 
