@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.frame_sample import POOL_TAXELS
 from tactile_bayes.mapping.frames import SelectedFrames, chunks
 from tactile_bayes.mapping.project import Projection, Projector
 from tactile_bayes.mapping.readout import Readout
 
 POOL_S = 0.02
-POOL_TAXELS = 2
 # Neighbouring frames share errors over less than this.
 SHARED_S = 0.2
 # A stroke is a run in one direction over at least this far.
@@ -37,8 +37,8 @@ class CoarseFrames:
         Where each block of frames begins among them.
     weight : (t, k) array
         Share of each good taxel in each block of taxels; columns add up to 1.
-    row : (k,) int array
-        Which rows of the head a block of taxels is of.
+    row, block : (k,) int arrays
+        Which rows of the head a block of taxels is of, and its number among all blocks of the head.
     basis : (k, 6) array
         Orthonormal: a level, two slopes and three curvatures over the head's blocks.
     """
@@ -48,6 +48,7 @@ class CoarseFrames:
     first: IndexArray
     weight: FloatArray
     row: IndexArray
+    block: IndexArray
     basis: FloatArray
 
     @classmethod
@@ -60,7 +61,7 @@ class CoarseFrames:
         """
         good, scan = selection.good_taxels, selection.scan
         readout = Readout.of(scan.element_calibration, good)
-        weight, row, basis = _taxel_blocks(good)
+        weight, row, block, basis = _taxel_blocks(good)
         slot = np.floor(scan.frames.time_s[frames] / POOL_S)
         first = np.flatnonzero(np.diff(slot, prepend=slot[:1] - 1) != 0)
         pooled = np.empty((len(frames), weight.shape[1]))
@@ -69,7 +70,7 @@ class CoarseFrames:
             pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[chosen]))
             pressure /= selection.level_kpa[chosen, None]
             pooled[part] = (pressure if valid is None else np.where(valid, pressure, 1.0)) @ weight
-        return cls(_block_means(pooled, first), frames, first, weight, row, basis)
+        return cls(block_means(pooled, first), frames, first, weight, row, block, basis)
 
     def blocks(self, time_s: FloatArray) -> IndexArray:
         """(m,) which stretch of `SHARED_S` each averaged frame lies in, from the times of the scan's frames."""
@@ -77,7 +78,7 @@ class CoarseFrames:
 
     def places_mm(self, projection: Projection) -> FloatArray:
         """(m, k, 2) mean places of the blocks on the plane, from the projection of `frames`."""
-        matrix = _block_means(projection.matrix.reshape(len(projection), -1), self.first).reshape(-1, 2, 4)
+        matrix = block_means(projection.matrix.reshape(len(projection), -1), self.first).reshape(-1, 2, 4)
         taxels = projection.taxels.place_and_one @ self.weight
         return np.asarray(np.einsum("mij,jk->mki", matrix, taxels) * projection.cell_mm)
 
@@ -88,8 +89,8 @@ def projector_of(selection: SelectedFrames, *, plane_from_base: FloatArray, cell
     return Projector(selection.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
 
 
-def _taxel_blocks(good: NDArray[np.bool_]) -> tuple[FloatArray, IndexArray, FloatArray]:
-    """Shares of the good taxels in blocks, each block's rows of the head, and polynomials over the blocks."""
+def _taxel_blocks(good: NDArray[np.bool_]) -> tuple[FloatArray, IndexArray, IndexArray, FloatArray]:
+    """Shares of the good taxels in blocks, each block's rows of the head, its number, and polynomials over them."""
     row, column = np.nonzero(good)
     number = row // POOL_TAXELS * good.shape[1] + column // POOL_TAXELS
     blocks, member = np.unique(number, return_inverse=True)
@@ -97,10 +98,10 @@ def _taxel_blocks(good: NDArray[np.bool_]) -> tuple[FloatArray, IndexArray, Floa
     weight[np.arange(len(row)), member] = 1.0 / np.bincount(member)[member]
     s, t = ((place - place.mean()) / len(good) @ weight for place in (row.astype(float), column.astype(float)))
     terms = [np.ones_like(s), s, t, s * s, s * t, t * t][: len(blocks)]
-    return weight, blocks // good.shape[1], np.linalg.qr(np.stack(terms, axis=1))[0]
+    return weight, blocks // good.shape[1], blocks, np.linalg.qr(np.stack(terms, axis=1))[0]
 
 
-def _block_means(values: FloatArray, first: IndexArray) -> FloatArray:
+def block_means(values: FloatArray, first: IndexArray) -> FloatArray:
     """(m, k) means of the rows of (n, k) values from each `first` up to the next."""
     counts = np.diff(np.append(first, len(values)))
     means: FloatArray = np.add.reduceat(values, first, axis=0) / counts[:, None]

@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.head_shape import HeadShape
+from tactile_bayes.mapping.frame_sample import FrameSample
 from tactile_bayes.records import dataclass
 
 # A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
@@ -101,6 +102,9 @@ class TactileMap:
         Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
     head
         Shape of the head that made the scan; None for an imported grid and for files of earlier versions.
+    frames
+        Some of its frames; None for an imported grid, for a map in kPa, while a scan is going on, and for files of
+        earlier versions.
     """
 
     mean: FloatArray
@@ -116,6 +120,7 @@ class TactileMap:
     quality: Mapping[str, float] = field(default_factory=dict)
     masked_taxels: tuple[str, ...] = ()
     head: HeadShape | None = None
+    frames: FrameSample | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))

@@ -49,6 +49,8 @@ class PopulationTable:
         `presets.HEAD_PROFILE` of each map, NaN for a map without; None where no map has it.
     log_fat : (n,) array
         ln of the depth of the fat-gland boundary in mm; None with `profile`.
+    by_place : (n, 6) array
+        `presets.BY_PLACE` of each map, NaN for a map without; None where no map has them.
     """
 
     body: np.ndarray[tuple[int], np.dtype[np.generic]]
@@ -60,6 +62,7 @@ class PopulationTable:
     unknowns: Mapping[str, FloatArray] = field(default_factory=dict)
     profile: FloatArray | None = None
     log_fat: FloatArray | None = None
+    by_place: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.d_mm)
@@ -76,6 +79,7 @@ class PopulationTable:
             {name: values[keep] for name, values in self.unknowns.items()},
             None if self.profile is None else self.profile[keep],
             None if self.log_fat is None else self.log_fat[keep],
+            None if self.by_place is None else self.by_place[keep],
         )
 
 
