@@ -1,7 +1,8 @@
 """Tactile maps as netCDF by the CF conventions; equal maps give equal bytes.
 
 Files of the schema map/2 hold the cells' centres as the coordinate variables ``x`` and ``y``. Those of map/1, which are
-read too, hold them as ``x_mm`` and ``y_mm`` on dimensions ``x`` and ``y`` that have no coordinates (record 0089).
+read too, hold them as ``x_mm`` and ``y_mm`` on dimensions ``x`` and ``y`` that have no coordinates (record 0089). The
+group ``frames`` of a scan's map holds some of its frames (record 0106).
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
-from tactile_bayes.files.netcdf import Group, Variable, netcdf_bytes, open_netcdf
+from tactile_bayes.files.map_frames_nc import FRAMES_GROUP, frame_contents, read_frames
+from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.geometry import check_rigid
@@ -80,8 +82,10 @@ def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, fo
         When the map's axes do not step by its cell.
     """
     _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
-    data = netcdf_bytes(_variables(tactile_map), attributes=_attributes(tactile_map, provenance))
-    write_bytes(path, data, force=force)
+    groups = {"/": Contents(_variables(tactile_map), _attributes(tactile_map, provenance))}
+    if tactile_map.frames is not None:
+        groups[FRAMES_GROUP] = frame_contents(tactile_map.frames)
+    write_bytes(path, grouped_netcdf_bytes(groups), force=force)
 
 
 def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
@@ -125,6 +129,7 @@ def read_map(path: Path) -> TactileMap:
             quality=header["quality"],
             masked_taxels=tuple(header["masked_taxels"]),
             head=header["head"],
+            frames=read_frames(file, way_out=_WAY_OUT),
         )
 
 

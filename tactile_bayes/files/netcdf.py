@@ -42,12 +42,15 @@ class Variable:
         Text by name: units, a long name.
     fill
         What stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates.
+    scale
+        What the stored numbers are to be multiplied by: the ``scale_factor`` of the CF conventions.
     """
 
     values: Any
     dimensions: tuple[str, ...]
     attributes: Mapping[str, str]
     fill: float | None = None
+    scale: float | None = None
 
 
 def netcdf_bytes(variables: Mapping[str, Variable], *, attributes: Mapping[str, str], group: str = "/") -> bytes:
@@ -121,6 +124,8 @@ def _write_values(place: Any, name: str, variable: Variable) -> Any:
     written = place.create_dataset(name, data=variable.values, fillvalue=variable.fill, track_order=True, **_PACKING)
     if variable.fill is not None:
         written.attrs["_FillValue"] = np.array([variable.fill], written.dtype)
+    if variable.scale is not None:
+        written.attrs["scale_factor"] = np.float64(variable.scale)
     for key, text in variable.attributes.items():
         written.attrs[key] = text
     return written
@@ -178,7 +183,7 @@ class Group:
         Parameters
         ----------
         kind
-            The type that it must have: ``f8``, ``i8``.
+            The type that it must have: ``f8``, ``i8``, ``u2``.
         dimensions
             The dimensions that it must have.
 
