@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -35,11 +36,14 @@ def main() -> None:
     parser.add_argument("--normalise", default="gain")
     parser.add_argument("--bodies", type=int, nargs="+", default=[250, 500, 1000, 2000])
     parser.add_argument("--forms", nargs="+", choices=FORMS, default=["log-quadratic", "gaussian-process"])
+    parser.add_argument("--without-places", action="store_true", help="learn without the figures by place")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     way, columns = rows_of_one_way(read_table(given.table, "population.table.json"), given.normalise)
     table = population_table(columns)
+    if given.without_places:
+        table = replace(table, by_place=None)
     bodies = np.unique(table.body)
     for number in given.bodies:
         if number > len(bodies) - 20:
@@ -67,10 +71,8 @@ def _held_out(
 
 def _sized(calibration: BodyCalibration, exams: PopulationTable) -> tuple[float, float]:
     """Log error of one body by the mean of its exams, and the variance that the calibration states."""
-    profiles: Sequence[tuple[float, ...] | None] = [None] * len(exams)
-    if exams.profile is not None:
-        profiles = [tuple(one) if np.isfinite(one).all() else None for one in exams.profile]
-    at, a, p = calibration.at_fat(profiles), exams.log_amplitude, exams.log_width
+    at = calibration.at_fat(_known(exams.profile, len(exams))).at_places(_known(exams.by_place, len(exams)))
+    a, p = exams.log_amplitude, exams.log_width
     size = at.log_size(a, p)
     slope = np.stack([(at.log_size(a + _STEP, p) - at.log_size(a - _STEP, p)) / (2 * _STEP), at.width_slope(a, p)])
     own = np.einsum("in,nij,jn->n", slope, exams.covariance[:, :2, :2], slope).mean()
@@ -78,6 +80,13 @@ def _sized(calibration: BodyCalibration, exams: PopulationTable) -> tuple[float,
     body, _, error = at.body_and_error(at.terms(a, p).mean(axis=0, keepdims=True), *middle, np.zeros(1))
     variance = float(body[0] ** 2 + error[0] + (own + np.exp(2 * at.mean[-1])) / len(exams))
     return float(size.mean() - np.log(exams.d_mm[0])), variance
+
+
+def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...] | None]:
+    """Figures of each exam; None where it has none."""
+    if figures is None:
+        return [None] * number
+    return [tuple(one) if np.isfinite(one).all() else None for one in figures]
 
 
 def _figures(error: FloatArray, variance: FloatArray) -> str:

@@ -170,7 +170,7 @@ def estimate_one(
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     posterior = estimate.map_posterior
-    used = None if posterior is None else fitting_calibration(posterior, calibration)
+    used = None if posterior is None else fitting_calibration(posterior, calibration, estimate.by_place)
     if posterior is not None and used is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
         by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"
@@ -375,5 +375,6 @@ def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | N
         posterior.angle_rad,
         turn_rad=angle,
         profile=head_profile(tactile_map.quality),
+        by_place=estimate.by_place,
         labels=estimate.draws.replicates,
     )

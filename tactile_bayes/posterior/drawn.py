@@ -29,13 +29,17 @@ MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none."""
+    """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none.
+
+    `by_place` is the map's figures `presets.BY_PLACE` of the lump, None where it has none.
+    """
 
     made: MapDraws
     size: SizePosterior | None
     fault: Abstention | None
     calibration: Calibration | None
     too_far: tuple[str, ...] = ()
+    by_place: tuple[float, ...] | None = None
 
 
 def draw_sized(
@@ -92,10 +96,11 @@ def _drawn(
     fault = shape_fault(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
-    calibration = fitting_calibration(posterior, calibration)
+    told = posterior.by_place(tactile_map)
+    calibration = fitting_calibration(posterior, calibration, told)
     far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
     size = None if fault or far else _size(posterior, made.draws, calibration, options.size_priors, rng=rng)
-    return Drawn(made, size, fault, calibration, far)
+    return Drawn(made, size, fault, calibration, far, told)
 
 
 def _size(
@@ -120,6 +125,11 @@ def _size(
     )
 
 
-def fitting_calibration(posterior: MapPosterior, calibration: Calibration | None) -> Calibration | None:
-    """The calibration, without its fat depth where no body of its table resembles the map at that depth."""
-    return None if calibration is None else calibration.fitting(*posterior.medians)
+def fitting_calibration(
+    posterior: MapPosterior, calibration: Calibration | None, by_place: tuple[float, ...] | None
+) -> Calibration | None:
+    """The calibration for the map's figures by place.
+
+    It is without its fat depth where no body of its table resembles the map at that depth.
+    """
+    return None if calibration is None else calibration.fitting(*posterior.medians).at_places([by_place])

@@ -119,6 +119,7 @@ def estimate_map(
         left_out=_left_out(tactile_map, options, calibration, made.figures),
         scene=made.scene,
         sensitivity=_sensitivity(posterior, size, options),
+        by_place=found.by_place,
     )
 
 

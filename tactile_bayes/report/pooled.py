@@ -76,7 +76,7 @@ def _omitted(used: BodyCalibration, documents: Sequence[Mapping[str, Any]]) -> l
     """What the pooled size does not contain, in words."""
     head = omissions.head(used.recipe.head)
     unknown = any(head in document["left_out"] for document in documents)
-    return [*([head] if unknown else []), *([omissions.fat_depth(used.fat_note)] if used.fat_note else [])]
+    return [*([head] if unknown else []), *used.omissions()]
 
 
 def _another_exam(size: SizePosterior | None, probability: float) -> dict[str, Any] | None:

@@ -75,6 +75,8 @@ class BodyCalibration:
         Depth F that this calibration is for; None where it is for any.
     fat_note
         Why the depth is not used though the calibration could; empty otherwise.
+    places_note
+        The same of the figures by place.
     any_depth
         Of a calibration for one depth, that for any.
     site
@@ -96,6 +98,7 @@ class BodyCalibration:
     with_fat: FatTerms | None = None
     fat_mm: float | None = None
     fat_note: str = ""
+    places_note: str = ""
     any_depth: BodyCalibration | None = None
     site: SiteShift | None = None
 
@@ -124,6 +127,10 @@ class BodyCalibration:
             return replace(self, with_fat=None, fat_note=why_not)
         found: BodyCalibration = fat.at(self, log_depth, profiles)
         return found
+
+    def at_places(self, by_place: Sequence[tuple[float, ...] | None]) -> BodyCalibration:  # noqa: ARG002
+        """The calibration for a mass whose maps have these `presets.BY_PLACE`: this one, if it has no use for them."""
+        return self
 
     def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> BodyCalibration:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth.
@@ -237,7 +244,8 @@ class BodyCalibration:
 
     def omissions(self) -> list[str]:
         """What a size does not contain, in words."""
-        return [omissions.fat_depth(self.fat_note)] if self.fat_note else []
+        notes = [omissions.fat_depth(self.fat_note)] if self.fat_note else []
+        return [*notes, omissions.by_place(self.places_note)] if self.places_note else notes
 
     def _unlike(self, amplitude: float, sigma_mm: float) -> str:
         return (

@@ -241,6 +241,11 @@ class SizeCalibration:
         del profiles
         return self
 
+    def at_places(self, by_place: Sequence[tuple[float, ...] | None]) -> SizeCalibration:
+        """Return the calibration unchanged: Eq 6 knows amplitude and width alone."""
+        del by_place
+        return self
+
     def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> SizeCalibration:
         """Return the calibration unchanged: it is the same for all maps."""
         del amplitude, sigma_x_mm, sigma_y_mm

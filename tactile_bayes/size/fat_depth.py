@@ -191,6 +191,10 @@ class FatTerms:
             "any_depth": replace(base, with_fat=None),
         }
 
+    def without_places(self) -> FatTerms:
+        """The calibration without the figures by place, of which only a process knows."""
+        return self
+
     def depths_apart(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float, float] | None:
         """Least and largest depth of fat in mm, where maps differ too much to be of one body.
 

@@ -1,6 +1,6 @@
-r"""Size calibration as a Gaussian process in amplitude, width and the head's pressure profile.
+r"""Size calibration as a Gaussian process in amplitude, width and what the frames tell.
 
-With :math:`x = (u, v, z_1, z_2, z_3)`, z the standardised profile, and u, v, w as in `fat_depth`,
+With :math:`x = (u, v, z_1, z_2, z_3)`, z the standardised profile of the head, and u, v, w as in `fat_depth`,
 
 .. math:: \ln d = \beta_0 + \beta_1 u + \beta_2 v + \beta_3 w + h(x) + B + E, \quad
           h \sim GP(0, k), \quad k(x, x') = s_h^2 \exp\Big(-\tfrac12 \sum_i (x_i - x_i')^2 / l_i^2\Big),
@@ -9,11 +9,14 @@ by a subset of regressors (Quinonero-Candela & Rasmussen 2005, sec. 3): with the
 :math:`K_{UU} = L L^T`, :math:`h(x) = s_h\, k(x, U) L^{-T} c`, the weights c being standard normal a priori. So the
 calibration is linear in its coefficients, as the others are. ln SD(B) is a full quadratic in u, v and w: a deep or
 faint lump tells less than one that is shallow and hard.
+
+For maps that keep frames a second process has the six figures of `mapping.bump_by_place` among its inputs too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +42,8 @@ SPREAD = tuple((i, j, k) for k in range(3) for i, j in powers(2 - k))
 """Powers of u, v and w in ln SD(B)."""
 _SPREAD: Powers = tuple((powers(2).index((i, j)), k) for i, j, k in SPREAD)
 _FEATURES: Powers = tuple((powers(ORDER).index((i, j)), k) for i, j, k in POWERS)
+MOST_SCALES = 4.0
+"""A figure by place further from its table's centre, in scales, counts as being there."""
 _NUGGET = 1e-6
 
 
@@ -48,35 +53,35 @@ class Kernel:
 
     Parameters
     ----------
-    points : (m, 5) array
+    points : (m, k) array
         U, in the units of x.
-    lengths : (5,) array
+    lengths : (k,) array
         l.
     scale
         s_h.
+    whitening : (m, m) array
+        s_h L^{-T}, from k(x, U) to the functions.
     """
 
     points: FloatArray
     lengths: FloatArray
     scale: float
+    whitening: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         m, k = self.points.shape
         if self.lengths.shape != (k,) or not (self.lengths > 0).all() or not self.scale > 0:
             raise BadDataError(f"lengths and scale of a process with {m} points of {k} values must be above 0")
-
-    def whitening(self) -> FloatArray:
-        """(m, m) matrix s_h L^{-T}, from k(x, U) to the functions."""
-        factor = np.linalg.cholesky(self.correlation(self.points) + _NUGGET * np.eye(len(self.points)))
-        return np.asarray(self.scale * np.linalg.inv(factor).T)
+        factor = np.linalg.cholesky(self.correlation(self.points) + _NUGGET * np.eye(m))
+        object.__setattr__(self, "whitening", np.asarray(self.scale * np.linalg.inv(factor).T))
 
     def correlation(self, x: FloatArray) -> FloatArray:
-        """(n, m) k(x, U) over s_h^2 for (n, 5) values."""
+        """(n, m) k(x, U) over s_h^2 for (n, k) values."""
         return squared_exponential(x, self.points, self.lengths)
 
     def functions(self, x: FloatArray) -> FloatArray:
-        """(n, m) functions of (n, 5) values."""
-        return np.asarray(self.correlation(x) @ self.whitening())
+        """(n, m) functions of (n, k) values."""
+        return np.asarray(self.correlation(x) @ self.whitening)
 
 
 def squared_exponential(x: FloatArray, points: FloatArray, lengths: FloatArray) -> FloatArray:
@@ -86,6 +91,45 @@ def squared_exponential(x: FloatArray, points: FloatArray, lengths: FloatArray) 
     exponent -= 0.5 * np.sum(points**2, axis=-1)
     exponent -= 0.5 * np.sum(x**2, axis=-1, keepdims=True)
     return np.asarray(np.exp(exponent, out=exponent))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceTable:
+    """The figures by place, `presets.BY_PLACE`, of the maps that a process was learned from.
+
+    Parameters
+    ----------
+    centre, scale : (6,) arrays
+    information_inverse : (7, 7) array
+        Of one and the standardised figures, for the leverage of a new map.
+    most_leverage
+        Of maps inside the table.
+    """
+
+    centre: FloatArray
+    scale: FloatArray
+    information_inverse: FloatArray
+    most_leverage: float
+
+    def standardised(self, by_place: FloatArray) -> FloatArray:
+        """(..., 6) figures about the table's centre, in its scales, at most `MOST_SCALES`."""
+        return np.clip((by_place - self.centre) / self.scale, -MOST_SCALES, MOST_SCALES)
+
+    def leverage(self, by_place: FloatArray) -> FloatArray:
+        """(n,) leverage of (n, 6) figures over the limit."""
+        x = np.insert((by_place - self.centre) / self.scale, 0, 1.0, axis=-1)
+        return np.asarray(np.einsum("ni,ij,nj->n", x, self.information_inverse, x) / self.most_leverage)
+
+    def mean(self, by_place: Sequence[tuple[float, ...] | None]) -> tuple[FloatArray | None, str]:
+        """(6,) standardised mean over the maps of a mass that resemble the table's, or the reason why there is none."""
+        known = [one for one in by_place if one is not None]
+        if not known:
+            return None, "no map keeps frames with the lump near the head; map the scan again"
+        found = np.array(known)
+        inside = self.leverage(found) <= 1.0
+        if not inside.any():
+            return None, "they are unlike any of the calibration's"
+        return self.standardised(found[inside]).mean(axis=0), ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,10 +145,16 @@ class FatProcess(FatTerms):
         Of h.
     other_sd
         SD of ln d by which a body may differ because it is none of the population's kind; adds to that of B.
+    places
+        The figures by place among the inputs; None where they are none.
+    with_places
+        The same with them, for maps that have them; None where the table had too few.
     """
 
     kernel: Kernel | None = None
     other_sd: float = 0.0
+    places: PlaceTable | None = None
+    with_places: FatProcess | None = None
 
     @property
     def file_key(self) -> str:
@@ -137,6 +187,10 @@ class FatProcess(FatTerms):
             raise BadDataError("the calibration has no process", way_out="learn it anew")
         return self.kernel
 
+    def without_places(self) -> FatProcess:
+        """The process of amplitude, width and profile alone."""
+        return replace(self, with_places=None)
+
     def contraction(self, log_depth: float) -> FloatArray:
         """Matrix that takes the coefficients to those at one depth; the weights stay."""
         linear, m = self._contracted(LINEAR, log_depth), len(self._kernel.points)
@@ -150,9 +204,13 @@ class FatProcess(FatTerms):
         self, base: DataclassInstance, log_depth: float, profiles: Sequence[tuple[float, ...] | None]
     ) -> ProcessAtProfile:
         """The calibration at the mean of the profiles."""
-        fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
         profile = (self.alike(profiles).mean(axis=0) - self.depth.centre) / self.depth.scale
-        own = {"kernel": self._kernel, "profile": profile, "other_sd": self.other_sd}
+        return self.at_figures(base, log_depth, profile)
+
+    def at_figures(self, base: DataclassInstance, log_depth: float, figures: FloatArray) -> ProcessAtProfile:
+        """The calibration at one depth for (3,) or (9,) standardised figures of the frames."""
+        fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
+        own = {"kernel": self._kernel, "profile": figures, "other_sd": self.other_sd, "with_places": self.with_places}
         return ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own})
 
 
@@ -164,15 +222,27 @@ class ProcessAtProfile(BodyCalibration):
     ----------
     kernel
         Of h.
-    profile : (3,) array
-        z of the mass.
-    other_sd
+    profile : (3,) or (9,) array
+        z of the mass, and its standardised figures by place where these are known.
+    other_sd, with_places
         As in `FatProcess`.
     """
 
     kernel: Kernel | None = None
     profile: FloatArray | None = None
     other_sd: float = 0.0
+    with_places: FatProcess | None = None
+
+    def at_places(self, by_place: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
+        """The calibration that knows the figures by place, at their mean over the maps that have them."""
+        process = self.with_places
+        if process is None or process.places is None:
+            return self
+        figures, why_not = process.places.mean(by_place)
+        if figures is None:
+            return replace(self, with_places=None, places_note=why_not)
+        found = process.at_figures(self, float(np.log(self.fat_mm or np.nan)), np.append(self._profile, figures))
+        return replace(found, any_depth=self.any_depth)
 
     @property
     def form_name(self) -> str:
@@ -192,7 +262,7 @@ class ProcessAtProfile(BodyCalibration):
     def terms(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(..., 3 + m) linear terms and functions of the process."""
         linear = monomials(self._centred(log_amplitude, log_width), AT_ONE_DEPTH)
-        process = self._correlation(log_amplitude, log_width) @ self._kernel.whitening()
+        process = self._correlation(log_amplitude, log_width) @ self._kernel.whitening
         return np.concatenate([linear, process], axis=-1)
 
     def body_and_error(
@@ -230,7 +300,7 @@ class ProcessAtProfile(BodyCalibration):
 
     def _weights(self) -> FloatArray:
         """(m,) weights of the correlations."""
-        return np.asarray(self._kernel.whitening() @ self.mean[len(AT_ONE_DEPTH) : self.coefficients])
+        return np.asarray(self._kernel.whitening @ self.mean[len(AT_ONE_DEPTH) : self.coefficients])
 
     @property
     def _kernel(self) -> Kernel:

@@ -16,3 +16,8 @@ def head(calibration_head: object) -> str:
 def fat_depth(why: str) -> str:
     """The depth of fat as a source left out, where maps do not give it."""
     return f"the depth of the fat, which would narrow the size: {why}"
+
+
+def by_place(why: str) -> str:
+    """The figures by place as a source left out, where maps do not give them."""
+    return f"how the lump feels under each part of the head, which would narrow the size: {why}"

@@ -65,8 +65,8 @@ class ShapeDraws:
         Half log axis ratio along the map's x axis and 45 degrees from it.
     turn_rad
         From the axes that the maps of a mass share to this map's.
-    profile
-        `presets.HEAD_PROFILE` of the map; None where it has none.
+    profile, by_place
+        `presets.HEAD_PROFILE` and `presets.BY_PLACE` of the map; None where it has none.
     labels
         Of the draws' independent replicates, as `ParameterDraws.labels`.
     """
@@ -77,6 +77,7 @@ class ShapeDraws:
     r: FloatArray
     turn_rad: float = 0.0
     profile: tuple[float, ...] | None = None
+    by_place: tuple[float, ...] | None = None
     labels: Labels | None = None
 
     @property
@@ -99,6 +100,7 @@ class ShapeDraws:
         *,
         turn_rad: float = 0.0,
         profile: tuple[float, ...] | None = None,
+        by_place: tuple[float, ...] | None = None,
         labels: Labels | None = None,
     ) -> ShapeDraws:
         """Prepare from draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
@@ -107,7 +109,8 @@ class ShapeDraws:
         half = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel()
         angle = angle_rad.ravel()
         p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
-        return cls(log_a, p, half * np.cos(2 * angle), half * np.sin(2 * angle), turn_rad, profile, labels)
+        q, r = half * np.cos(2 * angle), half * np.sin(2 * angle)
+        return cls(log_a, p, q, r, turn_rad, profile, by_place, labels)
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -156,7 +159,7 @@ def pooled_size(
     the spread of B and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
     maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
     """
-    calibration = calibration.at_fat([one.profile for one in maps])
+    calibration = calibration.at_fat([one.profile for one in maps]).at_places([one.by_place for one in maps])
     used, replicates = _matched(maps, number, rng)
     by_map = np.stack([corrected_log_size(calibration, m) for m in used])
     log_size = by_map if used is maps else [corrected_log_size(calibration, m) for m in maps]
@@ -342,6 +345,7 @@ def pool_maps(
     middles = [one.middle for one in used]
     for middle in middles:  # one map that does not go with the depth is enough: it is the same body
         calibration = calibration.fitting(*middle)
+    calibration = calibration.at_places([one.by_place for one in used])
     named = sorted(zip(found, middles, strict=True))
     far = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.too_far(*middle)]
     if far:

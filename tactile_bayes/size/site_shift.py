@@ -45,6 +45,8 @@ class SiteShift:
         Name of the calibration that is corrected.
     uses_fat
         Whether the phantoms were sized with the depth of fat; if not, no size with this correction is.
+    uses_places
+        The same of the figures by place.
     fit
         Figures of the fit: ``log_width`` (mean p of the phantoms), ``spread_factor``, ``sd_before`` and ``sd_after``.
     cautions
@@ -60,6 +62,7 @@ class SiteShift:
     maps: int
     base: str = ""
     uses_fat: bool = True
+    uses_places: bool = True
     fit: Mapping[str, float] = field(default_factory=dict)
     cautions: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
@@ -114,7 +117,10 @@ def site_slope(site: SiteShift | None) -> float:
 
 
 def with_site(calibration: BodyCalibration, site: SiteShift) -> BodyCalibration:
-    """The calibration with a correction; without the depth of fat where the phantoms were sized without it."""
-    if site.uses_fat or calibration.with_fat is None:
+    """The calibration with a correction; without the depth of fat or figures by place if the phantoms had none."""
+    fat = calibration.with_fat
+    if fat is None:
         return replace(calibration, site=site)
-    return replace(calibration, site=site, with_fat=None, fat_note=NO_PROFILE)
+    if not site.uses_fat:
+        return replace(calibration, site=site, with_fat=None, fat_note=NO_PROFILE)
+    return replace(calibration, site=site, with_fat=fat if site.uses_places else fat.without_places())

@@ -14,9 +14,8 @@ import numpy as np
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.fat_depth import ROUND
 from tactile_bayes.size.hidden import RoundLumps
-from tactile_bayes.size.learn.fat_depth import table_with_depths
+from tactile_bayes.size.learn.fat_depth import FatTable
 from tactile_bayes.size.learn.regression import (
     BodyRegression,
     PopulationTable,
@@ -24,7 +23,7 @@ from tactile_bayes.size.learn.regression import (
     domain_of,
     figures,
     hidden_terms,
-    largest_leverage,
+    leverages,
 )
 from tactile_bayes.size.polynomials import monomials
 from tactile_bayes.size.population_eq6 import (
@@ -103,14 +102,14 @@ def learn_population_eq6(table: PopulationTable, *, recipe: Recipe, source: str 
     u, v = table.log_amplitude - centre[0], table.log_width - centre[1]
     data, mean, covariance = _posterior(table, Eq6Rows(u, v, np.zeros_like(u), _PLAIN))
     features = monomials((u, v), FEATURES)
-    inverse, most_leverage = largest_leverage(features)
+    inverse, leverage = leverages(features)
     return PopulationEq6(
         centre=centre,
         mean=mean,
         covariance=covariance,
         round_lumps=RoundLumps(*data.oval(table, features[:, :3])),
         information_inverse=inverse,
-        most_leverage=most_leverage,
+        most_leverage=float(leverage.max()),
         domain=domain_of(table),
         recipe=recipe,
         hidden=hidden_terms(table, data, mean, features=features),
@@ -129,28 +128,17 @@ def learn_fat_eq6(table: PopulationTable) -> FatEq6 | None:
     NotConvergedError
         When the posterior has no mode.
     """
-    found = table_with_depths(table)
+    found = FatTable.of(table)
     if found is None:
         return None
-    table, depth, log_depth = found
-    (alpha, p0), w0 = _centre(table), round(float(log_depth.mean()), 3)
-    values = (table.log_amplitude - alpha, table.log_width - p0, log_depth - w0)
-    data, mean, covariance = _posterior(table, Eq6Rows(*values, FAT_COEFFICIENTS))
-    features = monomials(values, FAT_FEATURES)
-    inverse, most_leverage = largest_leverage(features)
-    coefficients, between, within = data.oval(table, monomials(values, ROUND))
+    data, mean, covariance = _posterior(found.maps, Eq6Rows(*found.values, FAT_COEFFICIENTS))
+    features = monomials(found.values, FAT_FEATURES)
     return FatEq6(
-        depth=depth,
-        centre=(alpha, p0, w0),
+        **found.fields(data, features),
         mean=mean,
         covariance=covariance,
-        round_coefficients=coefficients,
-        round_sd=(between, within),
-        information_inverse=inverse,
-        most_leverage=most_leverage,
-        fat_mm=(float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))),
-        hidden=hidden_terms(table, data, mean, features=features),
-        fit=figures(table, data, mean),
+        hidden=hidden_terms(found.maps, data, mean, features=features),
+        fit=figures(found.maps, data, mean),
     )
 
 

@@ -2,26 +2,81 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.size.fat_depth import POWERS, ROUND, FatCubic, FatDepth, cubic_terms, profile_terms
-from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable, figures, hidden_terms
+from tactile_bayes.size.fat_depth import ROUND, FatCubic, FatDepth, cubic_terms, profile_terms
+from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable, figures, hidden_terms, leverages
+from tactile_bayes.size.polynomials import monomials
 
 LEAST_BODIES = 80
 """Four for each term: with fewer a calibration without the fat's depth is all that a table supports."""
-_ROUND = [POWERS.index(one) for one in ROUND]
 
 
-def table_with_depths(table: PopulationTable) -> tuple[PopulationTable, FatDepth, FloatArray] | None:
-    """Rows with a profile, what their profiles tell of the fat, and (n,) ln F by it; None for too few bodies."""
-    if table.profile is None:
-        return None
-    table = table.rows(np.isfinite(table.profile.sum(axis=1)))
-    if table.profile is None or table.log_fat is None or len(np.unique(table.body)) < LEAST_BODIES:
-        return None
-    depth = learn_depth(table.profile, table.log_fat)
-    return table, depth, depth.log_depth(table.profile)
+@dataclass(frozen=True, slots=True, eq=False)
+class FatTable:
+    """Maps with a profile of the head, and what it tells.
+
+    Parameters
+    ----------
+    maps
+        The rows of the table that have one.
+    depth
+        From profile to depth of fat, learned from them.
+    log_depth : (n,) array
+        ln F by it.
+    centre
+        alpha_0, p_0 and w_0: rounded means.
+    """
+
+    maps: PopulationTable
+    depth: FatDepth
+    log_depth: FloatArray
+    centre: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, table: PopulationTable) -> FatTable | None:
+        """The rows with a profile; None for too few bodies."""
+        if table.profile is None:
+            return None
+        maps = table.rows(np.isfinite(table.profile.sum(axis=1)))
+        if maps.profile is None or maps.log_fat is None or len(np.unique(maps.body)) < LEAST_BODIES:
+            return None
+        depth = learn_depth(maps.profile, maps.log_fat)
+        log_depth = depth.log_depth(maps.profile)
+        alpha, p0, w0 = (round(float(one.mean()), 3) for one in (maps.log_amplitude, maps.log_width, log_depth))
+        return cls(maps, depth, log_depth, (alpha, p0, w0))
+
+    @property
+    def values(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n,) u, v and w."""
+        (alpha, p0, w0), maps = self.centre, self.maps
+        return maps.log_amplitude - alpha, maps.log_width - p0, self.log_depth - w0
+
+    def fields(self, data: BodyRegression, features: FloatArray, *, inside: float = 1.0) -> dict[str, Any]:
+        """Fields of `FatTerms` that do not depend on the form.
+
+        Parameters
+        ----------
+        features : (n, c) array
+            By which a map is like or unlike the table's.
+        inside
+            Share of the table's maps that count as inside it.
+        """
+        coefficients, between, within = data.oval(self.maps, monomials(self.values, ROUND))
+        inverse, leverage = leverages(features)
+        return {
+            "depth": self.depth,
+            "centre": self.centre,
+            "round_coefficients": coefficients,
+            "round_sd": (between, within),
+            "information_inverse": inverse,
+            "most_leverage": float(np.quantile(leverage, inside)),
+            "fat_mm": (float(np.exp(self.log_depth.min())), float(np.exp(self.log_depth.max()))),
+        }
 
 
 def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
@@ -32,31 +87,22 @@ def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
     NotConvergedError
         When the posterior has no mode.
     """
-    found = table_with_depths(table)
+    found = FatTable.of(table)
     if found is None:
         return None
-    table, depth, log_depth = found
-    alpha, p0, w0 = (round(float(one.mean()), 3) for one in (table.log_amplitude, table.log_width, log_depth))
+    (alpha, p0, _), (_, _, w) = found.centre, found.values
 
     def terms_of(log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
-        return cubic_terms(log_amplitude - alpha, log_width - p0, log_depth - w0)
+        return cubic_terms(log_amplitude - alpha, log_width - p0, w)
 
-    data = BodyRegression.of(table, terms_of)
+    data = BodyRegression.of(found.maps, terms_of)
     mean, covariance = data.posterior()
-    inverse, most_leverage = data.leverage()
-    coefficients, between, within = data.oval(table, data.terms[:, _ROUND])
     return FatCubic(
-        depth=depth,
-        centre=(alpha, p0, w0),
+        **found.fields(data, data.terms),
         mean=mean,
         covariance=covariance,
-        round_coefficients=coefficients,
-        round_sd=(between, within),
-        information_inverse=inverse,
-        most_leverage=most_leverage,
-        fat_mm=(float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))),
-        hidden=hidden_terms(table, data, mean),
-        fit=figures(table, data, mean),
+        hidden=hidden_terms(found.maps, data, mean),
+        fit=figures(found.maps, data, mean),
     )
 
 

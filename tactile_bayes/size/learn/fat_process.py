@@ -1,126 +1,32 @@
-r"""Learning of the Gaussian process over a population's maps, see `size.fat_process`.
-
-Given the kernel and the spread of B, the coefficients have a normal posterior in closed form, and with them a lower
-bound of the evidence of the bodies' means: less than the evidence by what the points do not explain of the process, so
-that lengths too short for the points do not pay (Titsias 2009, eq. 9). Its maximum, with weak priors, gives the
-kernel's lengths and scale. The coefficients of ln SD(B) are then those by which bodies left out are most probable, so
-that intervals hold on bodies never seen (Rasmussen & Williams 2006, sec. 5.4.2): by the evidence alone they held too
-seldom for shallow and clear lumps. The spread between exams comes from how the exams of one body differ, as in
-`regression`.
-"""
+r"""Learning of the Gaussian process over a population's maps, see `size.fat_process` and `process_fit`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from scipy.special import ndtri
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HELD
-from tactile_bayes.size.fat_depth import POWERS, ROUND, FatDepth
-from tactile_bayes.size.fat_process import LINEAR_POWERS, SPREAD, FatProcess, Kernel, squared_exponential
-from tactile_bayes.size.learn.fat_depth import LEAST_BODIES, table_with_depths
-from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable, hidden_terms, largest_leverage
+from tactile_bayes.size.fat_depth import POWERS
+from tactile_bayes.size.fat_process import FatProcess, PlaceTable
+from tactile_bayes.size.learn.fat_depth import LEAST_BODIES, FatTable
+from tactile_bayes.size.learn.process_fit import Fitted, ProcessRows, all_terms, fit_process, left_out_density
+from tactile_bayes.size.learn.regression import PopulationTable, error_figures, hidden_terms, leverages
 from tactile_bayes.size.polynomials import monomials
 
-POINTS: Final = 100
-"""Points of the kernel; with fewer bodies a quarter of their number."""
-BODIES_PER_POINT: Final = 4
 INSIDE: Final = 0.99
 """Share of the table's maps that count as inside it: its largest leverage is an outlier's, ten times what is left."""
 OTHER_SD: Final = 0.03
 """Of bodies unlike the population's. With it 95 % intervals hold in simulated trials of such bodies (record 0105)."""
-ROUNDS: Final = 2
-"""Times that points are chosen and the kernel is fitted to them."""
-_LINEAR_SD = 10.0
-_LENGTH, _SCALE, _BODY_SD = (np.log(2.0), 1.0), (np.log(0.3), 1.0), (np.log(0.1), 1.0)
-"""Centre and width of the normal priors on the logs of lengths, scale and SD(B) at the centre."""
-_SLOPE_SD = 0.3
-"""Width of the prior on the other coefficients of ln SD(B)."""
-_START_LENGTHS = (2.0, 0.7)
-"""The evidence has modes where what is smooth is taken for scatter, and the other way round."""
-_STEP = 1e-4
-_MOST_ITERATIONS = 200
-_DIFFERENCE = 1e-4
-"""Step of the gradient: below it the rounding of the solutions shows."""
-Minimise = Callable[..., Any]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ProcessRows:
-    """Maps of a table as the process takes them.
-
-    Parameters
-    ----------
-    data
-        The regression on the linear part.
-    x : (n, 5) array
-        Inputs of the kernel.
-    spread : (b, s) array
-        `SPREAD` of each body's mean.
-    """
-
-    data: BodyRegression
-    x: FloatArray
-    spread: FloatArray
-
-    @classmethod
-    def of(
-        cls, table: PopulationTable, depth: FatDepth, log_depth: FloatArray, centre: tuple[float, float, float]
-    ) -> ProcessRows:
-        """The rows of a table whose maps all have a profile."""
-        assert table.profile is not None
-        u, v, w = table.log_amplitude - centre[0], table.log_width - centre[1], log_depth - centre[2]
-        x = np.column_stack([u, v, (table.profile - depth.centre) / depth.scale])
-        nothing, linear = np.zeros((2, len(u))), monomials((u, v, w), LINEAR_POWERS)
-        data = BodyRegression.linear(table, linear, u=u, constant=nothing[0], slope=nothing)
-        spread = monomials([data.mean(one) for one in (u, v, w)], SPREAD)
-        return cls(data, x, spread)
-
-    def mean(self, values: FloatArray) -> FloatArray:
-        """(b, k) means of (n, k) values over each body's exams."""
-        return np.stack([self.data.mean(column) for column in values.T], axis=1)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
-    """The process given its kernel and spreads.
-
-    Parameters
-    ----------
-    kernel
-    log_spread : (s,) array
-        Coefficients of ln SD(B).
-    mean, covariance : (k,), (k, k) arrays
-        Of the linear coefficients and the weights.
-    terms : (b, k) array
-        Means of each body's terms.
-    variance : (b,) array
-        Of each body's mean ln d about the process.
-    log_evidence
-        Lower bound of the log evidence, without what no parameter changes.
-    """
-
-    kernel: Kernel
-    log_spread: FloatArray
-    mean: FloatArray
-    covariance: FloatArray
-    terms: FloatArray
-    variance: FloatArray
-    log_evidence: float
-
-    def left_out(self, log_d: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(b,) ln(predicted / true size) of each body held out, kernel and spreads kept, and the error's variance."""
-        weight = np.einsum("bi,ij,bj->b", self.terms, self.covariance, self.terms) / self.variance
-        residual = log_d - self.terms @ self.mean
-        return -residual / (1.0 - weight), self.variance / (1.0 - weight)
 
 
 def learn_fat_process(table: PopulationTable, *, other_sd: float = OTHER_SD) -> FatProcess | None:
     """Learn the calibration from maps with a profile; None for too few bodies.
+
+    Where enough of the maps have figures by place too, a second process knows these.
 
     Parameters
     ----------
@@ -132,193 +38,46 @@ def learn_fat_process(table: PopulationTable, *, other_sd: float = OTHER_SD) -> 
     NotConvergedError
         When the coefficients of ln SD(B) have no mode.
     """
-    found = table_with_depths(table)
+    found = FatTable.of(table)
     if found is None:
         return None
-    table, depth, log_depth = found
-    alpha, p0, w0 = (round(float(one.mean()), 3) for one in (table.log_amplitude, table.log_width, log_depth))
-    rows = ProcessRows.of(table, depth, log_depth, (alpha, p0, w0))
-    rows, fitted, exam = fit_process(table, rows)
-    features = monomials((rows.x[:, 0], rows.x[:, 1], log_depth - w0), POWERS)
-    inverse, _ = largest_leverage(features)
-    leverage = np.einsum("ni,ij,nj->n", features, inverse, features)
-    coefficients, between, within = rows.data.oval(table, features[:, [POWERS.index(one) for one in ROUND]])
+    return replace(_learned(found, None, other_sd), with_places=_with_places(found, other_sd))
+
+
+def _with_places(found: FatTable, other_sd: float) -> FatProcess | None:
+    """The process that knows the figures by place, in the scales of the whole table; None for too few bodies."""
+    if found.maps.by_place is None:
+        return None
+    kept = np.isfinite(found.maps.by_place.sum(axis=1))
+    maps = found.maps.rows(kept)
+    if maps.by_place is None or len(np.unique(maps.body)) < LEAST_BODIES:
+        return None
+    return _learned(replace(found, maps=maps, log_depth=found.log_depth[kept]), place_table(maps.by_place), other_sd)
+
+
+def place_table(by_place: FloatArray) -> PlaceTable:
+    """Median and robust scale of (n, 6) figures, and how far they reach."""
+    low, middle, high = np.quantile(by_place, [0.25, 0.5, 0.75], axis=0)
+    scale = (high - low) / 1.35
+    inverse, leverage = leverages(np.insert((by_place - middle) / scale, 0, 1.0, axis=1))
+    return PlaceTable(middle, scale, inverse, float(np.quantile(leverage, INSIDE)))
+
+
+def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> FatProcess:
+    rows, fitted, exam = fit_process(found.maps, ProcessRows.of(found, places))
+    features = monomials(found.values, POWERS)
     mean = np.concatenate([fitted.mean, fitted.log_spread, exam[:1]])
     whole = replace(rows.data, terms=all_terms(rows, fitted.kernel), mean_terms=fitted.terms)
     return FatProcess(
-        depth=depth,
-        centre=(alpha, p0, w0),
+        **found.fields(rows.data, features, inside=INSIDE),
         mean=mean,
         covariance=_covariance(rows, fitted, exam),
-        round_coefficients=coefficients,
-        round_sd=(between, within),
-        information_inverse=inverse,
-        most_leverage=float(np.quantile(leverage, INSIDE)),
-        fat_mm=(float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))),
-        hidden=hidden_terms(table, whole, mean, features=features),
-        fit=_figures(table, rows, fitted, exam),
+        hidden=hidden_terms(found.maps, whole, mean, features=features),
+        fit=_figures(found.maps, rows, fitted, exam),
         kernel=fitted.kernel,
         other_sd=other_sd,
+        places=places,
     )
-
-
-def fit_process(table: PopulationTable, rows: ProcessRows) -> tuple[ProcessRows, Fitted, FloatArray]:
-    """Points, kernel and spreads by turns; the rows with the maps' own variance, the fit, ln SD(E) and its variance."""
-    count = max(min(POINTS, rows.data.groups // BODIES_PER_POINT), LEAST_BODIES // BODIES_PER_POINT)
-    exam = np.array(rows.data.log_exam_sd(rows.data.least_squares()))
-    starts = [_start(rows, length) for length in _START_LENGTHS]
-    for _ in range(ROUNDS):
-        fits = [_best(rows, one, count, exam_sd=float(np.exp(exam[0]))) for one in starts]
-        theta, points, _ = min(fits, key=lambda one: one[2])
-        starts = [theta]
-        fitted = given(rows, points, theta, exam_sd=float(np.exp(exam[0])))
-        rows = replace(rows, data=replace(rows.data, map_variance=_map_variance(table, rows, fitted)))
-        whole = replace(rows.data, terms=all_terms(rows, fitted.kernel))
-        exam = np.array(whole.log_exam_sd(fitted.mean))
-    fitted = given(rows, points, theta, exam_sd=float(np.exp(exam[0])))
-    return rows, _spread_by_left_out(rows, fitted, exam_sd=float(np.exp(exam[0]))), exam
-
-
-def _spread_by_left_out(rows: ProcessRows, fitted: Fitted, *, exam_sd: float) -> Fitted:
-    """The fit with the coefficients of ln SD(B) by which bodies left out are most probable, the kernel kept."""
-    from scipy.optimize import minimize
-
-    density = _left_out_density(rows, fitted, exam_sd=exam_sd)
-
-    def cost(log_spread: FloatArray) -> float:
-        return -density(log_spread)
-
-    found = minimize(cost, fitted.log_spread, method="L-BFGS-B", options={"eps": _DIFFERENCE})
-    return _solved(rows, fitted.kernel, fitted.terms, np.asarray(found.x), exam_sd=exam_sd)
-
-
-def _left_out_density(rows: ProcessRows, fitted: Fitted, *, exam_sd: float) -> Callable[[FloatArray], float]:
-    """Log density of all bodies, each left out, with the prior, by (s,) coefficients of ln SD(B)."""
-
-    def density(log_spread: FloatArray) -> float:
-        solved = _solved(rows, fitted.kernel, fitted.terms, log_spread, exam_sd=exam_sd)
-        error, variance = solved.left_out(rows.data.mean_log_d)
-        return float(-0.5 * np.sum(np.log(variance) + error**2 / variance)) + _spread_prior(log_spread)
-
-    return density
-
-
-def spread_points(x: FloatArray, lengths: FloatArray, count: int) -> FloatArray:
-    """(m, k) of the (b, k) values that explain the kernel best: pivots of its incomplete Cholesky factor.
-
-    Notes
-    -----
-    Fine & Scheinberg (2001).
-    """
-    left, factor, chosen = np.ones(len(x)), np.zeros((len(x), count)), []
-    for j in range(count):
-        i = int(np.argmax(left))
-        chosen.append(i)
-        column = squared_exponential(x, x[i : i + 1], lengths)[:, 0] - factor[:, :j] @ factor[i, :j]
-        factor[:, j] = column / np.sqrt(left[i])
-        left = np.maximum(left - factor[:, j] ** 2, 1e-12)
-        left[chosen] = 0.0
-    return x[chosen]
-
-
-def all_terms(rows: ProcessRows, kernel: Kernel) -> FloatArray:
-    """(n, 4 + m) linear terms and functions of each map."""
-    return np.concatenate([rows.data.terms[:, : len(LINEAR_POWERS)], kernel.functions(rows.x)], axis=1)
-
-
-def given(rows: ProcessRows, points: FloatArray, theta: FloatArray, *, exam_sd: float) -> Fitted:
-    """Posterior of the coefficients and the evidence for one kernel and spread.
-
-    Parameters
-    ----------
-    theta : (k + 1 + s,) array
-        Logs of the k lengths and of the scale, coefficients of ln SD(B).
-    """
-    k = rows.x.shape[1]
-    kernel = Kernel(points, np.exp(theta[:k]), float(np.exp(theta[k])))
-    return _solved(rows, kernel, rows.mean(all_terms(rows, kernel)), theta[k + 1 :], exam_sd=exam_sd)
-
-
-def _solved(rows: ProcessRows, kernel: Kernel, terms: FloatArray, log_spread: FloatArray, *, exam_sd: float) -> Fitted:
-    """As `given`, for a kernel whose (b, k) terms are known."""
-    data = rows.data
-    variance = np.exp(2 * rows.spread @ log_spread) + (exam_sd**2 + data.mean(data.map_variance)) / data.exams
-    prior = np.ones(terms.shape[1])
-    prior[: len(LINEAR_POWERS)] = _LINEAR_SD**-2
-    scaled = terms / np.sqrt(variance)[:, None]
-    factor = np.linalg.cholesky(scaled.T @ scaled + np.diag(prior))
-    inverse = np.linalg.inv(factor)
-    covariance = inverse.T @ inverse
-    left = data.mean_log_d / np.sqrt(variance)
-    mean = covariance @ (scaled.T @ left)
-    misfit = left @ left - mean @ (scaled.T @ left)
-    evidence = -0.5 * misfit - 0.5 * np.log(variance).sum() - np.log(np.diag(factor)).sum()
-    unexplained = kernel.scale**2 - np.sum(terms[:, len(LINEAR_POWERS) :] ** 2, axis=1)
-    evidence -= 0.5 * np.sum(np.maximum(unexplained, 0.0) / variance)
-    return Fitted(kernel, log_spread, mean, covariance, terms, variance, float(evidence))
-
-
-def log_prior(theta: FloatArray, lengths: int) -> float:
-    """Of the logs of lengths and scale and the coefficients of ln SD(B)."""
-    of_lengths = np.sum(((theta[:lengths] - _LENGTH[0]) / _LENGTH[1]) ** 2)
-    of_scale = ((theta[lengths] - _SCALE[0]) / _SCALE[1]) ** 2
-    return float(-0.5 * (of_lengths + of_scale)) + _spread_prior(theta[lengths + 1 :])
-
-
-def _spread_prior(log_spread: FloatArray) -> float:
-    at_centre = ((log_spread[0] - _BODY_SD[0]) / _BODY_SD[1]) ** 2
-    return float(-0.5 * (at_centre + np.sum((log_spread[1:] / _SLOPE_SD) ** 2)))
-
-
-def _start(rows: ProcessRows, length: float) -> FloatArray:
-    lengths, spread = np.full(rows.x.shape[1], np.log(length)), np.zeros(rows.spread.shape[1])
-    spread[0] = _BODY_SD[0]
-    return np.concatenate([lengths, [_SCALE[0]], spread])
-
-
-def _of_means(rows: ProcessRows, *, exam_sd: float) -> ProcessRows:
-    """The bodies' means as rows of one exam each, with its spread: exams of a body differ little."""
-    data, count = rows.data, rows.data.groups
-    means = replace(
-        data,
-        terms=data.mean_terms,
-        constant=np.zeros(count),
-        map_variance=(exam_sd**2 + data.mean(data.map_variance)) / data.exams,
-        group=np.arange(count),
-        exams=np.ones(count),
-    )
-    return replace(rows, data=means, x=rows.mean(rows.x))
-
-
-def _best(rows: ProcessRows, start: FloatArray, count: int, *, exam_sd: float) -> tuple[FloatArray, FloatArray, float]:
-    """Logs of kernel and spreads at the mode next to a start, the points, and the mode's negative log density."""
-    from scipy.optimize import minimize
-
-    points = spread_points(rows.mean(rows.x), np.exp(start[: rows.x.shape[1]]), count)
-
-    bodies = _of_means(rows, exam_sd=exam_sd)
-
-    def cost(theta: FloatArray) -> float:
-        return -given(bodies, points, theta, exam_sd=0.0).log_evidence - log_prior(theta, rows.x.shape[1])
-
-    bounds = [(-2.0, 4.0)] * rows.x.shape[1] + [(-4.0, 2.0)] + [(-5.0, 1.0)]
-    bounds += [(-1.5, 1.5)] * (len(start) - len(bounds))
-    found = minimize(
-        cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": _MOST_ITERATIONS, "eps": _DIFFERENCE}
-    )
-    return np.asarray(found.x, dtype=np.float64), points, float(found.fun)
-
-
-def _map_variance(table: PopulationTable, rows: ProcessRows, fitted: Fitted) -> FloatArray:
-    """(n,) variance of the predicted ln d by the maps' own posteriors."""
-    slopes = []
-    for column, name in ((0, 1), (1, 2)):
-        moved = rows.x.copy()
-        moved[:, column] += _STEP
-        change = (fitted.kernel.functions(moved) - fitted.kernel.functions(rows.x)) / _STEP
-        slopes.append(fitted.mean[name] + change @ fitted.mean[len(LINEAR_POWERS) :])
-    slope = np.stack(slopes)
-    return np.asarray(np.einsum("in,nij,jn->n", slope, table.covariance[:, :2, :2], slope))
 
 
 def _covariance(rows: ProcessRows, fitted: Fitted, exam: FloatArray) -> FloatArray:
@@ -326,7 +85,7 @@ def _covariance(rows: ProcessRows, fitted: Fitted, exam: FloatArray) -> FloatArr
     from tactile_bayes.inference.laplace import mode_and_covariance
 
     k, s = len(fitted.mean), len(fitted.log_spread)
-    density = _left_out_density(rows, fitted, exam_sd=float(np.exp(exam[0])))
+    density = left_out_density(rows, fitted, exam_sd=float(np.exp(exam[0])))
 
     def many(spreads: FloatArray) -> FloatArray:
         return np.array([density(one) for one in spreads])
@@ -340,13 +99,6 @@ def _covariance(rows: ProcessRows, fitted: Fitted, exam: FloatArray) -> FloatArr
 def _figures(table: PopulationTable, rows: ProcessRows, fitted: Fitted, exam: FloatArray) -> dict[str, float]:
     """Number of rows, spreads, and errors cross-validated by body with the kernel kept."""
     error, variance = fitted.left_out(rows.data.mean_log_d)
-    return {
-        "maps": float(len(table)),
-        "bodies": float(rows.data.groups),
-        "body_sd": float(np.exp(np.median(rows.spread @ fitted.log_spread))),
-        "exam_sd": float(np.exp(exam[0])),
-        "left_out_sd": float(error.std()),
-        "left_out_mae_percent": float(100 * np.mean(np.abs(np.expm1(error)))),
-        "left_out_bias_percent": float(100 * np.mean(np.expm1(error))),
-        "left_out_held_percent": float(100 * np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(variance))),
-    }
+    spreads = {"body_sd": float(np.exp(np.median(rows.spread @ fitted.log_spread))), "exam_sd": float(np.exp(exam[0]))}
+    share_held = float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(variance)))
+    return error_figures(table, rows.data, spreads, error, share_held)

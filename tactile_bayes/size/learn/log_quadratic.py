@@ -16,6 +16,7 @@ from tactile_bayes.size.learn.regression import (
     domain_of,
     figures,
     hidden_terms,
+    leverages,
 )
 from tactile_bayes.size.log_quadratic import LogQuadratic, quadratic_terms
 
@@ -51,14 +52,14 @@ def learn_log_quadratic(
 
     data = BodyRegression.of(table, terms_of)
     mean, covariance = data.posterior()
-    inverse, most_leverage = data.leverage()
+    inverse, leverage = leverages(data.terms)
     return LogQuadratic(
         centre=centre,
         mean=mean,
         covariance=covariance,
         round_lumps=RoundLumps(*data.oval(table, data.terms[:, :3])),
         information_inverse=inverse,
-        most_leverage=most_leverage,
+        most_leverage=float(leverage.max()),
         domain=domain_of(table),
         recipe=recipe,
         hidden=hidden_terms(table, data, mean),

@@ -211,15 +211,11 @@ class BodyRegression:
         between = float(np.var(mean) - within * np.mean(1.0 / self.exams))
         return coefficients, float(np.sqrt(max(between, 0.0))), float(np.sqrt(max(within - map_variance, 0.0)))
 
-    def leverage(self) -> tuple[FloatArray, float]:
-        """(k, k) inverse of X^T X over the table's maps, and the largest leverage of one of them."""
-        return largest_leverage(self.terms)
 
-
-def largest_leverage(features: FloatArray) -> tuple[FloatArray, float]:
-    """(c, c) inverse of X^T X for (n, c) features, and the largest leverage of a row."""
+def leverages(features: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(c, c) inverse of X^T X for (n, c) features, and the (n,) leverages of the rows."""
     inverse = np.asarray(np.linalg.inv(features.T @ features), dtype=np.float64)
-    return inverse, float(np.einsum("ni,ij,nj->n", features, inverse, features).max())
+    return inverse, np.asarray(np.einsum("ni,ij,nj->n", features, inverse, features))
 
 
 def _map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
@@ -268,21 +264,38 @@ def hidden_terms(
 def figures(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> dict[str, float]:
     """Number of rows, spreads, and errors cross-validated by body."""
     error = left_out_errors(data.mean_terms, data.mean_log_d)
+    spreads = {"body_sd": float(np.exp(mode[-3])), "exam_sd": float(np.exp(mode[-1]))}
+    return error_figures(table, data, spreads, error, held(data, mode, error))
+
+
+def error_figures(
+    table: PopulationTable, data: BodyRegression, spreads: Mapping[str, float], error: FloatArray, share_held: float
+) -> dict[str, float]:
+    """Figures of a fit.
+
+    Parameters
+    ----------
+    spreads
+        ``body_sd`` and ``exam_sd``.
+    error : (groups,) array
+        ln(predicted / true size) of bodies left out.
+    share_held
+        Of them in their interval of probability `HELD`.
+    """
     return {
         "maps": float(len(table)),
         "bodies": float(data.groups),
-        "body_sd": float(np.exp(mode[-3])),
-        "exam_sd": float(np.exp(mode[-1])),
+        **spreads,
         "left_out_sd": float(error.std()),
         "left_out_mae_percent": float(100 * np.mean(np.abs(np.expm1(error)))),
         "left_out_bias_percent": float(100 * np.mean(np.expm1(error))),
-        "left_out_held_percent": 100 * held(data, mode, error),
+        "left_out_held_percent": 100 * share_held,
     }
 
 
 def held(data: BodyRegression, mode: FloatArray, error: FloatArray) -> float:
     """Share of held-out bodies whose size lies in the interval of probability `HELD`, by the learned spreads."""
-    leverage = _leverage(data.mean_terms)
+    leverage = leverages(data.mean_terms)[1]
     spread = np.exp(2 * (mode[-3] + mode[-2] * data.mean_u))
     spread = spread + (np.exp(2 * mode[-1]) + data.mean(data.map_variance)) / data.exams
     return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(spread / (1.0 - leverage))))
@@ -290,14 +303,9 @@ def held(data: BodyRegression, mode: FloatArray, error: FloatArray) -> float:
 
 def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
     """(n,) ln(predicted / true size) of each row, held out of the least-squares fit, in closed form."""
-    inverse = np.linalg.inv(terms.T @ terms)
+    inverse, leverage = leverages(terms)
     residual = log_d - terms @ (inverse @ (terms.T @ log_d))
-    return np.asarray(-residual / (1.0 - _leverage(terms)))
-
-
-def _leverage(terms: FloatArray) -> FloatArray:
-    """(n,) weight of each row in its own least-squares prediction."""
-    return np.asarray(np.einsum("ni,ij,nj->n", terms, np.linalg.inv(terms.T @ terms), terms))
+    return np.asarray(-residual / (1.0 - leverage))
 
 
 def check_population(table: PopulationTable) -> None:

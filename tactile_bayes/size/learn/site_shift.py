@@ -207,6 +207,7 @@ def correct_calibration(
         maps=sum(row.maps for _, row in rows),
         base=base,
         uses_fat=uses_fat,
+        uses_places=2 * sum(row.uses_places for _, row in rows) > len(rows),
         fit=_figures(data, found, calibration.centre[1]),
         cautions=(
             *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
@@ -226,6 +227,7 @@ class _Phantom:
     common: float
     maps: int
     uses_fat: bool
+    uses_places: bool
 
 
 def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phantom | str:
@@ -235,6 +237,7 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     centre, used = calibration.centre[1], calibration.at_fat([one.shape.profile for one in maps])
     for one in maps:
         used = used.fitting(*one.shape.middle)
+    used = used.at_places([one.shape.by_place for one in maps])
     for one in maps:
         note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
         if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
@@ -258,6 +261,7 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
         common=body_sd * float(np.sqrt(together)),
         maps=n,
         uses_fat=used.fat_mm is not None or calibration.with_fat is None,
+        uses_places=not used.places_note,
     )
 
 
