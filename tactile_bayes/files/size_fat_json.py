@@ -9,9 +9,9 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
-from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.presets import BY_PLACE, HEAD_PROFILE
 from tactile_bayes.size.fat_depth import ROUND, FatDepth, FatTerms
-from tactile_bayes.size.fat_process import LINEAR_POWERS, SPREAD, FatProcess, Kernel
+from tactile_bayes.size.fat_process import LINEAR_POWERS, SPREAD, FatProcess, Kernel, PlaceTable
 
 Terms = TypeVar("Terms", bound=FatTerms)
 
@@ -38,7 +38,19 @@ def process_document(fat: FatProcess) -> dict[str, Any]:
             "scale": number(kernel.scale),
         },
         "other_sd": number(fat.other_sd),
+        **({} if fat.places is None else {"places": _places_document(fat.places)}),
+        **({} if fat.with_places is None else {"with_places": process_document(fat.with_places)}),
         "covariance_factor": [[float(f"{value:.6g}") for value in row[: i + 1]] for i, row in enumerate(factor)],
+    }
+
+
+def _places_document(places: PlaceTable) -> dict[str, Any]:
+    return {
+        "names": list(BY_PLACE),
+        "centre": numbers(places.centre),
+        "scale": numbers(places.scale),
+        "information_inverse": numbers(places.information_inverse),
+        "most_leverage": number(places.most_leverage),
     }
 
 
@@ -91,12 +103,22 @@ def parse_process(document: dict[str, Any]) -> FatProcess:
             raise BadDataError(f"row {i + 1} of covariance_factor has {len(row)} numbers", way_out="learn it anew")
         factor[i, : i + 1] = row
     points, lengths = array_of(kernel, "points"), array_of(kernel, "lengths")
+    places, further = document.get("places"), document.get("with_places")
+    if further is not None and (places is not None or "places" not in further):
+        raise BadDataError("with_places is no process of figures by place", way_out="learn it anew")
     return FatProcess(
         **_shared_fields(document),
         covariance=factor @ factor.T,
         kernel=Kernel(points, lengths, float(kernel["scale"])),
         other_sd=float(document["other_sd"]),
+        places=None if places is None else _parse_places(places),
+        with_places=None if further is None else parse_process(further),
     )
+
+
+def _parse_places(document: dict[str, Any]) -> PlaceTable:
+    arrays = {name: array_of(document, name) for name in ("centre", "scale", "information_inverse")}
+    return PlaceTable(**arrays, most_leverage=float(document["most_leverage"]))
 
 
 def _shared_fields(document: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assum
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
 from tactile_bayes.posterior.assessment import MapDraws
-from tactile_bayes.posterior.drawn import draw_sized
+from tactile_bayes.posterior.drawn import Drawn, draw_sized
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
@@ -98,7 +98,7 @@ def estimate_map(
     if found.fault is not None:
         return _none(found.fault, candidates, detection)
     calibration = found.calibration
-    diagnostics = _diagnostics(tactile_map, made, calibration, size)
+    diagnostics = _diagnostics(tactile_map, found)
     if found.too_far:
         return _none(extrapolated(list(found.too_far)), candidates, detection, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
@@ -193,12 +193,8 @@ def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-def _diagnostics(
-    tactile_map: TactileMap,
-    made: MapDraws,
-    calibration: Calibration | None,
-    size: SizePosterior | None,
-) -> Diagnostics:
+def _diagnostics(tactile_map: TactileMap, found: Drawn) -> Diagnostics:
+    made, calibration = found.made, found.calibration
     medians = made.posterior.medians
     return Diagnostics(
         cells=len(made.fit.cells),
@@ -211,7 +207,9 @@ def _diagnostics(
         method=made.draws.method,
         sampler=made.draws.diagnostics,
         noise=made.figures,
-        convergence=_convergence(made, size) if made.draws.method == "ensemble" else {},
+        convergence=_convergence(made, found.size) if made.draws.method == "ensemble" else {},
+        by_place=found.by_place,
+        by_place_used=calibration is not None and calibration.knows_places,
     )
 
 

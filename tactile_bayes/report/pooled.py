@@ -62,6 +62,7 @@ def pooled_document(
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
         "left_out": _omitted(used, documents),
+        "by_place_used": used.knows_places,
         "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
         "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
@@ -148,7 +149,7 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
-    lines.append(_unknowns(document["unknowns"], document["fat_mm"]))
+    lines.append(_unknowns(document))
     if document["site"]:
         lines.append(f"Sizes by {document['site']}.")
     if document["left_out"]:
@@ -204,8 +205,8 @@ def _rise_line(name: str, rise: Mapping[str, float]) -> str:
     return f"{name}: another rise stands at {where} ({chance}); check that every map was sized at the same mass."
 
 
-def _unknowns(shares: Mapping[str, float], fat_mm: float | None) -> str:
-    text = fat_text(fat_mm) + unknowns_text(shares)
+def _unknowns(document: Mapping[str, Any]) -> str:
+    text = fat_text(document["fat_mm"], by_place=document["by_place_used"]) + unknowns_text(document["unknowns"])
     return text[0].upper() + text[1:] + "."
 
 

@@ -107,12 +107,15 @@ def _fat_lines(calibration: BodyCalibration, fat: FatTerms) -> list[str]:
         how = "m and f by its logarithm and v"
     elif isinstance(fat, FatProcess):
         how = "a Gaussian process in u, v and the pressure profile; ln SD between bodies a quadratic"
-    return [
+    lines = [
         f"for maps that give the depth of the fat, {low:.3g} to {high:.3g} mm, "
         f"to {100 * fat.depth.log_sd:.1f} %: {how}",
         f"between bodies, SD of ln d {fat.fit.get('body_sd', float('nan')):.3f}, "
         f"between exams of a body {fat.fit.get('exam_sd', float('nan')):.3f}; {_left_out_text(fat.fit)}",
     ]
+    if isinstance(fat, FatProcess) and fat.with_places is not None:
+        lines.append(f"for maps that also keep frames with the lump: {_left_out_text(fat.with_places.fit)}")
+    return lines
 
 
 def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) -> str:
@@ -123,15 +126,18 @@ def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) ->
         line += f" ({calibration.source}{head}); "
         if isinstance(calibration, PopulationEq6):
             line += f"Eq 6 for this map: {constants_text(calibration.constants(sigma_mm))}; "
-        line += f"{fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
+        line += (
+            f"{fat_text(calibration.fat_mm, by_place=calibration.knows_places)}{unknowns_text(calibration.unknowns)}"
+        )
     return line
 
 
-def fat_text(fat_mm: float | None) -> str:
-    """Depth of fat of the sizes, as the beginning of `unknowns_text`; empty where it is not used."""
+def fat_text(fat_mm: float | None, *, by_place: bool) -> str:
+    """What the frames told for the sizes, as the beginning of `unknowns_text`; empty where nothing of it is used."""
     if fat_mm is None:
         return ""
-    return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; "
+    more = "how the lump feels under each part of the head is used; " if by_place else ""
+    return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; {more}"
 
 
 def unknowns_text(unknowns: Mapping[str, float]) -> str:

@@ -128,6 +128,11 @@ class BodyCalibration:
         found: BodyCalibration = fat.at(self, log_depth, profiles)
         return found
 
+    @property
+    def knows_places(self) -> bool:
+        """Whether it is for one mass's figures by place."""
+        return False
+
     def at_places(self, by_place: Sequence[tuple[float, ...] | None]) -> BodyCalibration:  # noqa: ARG002
         """The calibration for a mass whose maps have these `presets.BY_PLACE`: this one, if it has no use for them."""
         return self

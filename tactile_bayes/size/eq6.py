@@ -241,6 +241,11 @@ class SizeCalibration:
         del profiles
         return self
 
+    @property
+    def knows_places(self) -> bool:
+        """Whether it is for one mass's figures by place: never."""
+        return False
+
     def at_places(self, by_place: Sequence[tuple[float, ...] | None]) -> SizeCalibration:
         """Return the calibration unchanged: Eq 6 knows amplitude and width alone."""
         del by_place

@@ -23,6 +23,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.fat_depth import ORDER, POWERS, FatTerms, Powers
@@ -156,6 +157,13 @@ class FatProcess(FatTerms):
     places: PlaceTable | None = None
     with_places: FatProcess | None = None
 
+    def __post_init__(self) -> None:
+        FatTerms.__post_init__(self)
+        inputs = 2 + len(self.depth.centre) + (0 if self.places is None else len(self.places.centre))
+        if self._kernel.points.shape[1] != inputs:
+            what = f"the process has points of {self._kernel.points.shape[1]} values, not {inputs}"
+            raise BadDataError(what, way_out="learn it anew")
+
     @property
     def file_key(self) -> str:
         """Its name in a calibration's file."""
@@ -232,6 +240,11 @@ class ProcessAtProfile(BodyCalibration):
     profile: FloatArray | None = None
     other_sd: float = 0.0
     with_places: FatProcess | None = None
+
+    @property
+    def knows_places(self) -> bool:
+        """Whether it is for one mass's figures by place."""
+        return len(self._profile) > len(HEAD_PROFILE)
 
     def at_places(self, by_place: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
         """The calibration that knows the figures by place, at their mean over the maps that have them."""

@@ -14,12 +14,13 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_quadratic_json import write_log_quadratic
+from tactile_bayes.presets import BY_PLACE
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_process import FatProcess, Kernel, ProcessAtProfile, squared_exponential
-from tactile_bayes.size.learn import fat_process
-from tactile_bayes.size.learn.fat_depth import learn_fat_cubic, table_with_depths
-from tactile_bayes.size.learn.fat_process import ProcessRows, given, learn_fat_process, spread_points
+from tactile_bayes.size.learn.fat_depth import FatTable, learn_fat_cubic
+from tactile_bayes.size.learn.fat_process import learn_fat_process, place_table
 from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
+from tactile_bayes.size.learn.process_fit import ProcessRows, given, spread_points
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.log_quadratic import LogQuadratic
 
@@ -64,10 +65,9 @@ def learned() -> LogQuadratic:
 
 
 def rows_of(bodies: int) -> ProcessRows:
-    found = table_with_depths(table(bodies))
+    found = FatTable.of(table(bodies))
     assert found is not None
-    one, depth, log_depth = found
-    return ProcessRows.of(one, depth, log_depth, (-1.0, 1.4, 2.6))
+    return ProcessRows.of(replace(found, centre=(-1.0, 1.4, 2.6)))
 
 
 def test_with_a_point_for_each_body_it_is_exact_regression() -> None:
@@ -188,6 +188,109 @@ def test_maps_of_a_mass_share_their_mean_profile(learned) -> None:
     np.testing.assert_allclose(between.profile, alone.profile, atol=1e-12)
 
 
+def seats(bodies: int, *, seed: int) -> np.ndarray:
+    """What neither bump nor profile tells of the bodies of a table."""
+    return np.random.default_rng(100 + seed).normal(size=bodies)
+
+
+def table_by_place(bodies: int = 300, *, seed: int = 1, told: bool = True) -> PopulationTable:
+    """Bodies whose size also depends on a seat that the figures by place tell; not `told`, they tell another body's."""
+    one = table(bodies, seed=seed)
+    seat = seats(bodies, seed=seed)
+    noise = np.random.default_rng(200 + seed).normal(size=(len(one), len(BY_PLACE)))
+    figures = 0.1 * noise + [1.0, -0.4, -0.2, 0.2, -0.6, -0.3]
+    figures[:, 1] += (seat if told else np.roll(seat, 1))[one.body.astype(int)]
+    return replace(one, d_mm=one.d_mm * np.exp(0.1 * seat[one.body.astype(int)]), by_place=figures)
+
+
+def spread_of_errors(calibration: LogQuadratic, maps: PopulationTable, *, by_place: bool) -> float:
+    assert maps.by_place is not None
+    assert maps.profile is not None
+    errors = []
+    for i in range(0, len(maps), 2):
+        figures = tuple(maps.by_place[i]) if by_place else None
+        at = calibration.at_fat([tuple(maps.profile[i])]).at_places([figures])
+        outlying = by_place and not at.knows_places  # one in a hundred
+        assert not outlying or "unlike" in at.omissions()[-1]
+        a, p = maps.log_amplitude[i : i + 1], maps.log_width[i : i + 1]
+        errors.append(float(at.log_size(a, p)[0]) - np.log(maps.d_mm[i]))
+    return float(np.std(errors))
+
+
+@pytest.fixture(scope="module")
+def learned_by_place() -> LogQuadratic:
+    return learn_log_quadratic(table_by_place(), recipe=RECIPE, learn_fat=learn_fat_process)
+
+
+def test_figures_by_place_tell_what_bump_and_profile_do_not(learned_by_place) -> None:
+    """The control: figures of other bodies take nothing off the error."""
+    fresh = table_by_place(150, seed=5)
+    without, with_them = (spread_of_errors(learned_by_place, fresh, by_place=by) for by in (False, True))
+    assert without > 0.1
+    assert with_them < 0.8 * without
+    control = learn_log_quadratic(table_by_place(told=False), recipe=RECIPE, learn_fat=learn_fat_process)
+    assert spread_of_errors(control, table_by_place(150, seed=5, told=False), by_place=True) > 0.9 * without
+
+
+def test_without_figures_by_place_the_size_says_so(learned_by_place, learned) -> None:
+    one = [tuple(profile_of(np.array([0.1]))[0])]
+    bare = learned_by_place.at_fat(one).at_places([None, None])
+    assert "under each part of the head" in bare.omissions()[-1]
+    assert "map the scan again" in bare.omissions()[-1]
+    far = learned_by_place.at_fat(one).at_places([(50.0,) * 6])
+    assert "unlike any of the calibration's" in far.omissions()[-1]
+    assert not far.knows_places
+    usual = (1.0, -0.4, -0.2, 0.2, -0.6, -0.3)
+    assert learned_by_place.at_fat(one).at_places([usual, None]).omissions() == []
+    # a calibration that was learned without them has no use for them
+    assert learned.at_fat(one).at_places([usual]).omissions() == []
+
+
+def test_maps_of_a_mass_share_their_mean_figures_by_place(learned_by_place) -> None:
+    profile = [tuple(profile_of(np.array([0.1]))[0])]
+    usual = np.array([1.0, -0.4, -0.2, 0.2, -0.6, -0.3])
+    low, high = tuple(usual - 0.05), tuple(usual + 0.05)
+    between = learned_by_place.at_fat(profile).at_places([low, None, high, (50.0,) * 6])
+    alone = learned_by_place.at_fat(profile).at_places([tuple(usual)])
+    assert isinstance(between, ProcessAtProfile)
+    np.testing.assert_allclose(between.profile, alone.profile, atol=1e-12)
+    assert between.fat_mm == alone.fat_mm
+
+
+def test_the_scale_of_figures_by_place_is_not_an_outliers() -> None:
+    figures = np.random.default_rng(1).normal(size=(500, 6))
+    plain = place_table(figures)
+    figures[0] = 1e6
+    np.testing.assert_allclose(place_table(figures).scale, plain.scale, rtol=0.02)
+    assert np.abs(plain.standardised(np.full(6, 1e6))).max() == 4.0
+
+
+def test_a_file_holds_the_process_of_figures_by_place(learned_by_place, tmp_path: Path) -> None:
+    write_log_quadratic(tmp_path / "s.json", learned_by_place, provenance=Provenance("test", {}, {}))
+    read = read_size_calibration(tmp_path / "s.json")
+    assert isinstance(read, LogQuadratic)
+    profile, a = [tuple(profile_of(np.array([0.1]))[0])], np.array([-2.0, -1.0, 0.0])
+    told = [(1.1, -0.2, -0.2, 0.2, -0.6, -0.3)]
+    got, want = (one.at_fat(profile).at_places(told) for one in (read, learned_by_place))
+    assert got.knows_places
+    np.testing.assert_allclose(got.log_size(a, a + 2.4), want.log_size(a, a + 2.4), atol=1e-6)
+    document = json.loads((tmp_path / "s.json").read_text())
+    inner = document["fat_process"]["with_places"]
+    del inner["places"]
+    (tmp_path / "cut.json").write_text(json.dumps(document))
+    with pytest.raises(BadDataError, match="with_places is no process of figures by place"):
+        read_size_calibration(tmp_path / "cut.json")
+    document["fat_process"]["places"] = learned_by_place_document(tmp_path / "s.json")
+    del document["fat_process"]["with_places"]
+    (tmp_path / "short.json").write_text(json.dumps(document))
+    with pytest.raises(BadDataError, match="points of 5 values, not 11"):
+        read_size_calibration(tmp_path / "short.json")
+
+
+def learned_by_place_document(path: Path) -> object:
+    return json.loads(path.read_text())["fat_process"]["with_places"]["places"]
+
+
 def test_few_bodies_have_no_process() -> None:
     assert learn_fat_process(table(79)) is None
 
@@ -233,4 +336,3 @@ def test_a_kernel_needs_positive_lengths() -> None:
     make = partial(Kernel, np.zeros((2, 5)))
     with pytest.raises(BadDataError, match="above 0"):
         make(np.array([1.0, 1.0, 0.0, 1.0, 1.0]), 1.0)
-    assert fat_process.POINTS >= 20

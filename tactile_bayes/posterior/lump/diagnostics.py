@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import field
 
+from tactile_bayes.presets import BY_PLACE
 from tactile_bayes.records import dataclass
 
 
@@ -60,6 +61,8 @@ class Diagnostics:
         What lies outside the calibration's range, in words.
     fat_mm
         Depth of fat that the size is for; None where the map does not give it.
+    by_place, by_place_used
+        Figures `presets.BY_PLACE` of the lump, None where the map has none; whether the size is by them.
     method, sampler
         The method that drew, and its own figures.
     noise
@@ -89,6 +92,8 @@ class Diagnostics:
     broken_assumptions: tuple[str, ...] = ()
     assumptions_to_check: tuple[str, ...] = ()
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    by_place: tuple[float, ...] | None = None
+    by_place_used: bool = False
 
     def as_dict(self) -> dict[str, object]:
         """The diagnostics as plain data."""
@@ -103,6 +108,8 @@ class Diagnostics:
             "broken_assumptions": list(self.broken_assumptions),
             "assumptions_to_check": list(self.assumptions_to_check),
             "fat_mm": self.fat_mm,
+            "by_place": None if self.by_place is None else dict(zip(BY_PLACE, self.by_place, strict=True)),
+            "by_place_used": self.by_place_used,
             **self.sampler,
             **self.noise.as_dict(),
             "method": self.method,
