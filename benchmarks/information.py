@@ -24,16 +24,18 @@ from typing import Any
 import numpy as np
 
 from benchmarks.information_bound import PROPERTIES, differentiate, posterior_sd
-from benchmarks.information_expansion import CHOSEN, expansion, part_figures
 from benchmarks.information_features import contact_figures, depth_figures, frame_figures, hermite_figures
 from benchmarks.information_frames import HeadFrames, fit_bump, fixed_bump
 from benchmarks.information_gp import Exams, left_out
+from benchmarks.information_parts import part_figures
 from tactile_bayes.forward.population import draw_mass
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.mapping.bump_by_place import Bump as MapBump
+from tactile_bayes.mapping.bump_by_place import by_place
+from tactile_bayes.presets import BY_PLACE, HEAD_PROFILE
 from tactile_bayes.scan import Scan
 from tactile_bayes.studies.population import MassRow, measure_exam
 
@@ -63,7 +65,7 @@ CANDIDATES: Mapping[str, Sequence[str]] = {
     "bumps of the rows and of the columns apart": ("rows_apart_x", "columns_apart_y"),
     "bumps from thirds of the rows": ROWS,
     "bumps from thirds of the rows, columns apart": (*ROWS, "columns_apart_y"),
-    "expansion of the frames": CHOSEN,
+    "by the lump's place under the head": BY_PLACE,
 }
 ORACLES = ("mean_kpa", "fat_kpa", "gland_ratio", "thickness_mm", "stiffness_ratio", "seat")
 CASES: Mapping[str, Mapping[str, Any]] = {
@@ -138,7 +140,7 @@ def _stored(folder: Path, most: int) -> Iterator[tuple[MassRow, Scene, Scan]]:
 
 
 def measure(row: MassRow, scene: Scene, scan: Scan) -> dict[str, float] | None:
-    """All figures of one exam; None where no lump or no profile of the head was measured."""
+    """All figures of one exam; None where no lump, no profile of the head or no frames with the lump were measured."""
     if not row.detected or row.head_profile_x2 is None:
         return None
     assert row.amplitude is not None
@@ -154,6 +156,12 @@ def measure(row: MassRow, scene: Scene, scan: Scan) -> dict[str, float] | None:
     free, cells = fit_bump(tactile_map, near, widths, row.amplitude)
     bump = fixed_bump(tactile_map, near, widths, row.amplitude)
     frames = HeadFrames.of(scan, tactile_map.plane_from_base, bump)
+    assert tactile_map.frames is not None
+    assert tactile_map.head is not None
+    x_mm, y_mm = (float(value) for value in bump.centre_mm)
+    told = by_place(tactile_map.frames, tactile_map.head, MapBump(row.amplitude, x_mm, y_mm, *widths))
+    if told is None:
+        return None
     return {
         "mean_kpa": row.mean_kpa,
         **hermite_figures(free, cells),
@@ -161,7 +169,7 @@ def measure(row: MassRow, scene: Scene, scan: Scan) -> dict[str, float] | None:
         **contact_figures(frames),
         **depth_figures(frames),
         **part_figures(frames, bump),
-        **expansion(frames, bump),
+        **dict(zip(BY_PLACE, told, strict=True)),
     }
 
 

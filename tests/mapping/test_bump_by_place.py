@@ -27,12 +27,15 @@ from tactile_bayes.scan import Scan
 from tactile_bayes.studies.population import measuring_options
 
 BUMP = Bump(0.4, 1.0, -2.0, 6.0, 7.0)
+STRONG = replace(BUMP, amplitude=4.0)
 HEAD = HeadShape()
 BLOCK_SD_MM = 0.75
 """Two taxels 1.5 mm apart: each 0.75 mm from their middle."""
 
 
-def law_frames(coefficients: tuple[float, ...], *, frames: int = 400, noise: float = 0.0, seed: int = 1) -> FrameSample:
+def law_frames(
+    coefficients: tuple[float, ...], *, bump: Bump = BUMP, frames: int = 400, noise: float = 0.0, seed: int = 1
+) -> FrameSample:
     """Frames of a head whose own pressure is a bowl, with what a lump adds by the six terms."""
     rng = np.random.default_rng(seed)
     rows, columns = np.meshgrid(np.arange(8), np.arange(13), indexing="ij")
@@ -50,7 +53,7 @@ def law_frames(coefficients: tuple[float, ...], *, frames: int = 400, noise: flo
     g, x2 = np.exp(-0.5 * (u**2 + v**2)), np.minimum(lump[:, :1] ** 2, 2.0)
     h = g * (u**2 - 1) / np.sqrt(2)
     terms = np.stack([g, g * x2, h, h * x2, g * u * lump[:, :1], g * v * lump[:, 1:]])
-    height = BUMP.amplitude * float(np.prod(sigma / wider))
+    height = bump.amplitude * float(np.prod(sigma / wider))
     own = 1.1 - (across / 30) ** 2
     own /= own.mean()
     pressure = own + height * np.tensordot(coefficients, terms, axes=1) + noise * rng.normal(size=g.shape)
@@ -58,15 +61,17 @@ def law_frames(coefficients: tuple[float, ...], *, frames: int = 400, noise: flo
 
 
 def test_coefficients_of_the_law_come_out() -> None:
-    """Against the coefficients that the frames were made with; each level is its frame's own."""
-    true = (1.2, -0.5, -0.1, 0.3, -0.4, -0.1)
-    found = by_place(law_frames(true), HEAD, BUMP)
-    assert found is not None
+    """Against the coefficients that the frames were made with; a bump so strong is hardly shrunk to the usual."""
+    true = np.array([1.2, -0.5, -0.1, 0.3, -0.4, -0.1])
+    found = by_place(law_frames(tuple(true), bump=STRONG), HEAD, STRONG)
     # the level is fitted with the bump's height alone, which takes up a little of the rest
     np.testing.assert_allclose(found, true, atol=0.08)
-    other = by_place(law_frames((1.2, -0.5, -0.1, 0.3, 0.4, -0.1)), HEAD, BUMP)
-    assert other is not None
-    assert abs(other[4] - 0.4) < 0.08
+    turned = true * [1, 1, 1, 1, -1, 1]
+    np.testing.assert_allclose(by_place(law_frames(tuple(turned), bump=STRONG), HEAD, STRONG), turned, atol=0.08)
+    # a bump ten times fainter lies between truth and usual
+    weak = by_place(law_frames(tuple(turned)), HEAD, BUMP)
+    assert weak is not None
+    assert USUAL[4] + 0.1 < weak[4] < turned[4] - 0.1
 
 
 def test_a_faint_bump_has_the_usual_figures() -> None:
