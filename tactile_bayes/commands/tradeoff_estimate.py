@@ -67,7 +67,8 @@ def command(
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.pipeline.tradeoff import Work, pooled_rows, tradeoff_of_map
+    from tactile_bayes.pipeline.tradeoff import pooled_rows, tradeoff_of_map
+    from tactile_bayes.studies.cost_ladder import Work
 
     if size_calibration is not None:
         also_read(size_calibration_path(size_calibration))

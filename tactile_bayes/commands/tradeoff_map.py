@@ -53,7 +53,8 @@ def command(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.pipeline.scans import load_scans
     from tactile_bayes.pipeline.settings import Settings
-    from tactile_bayes.pipeline.tradeoff import Work, tradeoff_of_scan
+    from tactile_bayes.pipeline.tradeoff import tradeoff_of_scan
+    from tactile_bayes.studies.cost_ladder import Work
 
     if figure is not None:
         refuse_existing(figure, force=force)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,29 +17,8 @@ if TYPE_CHECKING:
     from tactile_bayes.scan import Scan
     from tactile_bayes.size.calibration import Calibration
     from tactile_bayes.size.pooling import PooledEstimate
-    from tactile_bayes.studies.cost_ladder import Clock, Ladder, PooledRow, Progress
+    from tactile_bayes.studies.cost_ladder import Clock, Ladder, PooledRow, Work
     from tactile_bayes.studies.size_answers import SizeAnswer
-
-Announce = Callable[[float], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Work:
-    """How a study is run.
-
-    Parameters
-    ----------
-    clock
-        CPU seconds so far.
-    tolerance_mm, runs, announce, progress
-        As of `studies.estimate_tradeoff.measure`.
-    """
-
-    clock: Clock
-    tolerance_mm: float
-    runs: int
-    announce: Announce = lambda _seconds: None
-    progress: Progress | None = None
 
 
 def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[TactileMap, Ladder]:
@@ -59,18 +38,7 @@ def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[Tactile
     tactile_map = read_map(path)
     try:
         calibration, options, _ = estimate_inputs(settings, tactile_map)
-        return tactile_map, measure(
-            tactile_map,
-            calibration=calibration,
-            options=options,
-            clock=work.clock,
-            tolerance_mm=work.tolerance_mm,
-            seed=settings.seed,
-            runs=work.runs,
-            probability=settings.interval,
-            announce=work.announce,
-            progress=work.progress,
-        )
+        return tactile_map, measure(tactile_map, calibration=calibration, options=options, work=_of(settings, work))
     except BadDataError as error:
         raise error.at(path) from None
 
@@ -132,17 +100,12 @@ def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
         calibration, options, _ = estimate_inputs(settings, tactile_map)
         return calibration, options
 
-    return measure(
-        scan,
-        inputs=inputs,
-        clock=work.clock,
-        tolerance_mm=work.tolerance_mm,
-        seed=settings.seed,
-        runs=work.runs,
-        probability=settings.interval,
-        announce=work.announce,
-        progress=work.progress,
-    )
+    return measure(scan, inputs=inputs, work=_of(settings, work))
+
+
+def _of(settings: Settings, work: Work) -> Work:
+    """The work with the settings' seed and interval."""
+    return replace(work, seed=settings.seed, probability=settings.interval)
 
 
 def _refuse_checkpoint(settings: Settings) -> None:

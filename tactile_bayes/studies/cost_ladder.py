@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
 
+from tactile_bayes.presets import INTERVAL
 from tactile_bayes.studies.size_answers import Deviation, SizeAnswer, deviation
 
 Clock = Callable[[], float]
@@ -13,6 +15,58 @@ WORTH = 0.8
 """A setting that takes more than this share of the default's time is not worth a choice."""
 MOST_S = 4.0
 """CPU seconds after which a setting is not run again: its least time is known well enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """How a study is run.
+
+    Parameters
+    ----------
+    clock
+        CPU seconds so far.
+    tolerance_mm
+        See `Ladder`.
+    runs
+        Of each setting: times are the least of them, distances their root mean square.
+    announce
+        Called once, when the default has been timed, with about how many CPU seconds the rest will take.
+    progress
+        Called with settings done and in all.
+    seed
+        Of the random numbers.
+    probability
+        Of the intervals.
+    """
+
+    clock: Clock
+    tolerance_mm: float
+    runs: int = 3
+    announce: Callable[[float], None] = lambda _seconds: None
+    progress: Progress | None = None
+    seed: int = 1
+    probability: float = INTERVAL
+
+
+class Choice(Protocol):
+    """A setting to be tried: `axis`, `label`, `default` and `usable` as of `Priced`.
+
+    `weight` is about how many times the default's CPU time it takes, for a forecast.
+    """
+
+    @property
+    def axis(self) -> str: ...
+    @property
+    def label(self) -> str: ...
+    @property
+    def weight(self) -> float: ...
+    @property
+    def default(self) -> bool: ...
+    @property
+    def usable(self) -> bool: ...
+
+
+Chosen = TypeVar("Chosen", bound=Choice)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,3 +238,35 @@ def priced(
             break
     least = min(spent, key=lambda one: sum(one.values()))
     return Priced(axis, label, least, tuple(answers), deviation(answers, reference.answer), default, usable)
+
+
+def default_run(run: Run) -> tuple[float, SizeAnswer]:
+    """CPU seconds and answer of the default, which is run twice: imports and first calls cost nothing afterwards."""
+    run(0)
+    seconds, answer = run(0)
+    return sum(seconds.values()), answer
+
+
+def climbed(
+    choices: Sequence[Chosen],
+    run_of: Callable[[Chosen], Run],
+    reference: Callable[[], Reference],
+    *,
+    default_s: float,
+    work: Work,
+) -> Ladder:
+    """Say how long it takes, make the reference and price every setting.
+
+    Parameters
+    ----------
+    default_s
+        CPU seconds of the default.
+    """
+    work.announce(default_s * (4.0 + work.runs * sum(one.weight for one in choices)))
+    made, rows = reference(), []
+    for number, one in enumerate(choices, start=1):
+        run = run_of(one)
+        rows.append(priced(one.axis, one.label, run, made, runs=work.runs, default=one.default, usable=one.usable))
+        if work.progress is not None:
+            work.progress(number, len(choices))
+    return Ladder(tuple(rows), made, work.tolerance_mm)

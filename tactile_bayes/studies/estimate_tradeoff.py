@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES
 from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.studies.cost_ladder import Clock, Ladder, Priced, Progress, Reference, Run, priced
+from tactile_bayes.studies.cost_ladder import Clock, Ladder, Reference, Run, Work, climbed, default_run
 from tactile_bayes.studies.size_answers import SizeAnswer, answer_of
 
 LONG_RUNS = (("importance", 0.003), ("importance", 0.01), ("ensemble", 0.05), ("ensemble", 0.1))
@@ -201,17 +201,7 @@ def fitted_as(calibration: Calibration | None, options: EstimateOptions) -> Cali
 
 
 def measure(
-    tactile_map: TactileMap,
-    *,
-    calibration: Calibration | None,
-    options: EstimateOptions,
-    clock: Clock,
-    tolerance_mm: float,
-    seed: int = 1,
-    runs: int = 3,
-    probability: float = INTERVAL,
-    announce: Callable[[float], None] = lambda _seconds: None,
-    progress: Progress | None = None,
+    tactile_map: TactileMap, *, calibration: Calibration | None, options: EstimateOptions, work: Work
 ) -> Ladder:
     """Run every setting on one map.
 
@@ -219,28 +209,14 @@ def measure(
     ----------
     calibration, options
         What `estimate` takes by itself for this map.
-    clock
-        CPU seconds so far.
-    tolerance_mm
-        See `Ladder`.
-    runs
-        Of each setting: times are the least of them, distances their root mean square.
-    announce
-        Called once, when the default has been timed, with about how many CPU seconds the rest will take.
-    progress
-        Called with settings done and in all.
     """
-    estimator = Estimator(tactile_map, calibration, seed, clock, probability)
-    default = estimator.run(options)
-    default(0)  # imports and first calls cost nothing afterwards
-    seconds, answer = default(0)
+    estimator = Estimator(tactile_map, calibration, work.seed, work.clock, work.probability)
+    seconds, answer = default_run(estimator.run(options))
     settings = worth_trying(settings_of(options, level_known=tactile_map.background is not None), answer)
-    announce(seconds["estimate"] * (4.0 + runs * sum(one.weight for one in settings)))
-    reference = estimator.reference(options)
-    rows: list[Priced] = []
-    for number, one in enumerate(settings, start=1):
-        run = estimator.run(one.options)
-        rows.append(priced(one.axis, one.label, run, reference, runs=runs, default=one.default, usable=one.usable))
-        if progress is not None:
-            progress(number, len(settings))
-    return Ladder(tuple(rows), reference, tolerance_mm)
+    return climbed(
+        settings,
+        lambda one: estimator.run(one.options),
+        lambda: estimator.reference(options),
+        default_s=seconds,
+        work=work,
+    )

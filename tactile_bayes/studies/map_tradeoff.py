@@ -12,10 +12,10 @@ from tactile_bayes.mapping.engine import fast_is_installed
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.mapping.thinning import first_seconds
 from tactile_bayes.posterior.options import EstimateOptions
-from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, INTERVAL, NORMALISE
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.studies.cost_ladder import Clock, Ladder, Priced, Progress, Reference, Run, priced
+from tactile_bayes.studies.cost_ladder import Ladder, Reference, Run, Work, climbed, default_run
 from tactile_bayes.studies.estimate_tradeoff import Estimator
 from tactile_bayes.studies.size_answers import SizeAnswer
 
@@ -79,32 +79,20 @@ def _engines() -> Iterator[MapSetting]:
         yield MapSetting(ENGINE, f"engine {name}", {"engine": name}, usable=False)
 
 
-def measure(
-    scan: Scan,
-    *,
-    inputs: Inputs,
-    clock: Clock,
-    tolerance_mm: float,
-    seed: int = 1,
-    runs: int = 3,
-    probability: float = INTERVAL,
-    announce: Callable[[float], None] = lambda _seconds: None,
-    progress: Progress | None = None,
-) -> Ladder:
+def measure(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
     """Build and estimate the map of a scan at every setting.
 
     Parameters
     ----------
     inputs
         From a map to the calibration and the options with which `estimate` takes it by itself.
-    clock, tolerance_mm, seed, runs, probability, announce, progress
-        As of `studies.estimate_tradeoff.measure`.
 
     Raises
     ------
     BadDataError
         When no map can be built by default.
     """
+    clock = work.clock
 
     def run_of(one: MapSetting) -> Run:
         def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
@@ -113,7 +101,7 @@ def measure(
                 tactile_map = _build(scan, one)
                 built_s = clock() - begun
                 calibration, options = inputs(tactile_map)
-                estimator = Estimator(tactile_map, calibration, seed, clock, probability)
+                estimator = Estimator(tactile_map, calibration, work.seed, clock, work.probability)
                 seconds, answer = estimator.run(options)(number)
             except BadDataError as error:
                 if one.default:
@@ -124,18 +112,8 @@ def measure(
         return once
 
     settings = settings_of(scan)
-    default = run_of(settings[0])
-    default(0)  # imports and first calls cost nothing afterwards
-    seconds, _ = default(0)
-    announce(sum(seconds.values()) * (4.0 + runs * sum(one.weight for one in settings)))
-    reference = _reference(scan, inputs, clock=clock, seed=seed, probability=probability)
-    rows: list[Priced] = []
-    for number, one in enumerate(settings, start=1):
-        found = priced(one.axis, one.label, run_of(one), reference, runs=runs, default=one.default, usable=one.usable)
-        rows.append(found)
-        if progress is not None:
-            progress(number, len(settings))
-    return Ladder(tuple(rows), reference, tolerance_mm)
+    seconds, _ = default_run(run_of(settings[0]))
+    return climbed(settings, run_of, lambda: _reference(scan, inputs, work), default_s=seconds, work=work)
 
 
 def _build(scan: Scan, one: MapSetting) -> TactileMap:
@@ -143,11 +121,11 @@ def _build(scan: Scan, one: MapSetting) -> TactileMap:
     return build_map(used, **one.options)
 
 
-def _reference(scan: Scan, inputs: Inputs, *, clock: Clock, seed: int, probability: float) -> Reference:
+def _reference(scan: Scan, inputs: Inputs, work: Work) -> Reference:
     """A long run on the map with the finest cells, of all frames."""
-    begun = clock()
+    begun = work.clock()
     finest = build_map(scan, cell_mm=FINEST_CELL_MM)
     calibration, options = inputs(finest)
-    found = Estimator(finest, calibration, seed, clock, probability).reference(options)
+    found = Estimator(finest, calibration, work.seed, work.clock, work.probability).reference(options)
     words = found.words.replace("the default's posterior", f"the map of all frames in cells of {FINEST_CELL_MM:g} mm")
-    return replace(found, words=words, cpu_s=clock() - begun)
+    return replace(found, words=words, cpu_s=work.clock() - begun)

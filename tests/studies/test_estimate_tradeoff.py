@@ -32,7 +32,7 @@ from tactile_bayes.report.ladder_text import ladder_text
 from tactile_bayes.size.calibration import Calibration
 from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
 from tactile_bayes.studies import estimate_tradeoff as study
-from tactile_bayes.studies.cost_ladder import Ladder, PooledRow, Priced, Reference, priced
+from tactile_bayes.studies.cost_ladder import Ladder, PooledRow, Priced, Reference, Work, priced
 from tactile_bayes.studies.estimate_tradeoff import Estimator, measure
 from tactile_bayes.studies.size_answers import SIZE, SizeAnswer, deviation
 
@@ -68,9 +68,7 @@ def ladder_of(tactile_map: TactileMap, **chosen: object) -> Ladder:
             tactile_map,
             calibration=calibration,
             options=options,
-            clock=lambda: float(next(ticks)),
-            tolerance_mm=0.2,
-            runs=1,
+            work=Work(lambda: float(next(ticks)), 0.2, 1),
         )
 
 
