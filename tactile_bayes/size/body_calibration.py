@@ -79,6 +79,8 @@ class BodyCalibration:
         The same of the figures by place.
     any_depth
         Of a calibration for one depth, that for any.
+    other_sd
+        SD of ln d by which a body may differ because it is none of the table's kind; part of SD(B).
     site
         Correction by a site's own phantoms; `pooling` adds it, no method of this class does.
     """
@@ -100,6 +102,7 @@ class BodyCalibration:
     fat_note: str = ""
     places_note: str = ""
     any_depth: BodyCalibration | None = None
+    other_sd: float = 0.0
     site: SiteShift | None = None
 
     def __post_init__(self) -> None:
@@ -220,7 +223,7 @@ class BodyCalibration:
         together = np.sum(terms @ spread[:k, k:-1] * x, axis=-1)
         slope = np.divide(together, sd, out=np.zeros_like(sd), where=sd > 0)
         whole = np.sum(terms @ spread[:k, :k] * terms, axis=-1)
-        return body_sd, slope * score, np.maximum(whole - slope**2, 0.0)
+        return np.hypot(body_sd, self.other_sd), slope * score, np.maximum(whole - slope**2, 0.0)
 
     def leverage(self, amplitude: float, sigma_mm: float) -> float:
         """Leverage of a map over the largest in the table; infinite without a rise."""

@@ -232,13 +232,12 @@ class ProcessAtProfile(BodyCalibration):
         Of h.
     profile : (3,) or (9,) array
         z of the mass, and its standardised figures by place where these are known.
-    other_sd, with_places
+    with_places
         As in `FatProcess`.
     """
 
     kernel: Kernel | None = None
     profile: FloatArray | None = None
-    other_sd: float = 0.0
     with_places: FatProcess | None = None
 
     @property
@@ -277,13 +276,6 @@ class ProcessAtProfile(BodyCalibration):
         linear = monomials(self._centred(log_amplitude, log_width), AT_ONE_DEPTH)
         process = self._correlation(log_amplitude, log_width) @ self._kernel.whitening
         return np.concatenate([linear, process], axis=-1)
-
-    def body_and_error(
-        self, terms: FloatArray, log_amplitude: FloatArray, log_width: FloatArray, score: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As of every calibration, with `other_sd` in the first."""
-        found = BodyCalibration.body_and_error(self, terms, log_amplitude, log_width, score)
-        return np.hypot(found[0], self.other_sd), *found[1:]
 
     def features(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(..., 10) terms of a full cubic in u and v."""

@@ -251,11 +251,14 @@ class _Pool:
         middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
         terms = self.terms[0] if len(weight) == 1 else np.einsum("kn,knt->nt", weight, self.terms)
         body_sd, shift, error = self.calibration.body_and_error(terms, middle_a, middle_width, score)
+        # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
+        other_sd = self.calibration.other_sd
+        own_sd = np.sqrt(np.maximum(body_sd**2 - other_sd**2, 0.0))
         expected, left = _known_body(self.calibration, self.known, middle_a, middle_width)
-        return expected + shift, {
+        return expected * own_sd + shift, {
             "between_maps": np.sum(weight**2, axis=0) * tau**2,
             "calibration": error,
-            "body": (left * body_sd) ** 2,
+            "body": (left * own_sd) ** 2 + other_sd**2,
             **site_variance(self.calibration.site, middle_width),
         }
 
@@ -368,7 +371,7 @@ def pool_maps(
 def _known_body(
     calibration: BodyCalibration, known: Mapping[str, float], log_amplitude: FloatArray, log_width: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Mean of B given the known properties, and the remaining share of its standard deviation."""
+    """Mean of B given the known properties, and what remains of its SD, both over its SD."""
     if not known:
         return np.zeros(len(log_width)), 1.0
     hidden = calibration.hidden
@@ -378,7 +381,7 @@ def _known_body(
             raise UsageError(f"the calibration has no property {name}; it has {', '.join(names) or 'none'}")
     assert hidden is not None
     expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
-    return expected, float(np.sqrt(1.0 - hidden.share(*known)))
+    return expected / np.sqrt(hidden.body_variance), float(np.sqrt(1.0 - hidden.share(*known)))
 
 
 def _elongation(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -206,6 +208,15 @@ def test_what_is_known_of_the_body_is_used_and_what_the_calibration_does_not_kno
     assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.004)
     left = 1 - 0.024**2 / 0.12 / BODY_SD**2
     assert known.std() == pytest.approx(np.hypot(BODY_SD * np.sqrt(left), 0.01), rel=0.04)
+    # where bodies differ twice as much, what is known of one tells twice as much of its size
+    wide = replace(use, mean=use.mean + np.log(2.0) * (np.arange(len(use.mean)) == use.coefficients))
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=wide).max_size_mm) for p in (centred, KNOWN_0))
+    assert known.mean() - unknown.mean() == pytest.approx(2 * 0.6 * 0.2, abs=0.008)
+    # and nothing of bodies of another kind
+    other = replace(use, other_sd=0.1)
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=other).max_size_mm) for p in (centred, KNOWN_0))
+    assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.006)
+    assert known.std() == pytest.approx(np.sqrt(BODY_SD**2 * left + 0.01**2 + 0.1**2), rel=0.04)
     with pytest.raises(UsageError, match="no property weather"):
         pooled([shape(2.7)], priors=SizePriors(known={"weather": 1.0}), use=use)
 
