@@ -96,11 +96,16 @@ def _drawn(
     fault = shape_fault(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
-    told = posterior.by_place(tactile_map)
+    told = None if _beside_another(made) else posterior.by_place(tactile_map)
     calibration = fitting_calibration(posterior, calibration, told)
     far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
     size = None if fault or far else _size(posterior, made.draws, calibration, options.size_priors, rng=rng)
     return Drawn(made, size, fault, calibration, far, told)
+
+
+def _beside_another(made: MapDraws) -> bool:
+    """Whether a second lump or a rib stands in the lump's window: the frames feel both."""
+    return made.scene is not None and bool(made.scene.fit.scene.extra)
 
 
 def _size(

@@ -236,7 +236,7 @@ def test_without_figures_by_place_the_size_says_so(learned_by_place, learned) ->
     one = [tuple(profile_of(np.array([0.1]))[0])]
     bare = learned_by_place.at_fat(one).at_places([None, None])
     assert "under each part of the head" in bare.omissions()[-1]
-    assert "map the scan again" in bare.omissions()[-1]
+    assert "feel the lump alone" in bare.omissions()[-1]
     far = learned_by_place.at_fat(one).at_places([(50.0,) * 6])
     assert "unlike any of the calibration's" in far.omissions()[-1]
     assert not far.knows_places
