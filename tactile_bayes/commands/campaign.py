@@ -70,7 +70,7 @@ def init(folder: Path, output: Path, force: bool) -> None:
     "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis of the trial, as for `validate`."
 )
 @click.option("--method", type=click.Choice(METHODS), default="importance", show_default=True, help="As `estimate`.")
-@click.option("--size-calibration", metavar="NAME|SIZE.json", help="As `estimate`; a row of the table may name its own.")
+@click.option("--size-calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
 @click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Priors and more, as `estimate`.")
 @click.option(
     "--normalise", type=click.Choice(NORMALISE), default=DEFAULT_NORMALISE, show_default=True, help="As `map`."
@@ -108,7 +108,8 @@ def run(
     from tactile_bayes.commands.settings_file import settings_of
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.manifest_csv import read_manifest
-    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings, open_campaign, tidy
+    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
+    from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
     from tactile_bayes.pipeline.campaign_report import check_inputs, write_outputs
 
     settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed)
@@ -125,13 +126,14 @@ def run(
         campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, progress=progress)
         campaign.run()
         if not dry_run:
-            left = tidy(campaign)
+            left = tidy(place, table, campaign.found.results)
             written = write_outputs(campaign, excision, protocol)
     if dry_run:
         _say_plan(campaign, workers)
     else:
         _say_done(campaign, written, output, left)
-    click.echo(RESEARCH_USE)
+    if dry_run or not written.report:  # which ends with it
+        click.echo(RESEARCH_USE)
 
 
 def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings) -> None:
@@ -189,11 +191,15 @@ def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence
         click.echo(f"failed: {name}: {fault.step}: {fault.reason}", err=True)
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"failed: {len(found.faults) - _MOST_NAMED} more, see failures.csv", err=True)
-    for words, names in (("no size after excision, left out of trial.csv", written.left_out), ("not in the table", left)):
-        if names:
-            more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-            click.echo(f"{words}: {', '.join(names[:_MOST_NAMED])}{more}")
+    _say_names("no size after excision, left out of trial.csv", written.left_out)
+    _say_names("folders of exams that the table does not list", left)
     if written.report:
         click.echo(written.report, nl=False)
     elif written.no_report:
         click.echo(f"no trial report: {written.no_report}")
+
+
+def _say_names(words: str, names: Sequence[str]) -> None:
+    if names:
+        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        click.echo(f"{words}: {', '.join(names[:_MOST_NAMED])}{more}")

@@ -19,9 +19,9 @@ _DRAWS: Final = ("log_amplitude", "log_width", "q", "r")
 
 def write_shape(path: Path, shape: ShapeDraws, *, force: bool = False) -> None:
     """Write the draws atomically; fields that are None are left out."""
-    values = {one.name: getattr(shape, one.name) for one in fields(shape)}
+    values: dict[str, Any] = {one.name: getattr(shape, one.name) for one in fields(shape)}
     out = io.BytesIO()
-    np.savez_compressed(out, **{name: np.asarray(value) for name, value in values.items() if value is not None})
+    np.savez_compressed(out, **{name: value for name, value in values.items() if value is not None})
     write_bytes(path, out.getvalue(), force=force)
 
 

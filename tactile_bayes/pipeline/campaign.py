@@ -1,7 +1,7 @@
 """A campaign: from a table of exams to maps, estimates and pooled sizes, step by step, resumable.
 
 Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...) and
-``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_tables`), and `JOURNAL`, which
+``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), and the journal, which
 holds for each step its key, the digests of its files and how long it took. The key is the step, the exam or mass, and a
 digest of the program's version, the settings and the content of the inputs. A step whose key is in the journal and
 whose files are what it made is not run again.
@@ -9,31 +9,25 @@ whose files are what it made is not run again.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import statistics
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes import __version__
-from tactile_bayes.batch import BatchStore, open_store, run_batch
-from tactile_bayes.errors import TactileBayesError, UsageError
+from tactile_bayes.batch import BatchStore, run_batch
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, UNWRITTEN, Result, Task, run_step
+from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged
+from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, run_step
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import DEFAULT_NORMALISE
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
-
-JOURNAL: Final = "campaign.journal"
-EXAMS, MASSES = "exams", "masses"
-_HEADER: Final = {"campaign": 1}
 
 Progress = Callable[[int, int], None]
 
@@ -58,7 +52,11 @@ class CampaignSettings:
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
-        given = {"centre_mm": exam.centre_mm, "calibration": exam.calibration, "known": exam.known or None}
+        given: dict[str, Any] = {
+            "centre_mm": exam.centre_mm,
+            "calibration": exam.calibration,
+            "known": exam.known or None,
+        }
         return replace(self.estimate, **{name: value for name, value in given.items() if value is not None})
 
 
@@ -95,43 +93,6 @@ class Progression:
     def of(self, step: str, name: str) -> Result | None:
         """Result of a step of an exam or mass; None where there is none."""
         return self.results[step].get(name)
-
-
-@contextlib.contextmanager
-def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | None]:
-    """Open the journal of a folder, which is made if need be; None for a dry run in a folder without one.
-
-    Raises
-    ------
-    UsageError
-        When the folder holds something else, another run is using it, or it cannot be made.
-    """
-    journal = folder / JOURNAL
-    if not journal.exists():
-        if folder.is_dir() and any(folder.iterdir()):
-            raise UsageError(f"{folder} holds files, and no campaign; choose a new folder")
-        if dry:
-            yield None
-            return
-        _make(folder)
-    with open_store(journal, settings=_HEADER, encode=_taken) as store:
-        yield store
-
-
-def _make(folder: Path) -> None:
-    from tactile_bayes.files.atomic import unwritable
-
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-    except OSError as error:
-        raise unwritable(folder, error) from None
-
-
-def _taken(result: Result) -> Result:
-    """Stop the campaign where the disk did not take a result; others go into the journal."""
-    if UNWRITTEN in result:
-        raise UsageError(f"{result[UNWRITTEN]}; what is done is kept: run again to go on")
-    return result
 
 
 class Campaign:
@@ -174,7 +135,7 @@ class Campaign:
         progress: Progress | None = None,
     ) -> None:
         self.exams, self.folder, self.settings = exams, folder, settings
-        self.found = Progression(seconds=_seconds({} if store is None else store.values))
+        self.found = Progression(seconds=median_seconds({} if store is None else store.values))
         self.not_pooled = ""
         self._store, self._executor, self._dry, self._progress = store, executor, dry, progress
         self._done, self._total = 0, len(exams) * (3 if settings.figures else 2)
@@ -308,9 +269,7 @@ class Campaign:
         first = self.found.of("map", exams[0].name)
         assert first is not None
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
-        files = [
-            [exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams
-        ]
+        files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
         key = {"exams": files, **self._settings_key(settings, first["normalise"])}
         members = tuple((exam.name, self.folder / EXAMS / exam.name) for exam in exams)
         folder = self.folder / MASSES / name
@@ -348,7 +307,7 @@ class Campaign:
             return {}
         values = self._store.values
         for task in tasks:
-            if task.key in values and not _unchanged(task.folder, values[task.key]["files"]):
+            if task.key in values and not unchanged(task.folder, values[task.key]["files"]):
                 del values[task.key]
         return {task.key: values[task.key] for task in tasks if task.key in values}
 
@@ -375,40 +334,3 @@ def _digest_of(path: Path) -> str:
     from tactile_bayes.files.atomic import sha256
 
     return sha256(path)
-
-
-def _unchanged(folder: Path, files: Mapping[str, str]) -> bool:
-    try:
-        return all(_digest_of(folder / name) == digest for name, digest in files.items())
-    except TactileBayesError:
-        return False
-
-
-def _seconds(values: Mapping[str, Any]) -> dict[str, float]:
-    """Median seconds of each step, from results of any run."""
-    taken = defaultdict(list)
-    for key, value in values.items():
-        taken[key.split(" ")[0]].append(value["seconds"])
-    return {step: statistics.median(times) for step, times in taken.items()}
-
-
-def tidy(campaign: Campaign) -> list[str]:
-    """Remove files of earlier runs that this one did not make again, and name folders of exams no longer listed."""
-    made: dict[Path, set[str]] = {campaign.folder / EXAMS / exam.name: set() for exam in campaign.exams}
-    made |= {campaign.folder / MASSES / exam.of_mass: set() for exam in campaign.exams}
-    for step, results in campaign.found.results.items():
-        place = MASSES if step == "pool" else EXAMS
-        for name, result in results.items():
-            made[campaign.folder / place / name] |= set(result["files"])
-    for folder, kept in made.items():
-        ours = FILES["pool"] if folder.parent.name == MASSES else [n for s, ns in FILES.items() if s != "pool" for n in ns]
-        for name in ours:
-            if name not in kept:
-                (folder / name).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # not empty, or never made
-            folder.rmdir()
-    for place in (EXAMS, MASSES):
-        with contextlib.suppress(OSError):
-            (campaign.folder / place).rmdir()
-    folders = [one for place in (EXAMS, MASSES) for one in sorted((campaign.folder / place).glob("*"))]
-    return [f"{one.parent.name}/{one.name}" for one in folders if one not in made]

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.manifest_csv import natural
-from tactile_bayes.pipeline.campaign import JOURNAL
+from tactile_bayes.pipeline.campaign_folder import JOURNAL
 from tactile_bayes.records import dataclass
 
 _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.pipeline.campaign import EXAMS, Campaign
+from tactile_bayes.pipeline.campaign import Campaign
+from tactile_bayes.pipeline.campaign_folder import EXAMS
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, MAP, MAP_FIGURE, SIZE_FIGURE, THUMBNAIL
 from tactile_bayes.pipeline.campaign_tables import DONE, FAILURES, TRIAL, Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass

@@ -34,7 +34,8 @@ FILES: Final = {
 """The files that each step may write."""
 UNWRITTEN: Final = "unwritten"
 """Key of a result that the disk did not take: the campaign's fault, not the exam's."""
-_BEGINNINGS: Final = {"a scan": "scan", "a map or posterior (netCDF)": "map", "an archive (.npz or a spreadsheet)": "npz"}
+_KINDS: Final = {"a map or posterior (netCDF)": "map", "an archive (.npz or a spreadsheet)": "npz"}
+"""What `kind_of` calls the files that are no scans."""
 _SAME: Final = {"patient": "subject", "side": "side", "reader": "examiner", "visit": "visit", "mass": "mass"}
 """Columns of exams.csv, and what a scan calls the same."""
 
@@ -126,7 +127,7 @@ def _map(task: Task) -> tuple[Result, Writes]:
 
     if sha256(task.source) != task.source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
-    kind = _BEGINNINGS.get(kind_of(task.source), "")
+    kind = _KINDS.get(kind_of(task.source), "")
     if kind == "map":
         return _given_map(task)
     if kind == "npz":
@@ -225,9 +226,8 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
         return
     shown = list(dict.fromkeys([*(name for name in ("patient", "side") if name in both), *differs]))
     here, there = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
-    raise BadDataError(
-        f"exams.csv says {here}; the file says {there}", way_out="is it another exam's file? correct the row or the file"
-    )
+    way_out = "is it another exam's file? correct the row or the file"
+    raise BadDataError(f"exams.csv says {here}; the file says {there}", way_out=way_out)
 
 
 def _estimate(task: Task) -> tuple[Result, Writes]:

@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.manifest_csv import Exam, table_text
-from tactile_bayes.pipeline.campaign import EXAMS, MASSES, Campaign
+from tactile_bayes.pipeline.campaign import Campaign
+from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED
 from tactile_bayes.records import dataclass
 
@@ -105,7 +106,7 @@ def exam_rows(campaign: Campaign) -> list[Row]:
 def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
     fault = campaign.found.faults.get(exam.name)
     mapped = campaign.found.of("map", exam.name) or {}
-    facts = {"scans": tuple(mapped.get("scans", ())), "notes": tuple(mapped.get("notes", ()))}
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": tuple(mapped.get("notes", ()))}
     if fault is not None and fault.step != "figures":
         return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
     document = load_json(campaign.folder / EXAMS / exam.name / ESTIMATE)
@@ -163,7 +164,9 @@ def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
     failed = {row.exam.name: _names(row.exam) for row in rows}
     failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
     found = campaign.found.faults
-    lines = [failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found]
+    lines = [
+        failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
+    ]
     return table_text(lines, _FAILURE_COLUMNS)
 
 
@@ -183,15 +186,14 @@ def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple
     pooled = pooled_documents(campaign)
     for name, row in visits.items() if campaign.found.results["pool"] else ():
         document = pooled.get(name)
-        reason = "" if document is None else document["reason"]
-        readings.append(_reading(row.exam, POOLED_MODALITY, count, document, reason=reason or _unpooled(campaign, name)))
+        reason = _unpooled(campaign, name) if document is None else str(document["reason"])
+        readings.append(_reading(row.exam, POOLED_MODALITY, count, document, reason=reason))
         readings[-1] |= {"synthetic": row.synthetic}
     return table_text(readings, _TRIAL_COLUMNS)
 
 
 def _unpooled(campaign: Campaign, name: str) -> str:
-    if name in campaign.found.results["pool"]:
-        return ""
+    """Why a mass was not pooled."""
     fault = campaign.found.faults.get(name)
     return "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
 

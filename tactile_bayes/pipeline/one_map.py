@@ -101,9 +101,7 @@ def estimate_file(
 
     tactile_map, scans = read_map_and_scans(path)
     try:
-        return estimate_one(
-            tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice
-        )
+        return estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
     except BadDataError as error:
         raise error.at(path) from None
 

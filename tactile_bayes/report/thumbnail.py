@@ -13,7 +13,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.orientation import Orientation, orientation_of
 from tactile_bayes.mapping.tactile_map import TactileMap
 
-LONGEST_PX: Final = 180
+LONGEST_PX: Final = 300
 _WIDEST_CELL_PX: Final = 3
 # From low to high: five colours of viridis (van der Walt & Smith 2015), which also read in grey.
 _COLOURS: Final = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], dtype=float)
