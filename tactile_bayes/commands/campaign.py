@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.options import FORCE, WORKERS, scheduler_option, seed_option
-from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.commands.paths import FilePath, also_read, refuse_same
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARCH_USE
 
@@ -110,12 +110,15 @@ def run(
     from tactile_bayes.files.manifest_csv import read_manifest
     from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
     from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
-    from tactile_bayes.pipeline.campaign_report import check_inputs, write_outputs
+    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, write_outputs
 
     settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed)
     of_all = CampaignSettings(settings, normalise, figures)
     table = read_manifest(exams)
     _check_paths(table, output, of_all)
+    refuse_same(
+        [output / name for name in WRITTEN], [path for path in (exams, excision, protocol, settings_file) if path]
+    )
     check_inputs(excision, protocol)
     with (
         open_campaign(output, dry=dry_run) as store,

@@ -29,7 +29,7 @@ class Exam:
     Parameters
     ----------
     file, path
-        As the table has it, and where it is.
+        As the table has it, and where it is, absolute.
     patient, visit, mass, replicate
         Codes that name the exam.
     side, reader
@@ -103,7 +103,7 @@ def _exam(table: Table, row: int) -> Exam:
     if calibration is not None and calibration not in (*SHIPPED, NONE):
         calibration = str(_inside(table, row, "calibration", calibration))
     return Exam(
-        path=_inside(table, row, "file", cells["file"]),
+        path=Path(os.path.abspath(_inside(table, row, "file", cells["file"]))),  # noqa: PTH100 (links stay links)
         centre_mm=None if x is None else (x, y),
         known=tuple((name, cells[f"known_{name}"]) for name in KNOWN if cells[f"known_{name}"] is not None),
         calibration=calibration,

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes import __version__
-from tactile_bayes.batch import BatchStore, run_batch
+from tactile_bayes.batch import CLUSTER_LOST, BatchStore, run_batch
+from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, run_step
@@ -69,7 +70,7 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Progression:
+class CampaignState:
     """How far a campaign is: results by step and name, faults by name, counts and times of steps.
 
     Parameters
@@ -135,20 +136,22 @@ class Campaign:
         progress: Progress | None = None,
     ) -> None:
         self.exams, self.folder, self.settings = exams, folder, settings
-        self.found = Progression(seconds=median_seconds({} if store is None else store.values))
+        self.found = CampaignState(seconds=median_seconds({} if store is None else store.values))
         self.not_pooled = ""
         self._store, self._executor, self._dry, self._progress = store, executor, dry, progress
         self._done, self._total = 0, len(exams) * (3 if settings.figures else 2)
         self._digests: dict[Path, str] = {}
         self._calibrations: dict[str, str] = {}
 
-    def run(self) -> Progression:
+    def run(self) -> CampaignState:
         """Run what is missing: maps, then estimates, figures, and pooled sizes.
 
         Raises
         ------
         UsageError
             When the disk does not take a result; all that is done is kept.
+        TactileBayesError
+            When the cluster was lost; all that is done is kept.
         BatchInterrupted
             On Ctrl-C; what is done is kept.
         """
@@ -168,15 +171,16 @@ class Campaign:
         return self.found
 
     def _hash_sources(self) -> None:
-        paths = list(dict.fromkeys(exam.path for exam in self.exams))
-        outcomes = run_batch(_digest_of, paths, key=str, executor=self._executor)
-        for path, outcome in zip(paths, outcomes, strict=True):
+        of_path: dict[Path, list[Exam]] = defaultdict(list)
+        for exam in self.exams:
+            of_path[exam.path].append(exam)
+        outcomes = run_batch(_digest_of, of_path, key=str, executor=self._executor)
+        for (path, exams), outcome in zip(of_path.items(), outcomes, strict=True):
             if outcome.value is not None:
                 self._digests[path] = outcome.value
-            for exam in self.exams:
-                if exam.path == path and not outcome.ok:
-                    reason = outcome.error.removeprefix(f"{path}: ")
-                    self.found.faults[exam.name] = Fault("read", reason)
+                continue
+            for exam in exams:
+                self.found.faults[exam.name] = Fault("read", outcome.error.removeprefix(f"{path}: "))
 
     def _refuse_same_files(self) -> None:
         """Exams of one file are faults, but for the masses of one scan, each with its place."""
@@ -298,6 +302,8 @@ class Campaign:
         for task, outcome in zip(missing, outcomes, strict=True):
             if outcome.value is not None:
                 self.found.results[step][task.name] = outcome.value
+            elif outcome.error == CLUSTER_LOST:
+                raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
                 self.found.faults[task.name] = Fault(step, outcome.error)
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from tactile_bayes.report.campaign_html import Card
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
+WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX)
+"""Files beside the exams."""
 _LINKS: Final = {"map.png": MAP_FIGURE, "size.png": SIZE_FIGURE, "estimate.json": ESTIMATE, "map.nc": MAP}
 
 

@@ -37,7 +37,7 @@ UNWRITTEN: Final = "unwritten"
 _KINDS: Final = {"a map or posterior (netCDF)": "map", "an archive (.npz or a spreadsheet)": "npz"}
 """What `kind_of` calls the files that are no scans."""
 _SAME: Final = {"patient": "subject", "side": "side", "reader": "examiner", "visit": "visit", "mass": "mass"}
-"""Columns of exams.csv, and what a scan calls the same."""
+"""Columns of the table of exams, and what a scan calls the same."""
 
 Result = dict[str, Any]
 
@@ -59,7 +59,7 @@ class Task:
     source, source_sha256
         map: the exam's file.
     expected
-        map: what exams.csv says of the exam, by its columns.
+        map: what the table says of the exam, by its columns.
     normalise
         map: as the option of `map`.
     settings
@@ -211,7 +211,7 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
     Parameters
     ----------
     expected
-        By the columns of exams.csv.
+        By the columns of the table of exams.
     facts
         By the keys of a scan's session.
 
@@ -227,7 +227,7 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
     shown = list(dict.fromkeys([*(name for name in ("patient", "side") if name in both), *differs]))
     here, there = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
     way_out = "is it another exam's file? correct the row or the file"
-    raise BadDataError(f"exams.csv says {here}; the file says {there}", way_out=way_out)
+    raise BadDataError(f"the table says {here}; the file says {there}", way_out=way_out)
 
 
 def _estimate(task: Task) -> tuple[Result, Writes]:
