@@ -10,6 +10,7 @@ from typing import Any
 SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
 SECTIONS = {
     "Trial (CSV)": "trial.table.json",
+    "Exams (CSV)": "exams.table.json",
     "Excision (CSV)": "excision.table.json",
     "Size table (CSV)": "size_table.table.json",
     "Phantom maps (CSV)": "phantom_maps.table.json",

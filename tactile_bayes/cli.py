@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
     "diagnose": ("diagnose", "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures."),
     "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
+    "campaign": ("campaign", "From a folder of exams to the trial's report: `campaign init`, `campaign run`."),
     "plan": ("plan", "Plan a trial: power and the worth of more maps, by simulation."),
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.options import FORCE
+from tactile_bayes.commands.options import FORCE, SESSION
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.files.arrays_layout import layout_lines
 from tactile_bayes.presets import NORMALISE, RESEARCH_USE
@@ -39,6 +39,7 @@ _LONGEST_UNITS = 20
 @click.option(
     "--units", metavar="TEXT", help="Map: unit of values that are not normalised, such as kPa. Default: unknown."
 )
+@SESSION
 @FORCE
 def command(
     *,
@@ -48,6 +49,7 @@ def command(
     spacing_mm: float | None,
     normalise: str | None,
     units: str | None,
+    session_file: Path | None,
     force: bool,
 ) -> None:
     """Import scans, grids and images from other programs.
@@ -63,9 +65,11 @@ def command(
     kind = kind or _kind_of(source, output)
     if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
         raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
+    if kind == "map" and session_file is not None:
+        raise UsageError("--session is for scans; leave it out or give --as scan")
     _check_units(units, normalise)
     if kind == "scan":
-        lines = _import_scan(source, output, force=force)
+        lines = _import_scan(source, output, session_file, force=force)
     else:
         lines = _import_map(
             source, output, spacing_mm=spacing_mm, normalise=normalise or "none", units=units or "", force=force
@@ -96,9 +100,10 @@ def _check_units(units: str | None, normalise: str | None) -> None:
         raise UsageError(f"--units {units[:30]!r} is not a unit; give up to {_LONGEST_UNITS} letters, such as kPa")
 
 
-def _import_scan(source: Path, output: Path, *, force: bool) -> list[str]:
+def _import_scan(source: Path, output: Path, session_file: Path | None, *, force: bool) -> list[str]:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+    from tactile_bayes.files.session_toml import with_session
 
     lost: tuple[str, ...] = ()
     truth = None
@@ -109,8 +114,9 @@ def _import_scan(source: Path, output: Path, *, force: bool) -> list[str]:
         from tactile_bayes.files.arrays_npz import read_arrays
 
         scan = read_arrays(source)
-    provenance = Provenance("import", {"as": "scan", "lost": list(lost)}, inputs=hash_inputs(source=source))
-    write_scan(output, scan, provenance=provenance, truth=truth, force=force)
+    files = {"source": source} | ({"session": session_file} if session_file else {})
+    provenance = Provenance("import", {"as": "scan", "lost": list(lost)}, inputs=hash_inputs(**files))
+    write_scan(output, with_session(scan, session_file), provenance=provenance, truth=truth, force=force)
     return [*describe_scan(scan), *(f"lost: {line}" for line in lost)]
 
 

@@ -85,9 +85,8 @@ def command(
     """
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.map_nc import write_map
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.mapping import build_map
-    from tactile_bayes.pipeline.scans import load_scans
+    from tactile_bayes.pipeline.scans import load_scans, map_provenance
     from tactile_bayes.report.map_text import map_text
 
     _check_paths(scans, output, figure, force=force)
@@ -118,8 +117,7 @@ def command(
             progress=progress,
         )
     clock.tell("map")
-    inputs = hash_inputs(**{f"scan_{number}": path for number, path in enumerate(scans, start=1)})
-    write_map(output, tactile_map, provenance=Provenance("map", settings, inputs), force=force)
+    write_map(output, tactile_map, provenance=map_provenance(scans, loaded, settings), force=force)
     if figure:
         from tactile_bayes.report.map_figure import map_figure
 

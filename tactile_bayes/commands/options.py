@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 
 if TYPE_CHECKING:
@@ -65,6 +66,13 @@ class NumberOr(_ParamType):
 
 
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
+SESSION = click.option(
+    "--session",
+    "session_file",
+    type=FilePath(),
+    metavar="SESSION.toml",
+    help="Facts of the exam for the scan: subject, side, posture, examiner, visit and more, in plain text.",
+)
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PRESSURE_WINDOW = click.option(
     "--pressure-window-kpa",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.options import FORCE
+from tactile_bayes.commands.options import FORCE, SESSION
 from tactile_bayes.commands.paths import FilePath
 
 if TYPE_CHECKING:
@@ -32,9 +32,17 @@ if TYPE_CHECKING:
     "Default: as the scene's [head] gives them for solid, shoulders-inside for plane-strain and empirical. "
     "empirical-gaussian has none."
 )
+@SESSION
 @FORCE
 def command(
-    *, scene: Path, output: Path, seed: int | None, fidelity: str | None, head: str | None, force: bool
+    *,
+    scene: Path,
+    output: Path,
+    seed: int | None,
+    fidelity: str | None,
+    head: str | None,
+    session_file: Path | None,
+    force: bool,
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file.
 
@@ -51,13 +59,20 @@ def command(
     from tactile_bayes.presets import RESEARCH_USE
 
     refuse_existing(output, force=force)
-    for line in _run(scene, output, seed=seed, fidelity=fidelity, head=head, force=force):
+    for line in _run(scene, output, session_file, seed=seed, fidelity=fidelity, head=head, force=force):
         click.echo(line)
     click.echo(RESEARCH_USE)
 
 
 def _run(
-    scene_path: Path, output: Path, *, seed: int | None, fidelity: str | None, head: str | None, force: bool
+    scene_path: Path,
+    output: Path,
+    session_file: Path | None,
+    *,
+    seed: int | None,
+    fidelity: str | None,
+    head: str | None,
+    force: bool,
 ) -> list[str]:
     import numpy as np
 
@@ -66,6 +81,7 @@ def _run(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import write_scan
     from tactile_bayes.files.scene_toml import read_scene
+    from tactile_bayes.files.session_toml import with_session
     from tactile_bayes.forward.plane.empirical import outside_range
     from tactile_bayes.forward.simulate import simulate
 
@@ -76,10 +92,10 @@ def _run(
     used = scene.seed if seed is None else seed
     with progress_bar("frames") as progress:
         simulated = simulate(scene, rng=np.random.default_rng(used), fidelity=fidelity, head=head, progress=progress)
-    provenance = Provenance(
-        "simulate", {"model": simulated.truth["model"]}, inputs=hash_inputs(scene=scene_path), seed=used
-    )
-    write_scan(output, simulated.scan, provenance=provenance, truth=simulated.truth, force=force)
+    files = {"scene": scene_path} | ({"session": session_file} if session_file else {})
+    provenance = Provenance("simulate", {"model": simulated.truth["model"]}, inputs=hash_inputs(**files), seed=used)
+    scan = with_session(simulated.scan, session_file)
+    write_scan(output, scan, provenance=provenance, truth=simulated.truth, force=force)
     lumps = [*map(_bump_line, scene.lumps), *map(_tissue_line, scene.solid_lumps)]
     found = [*(lumps or ["no lump"]), *map(_rib_line, scene.ribs)]
     return [

@@ -17,7 +17,13 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.size.calibration import Calibration
 
-_TABLES = ("trial.table.json", "excision.table.json", "size_table.table.json", "phantom_maps.table.json")
+_TABLES = (
+    "trial.table.json",
+    "excision.table.json",
+    "exams.table.json",
+    "size_table.table.json",
+    "phantom_maps.table.json",
+)
 
 
 def describe(path: Path) -> dict[str, Any]:

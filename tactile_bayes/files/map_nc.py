@@ -20,7 +20,7 @@ from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
 from tactile_bayes.files.map_frames_nc import FRAMES_GROUP, frame_contents, read_frames
 from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
-from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.geometry import check_rigid
 from tactile_bayes.head_shape import HeadShape
@@ -112,6 +112,11 @@ def read_map(path: Path) -> TactileMap:
     BadDataError
         Naming the file, the variable or attribute, its value and the way out.
     """
+    return read_map_and_scans(path)[0]
+
+
+def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ...]]:
+    """Read a map, and the scans it was made from, as `Provenance.scans` has them; for the errors see `read_map`."""
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
         check_limit(_dimension(file, "y") * _dimension(file, "x"), CELLS, what="it has {} cells")
@@ -120,7 +125,7 @@ def read_map(path: Path) -> TactileMap:
         arrays = {field: _read_variable(file, name, field=field) for field, name in names.items()}
         transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
         _check_lattice({names[field]: arrays[field] for field in ("x_mm", "y_mm")}, header["recipe"].cell_mm)
-        return TactileMap(
+        tactile_map = TactileMap(
             **arrays,
             **transforms,
             recipe=header["recipe"],
@@ -131,6 +136,7 @@ def read_map(path: Path) -> TactileMap:
             head=header["head"],
             frames=read_frames(file, way_out=_WAY_OUT),
         )
+        return tactile_map, scans_of(header["provenance"])
 
 
 def read_map_header(path: Path) -> dict[str, Any]:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
 
+if TYPE_CHECKING:
+    from tactile_bayes.scan import Scan
+
 SCHEMA: Final = "scan_session.schema.json"
 SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation")
 """Keys that the recording itself writes."""
+
+
+def with_session(scan: Scan, path: Path | None) -> Scan:
+    """The scan with the facts of a session file over its own; for the errors see `read_session`."""
+    return scan if path is None else replace(scan, session={**scan.session, **read_session(path)})
 
 
 def read_session(path: Path) -> dict[str, str]:

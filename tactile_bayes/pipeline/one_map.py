@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,11 +97,11 @@ def estimate_file(
     path: Path, settings: Settings, *, progress: Progress | None = None, notice: Notice | None = None
 ) -> Outcome:
     """Read a map and estimate it; see `estimate_one`."""
-    from tactile_bayes.files.map_nc import read_map
+    from tactile_bayes.files.map_nc import read_map_and_scans
 
-    tactile_map = read_map(path)
+    tactile_map, scans = read_map_and_scans(path)
     try:
-        return estimate_one(tactile_map, settings, inputs={"map": path}, progress=progress, notice=notice)
+        return estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
     except BadDataError as error:
         raise error.at(path) from None
 
@@ -111,6 +111,7 @@ def estimate_one(
     settings: Settings,
     *,
     inputs: Mapping[str, Path] | None = None,
+    scans: Sequence[Mapping[str, str]] = (),
     progress: Progress | None = None,
     notice: Notice | None = None,
 ) -> Outcome:
@@ -120,6 +121,8 @@ def estimate_one(
     ----------
     inputs
         Files that the map came from, by role, for the provenance.
+    scans
+        The scans at the beginning, as `Provenance.scans` has them.
     progress
         Called with draws done and wanted.
     notice
@@ -183,7 +186,7 @@ def estimate_one(
         estimate = replace(estimate, diagnostics=diagnostics)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     recorded = _recorded(settings, options, calibration=named)
-    provenance = Provenance("estimate", recorded, digests, seed=settings.seed)
+    provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
     return Outcome(tactile_map, estimate, provenance, settings, used)
 
 

@@ -50,7 +50,7 @@ def pool_answers(
     """
     import numpy as np
 
-    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
     from tactile_bayes.report.pooled import pooled_document
     from tactile_bayes.size.pooling import pool_maps
 
@@ -65,8 +65,9 @@ def pool_answers(
         rng=np.random.default_rng([settings.seed, *words]),
     )
     digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {}))
-    provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed)
     documents = [answer.document for answer in answers if answer.document is not None]
+    scans = [scan for document in documents for scan in scans_of(document["provenance"])]
+    provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed, scans=scans)
     document = pooled_document(
         pooled, list(names), documents, calibration, probability=settings.interval, provenance=provenance
     )

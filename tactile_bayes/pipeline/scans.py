@@ -1,14 +1,15 @@
-"""Loading of scan files, with cautions."""
+"""Loading of scan files, with cautions, and the provenance of their map."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError
 
 if TYPE_CHECKING:
+    from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.scan import Scan
 
 
@@ -24,3 +25,20 @@ def load_scans(paths: Sequence[Path]) -> tuple[list[Scan], list[str]]:
         scans.append(file.scan)
         lost += [f"scan {number}: {line}" for line in (*file.lost, *file.cautions())]
     return scans, lost
+
+
+def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mapping[str, Any]) -> Provenance:
+    """Provenance of a map: its settings, the scans' digests, and what the scans say of their exam.
+
+    Parameters
+    ----------
+    paths, scans
+        The files, and what was read from each.
+    settings
+        By the names of the command's options.
+    """
+    from tactile_bayes.files.provenance import Provenance, hash_inputs, scan_facts
+
+    inputs = hash_inputs(**{f"scan_{number}": path for number, path in enumerate(paths, start=1)})
+    facts = [scan_facts(digest, scan.session) for digest, scan in zip(inputs.values(), scans, strict=True)]
+    return Provenance("map", settings, inputs, scans=facts)

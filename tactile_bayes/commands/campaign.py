@@ -1,0 +1,208 @@
+"""`campaign`: from a folder of exams to the trial's report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tactile_bayes.commands.options import FORCE, WORKERS, scheduler_option, seed_option
+from tactile_bayes.commands.paths import FilePath, also_read, refuse_same
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARCH_USE
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.manifest_csv import Exam
+    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
+    from tactile_bayes.pipeline.campaign_report import Written
+
+_FILE = FilePath()
+_MOST_NAMED = 5
+
+
+@click.group("campaign")
+def command() -> None:
+    """From a folder of exams to the trial's report, in one resumable run."""
+
+
+@command.command("init")
+@click.argument("folder", metavar="FOLDER", type=_FILE)
+@click.option("-o", "--output", required=True, metavar="EXAMS.csv", type=_FILE, help="Where to write the table.")
+@FORCE
+def init(folder: Path, output: Path, force: bool) -> None:
+    """Write the table of exams from a folder of scans and what they carry.
+
+    Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
+    are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
+    fills stay blank.
+
+    Example: tactile-bayes campaign init scans -o exams.csv
+    """
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.manifest_csv import write_manifest
+    from tactile_bayes.pipeline.campaign_init import find_exams
+
+    refuse_existing(output, force=force)
+    found = find_exams(folder, output)
+    for line in found.skipped:
+        click.echo(f"left out: {line}", err=True)
+    if not found.rows:
+        raise BadDataError("holds no scan (.mcap, .npz)", way_out="give the folder of the scans", path=str(folder))
+    write_manifest(output, found.rows, force=force)
+    patients = {row["patient"] for row in found.rows if "patient" in row}
+    nameless = sum("patient" not in row for row in found.rows)
+    click.echo(f"{output}: {len(found.rows)} exams of {len(patients)} patients")
+    if nameless:
+        click.echo(f"{nameless} scans do not say whose they are: fill in the column patient")
+    click.echo(RESEARCH_USE)
+
+
+@command.command("run")
+@click.argument("exams", metavar="EXAMS.csv", type=_FILE)
+@click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
+@click.option(
+    "--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision: adds the trial's report."
+)
+@click.option(
+    "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis of the trial, as for `validate`."
+)
+@click.option("--method", type=click.Choice(METHODS), default="importance", show_default=True, help="As `estimate`.")
+@click.option("--size-calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own.")
+@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Priors and more, as `estimate`.")
+@click.option(
+    "--normalise", type=click.Choice(NORMALISE), default=DEFAULT_NORMALISE, show_default=True, help="As `map`."
+)
+@seed_option(1)
+@click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done and how long it takes, and do nothing.")
+@WORKERS
+@scheduler_option("the exams")
+def run(
+    exams: Path,
+    output: Path,
+    excision: Path | None,
+    protocol: Path | None,
+    method: str,
+    size_calibration: str | None,
+    settings_file: Path | None,
+    normalise: str,
+    seed: int,
+    figures: bool,
+    dry_run: bool,
+    workers: int,
+    scheduler: str | None,
+) -> None:
+    """Map, estimate and pool the exams of a table, and report the trial.
+
+    DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
+    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. An exam's fault is
+    its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
+    what depends on a file or setting that changed, and what failed.
+
+    Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
+    """
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.executors import open_executor
+    from tactile_bayes.files.manifest_csv import read_manifest
+    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
+    from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
+    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, write_outputs
+
+    settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed)
+    of_all = CampaignSettings(settings, normalise, figures)
+    table = read_manifest(exams)
+    _check_paths(table, output, of_all)
+    refuse_same(
+        [output / name for name in WRITTEN], [path for path in (exams, excision, protocol, settings_file) if path]
+    )
+    check_inputs(excision, protocol)
+    with (
+        open_campaign(output, dry=dry_run) as store,
+        open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
+        progress_bar("steps") as progress,
+    ):
+        place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
+        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, progress=progress)
+        campaign.run()
+        if not dry_run:
+            left = tidy(place, table, campaign.found.results)
+            written = write_outputs(campaign, excision, protocol)
+    if dry_run:
+        _say_plan(campaign, workers)
+    else:
+        _say_done(campaign, written, output, left)
+    if dry_run or not written.report:  # which ends with it
+        click.echo(RESEARCH_USE)
+
+
+def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings) -> None:
+    """Refuse exams inside the output folder, an output folder that is a file, and a checkpoint for many maps."""
+    from tactile_bayes.files.shipped import size_calibration_path
+
+    if output.exists() and not output.is_dir():
+        raise UsageError(f"{output} is a file; give the name of a folder")
+    if settings.estimate.checkpoint is not None:
+        raise UsageError("a checkpoint is for one map; leave it out of the settings file")
+    folder = Path(os.path.realpath(output))
+    inside = next((exam.file for exam in table if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
+    if inside is not None:
+        raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
+    for name in {settings.of(exam).calibration for exam in table} - {None}:
+        also_read(size_calibration_path(str(name)))
+
+
+def _say_plan(campaign: Campaign, workers: int) -> None:
+    found = campaign.found
+    seconds, unknown = 0.0, []
+    for step, todo in found.todo.items():
+        click.echo(f"{step}: {todo} to do, {found.kept[step]} done")
+        if todo and step not in found.seconds:
+            unknown.append(step)
+        seconds += todo * found.seconds.get(step, 0.0)
+    for name, fault in found.faults.items():
+        click.echo(f"{name}: {fault.step} failed: {fault.reason}")
+    if unknown:
+        click.echo(f"How long is not known: no {', '.join(unknown)} was run here yet.")
+    else:
+        click.echo(f"About {_duration(seconds / max(workers, 1))} by the times measured here.")
+    click.echo("Nothing was run.")
+
+
+def _duration(seconds: float) -> str:
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    return f"{whole // 60} min" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence[str]) -> None:
+    from tactile_bayes.pipeline.campaign_report import counts_words
+
+    found = campaign.found
+    counts = counts_words(written.sized, written.unsized, written.failed)
+    click.echo(f"{output}: {len(campaign.exams)} exams: {counts}")
+    if written.pooled:
+        click.echo(f"{written.pooled} masses pooled")
+    elif campaign.not_pooled:
+        click.echo(f"no mass pooled: {campaign.not_pooled}")
+    click.echo(f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs")
+    for name, fault in list(found.faults.items())[:_MOST_NAMED]:
+        click.echo(f"failed: {name}: {fault.step}: {fault.reason}", err=True)
+    if len(found.faults) > _MOST_NAMED:
+        click.echo(f"failed: {len(found.faults) - _MOST_NAMED} more, see failures.csv", err=True)
+    _say_names("no size after excision, left out of trial.csv", written.left_out)
+    _say_names("folders of exams that the table does not list", left)
+    if written.report:
+        click.echo(written.report, nl=False)
+    elif written.no_report:
+        click.echo(f"no trial report: {written.no_report}")
+
+
+def _say_names(words: str, names: Sequence[str]) -> None:
+    if names:
+        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        click.echo(f"{words}: {', '.join(names[:_MOST_NAMED])}{more}")

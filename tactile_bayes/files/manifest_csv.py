@@ -1,0 +1,171 @@
+"""The table of a campaign's exams, `exams.csv`: which file is which exam of which mass."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.files.shipped import NONE, SHIPPED
+from tactile_bayes.files.tables import Table, read_table
+from tactile_bayes.records import dataclass
+
+SCHEMA: Final = "exams.table.json"
+KNOWN: Final = ("seat", "depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
+"""Properties of a body that columns ``known_...`` give, by the names of `Settings.known`."""
+_WRITTEN: Final = ("file", "patient", "visit", "mass", "replicate", "side", "reader")
+
+
+@dataclass(frozen=True, slots=True)
+class Exam:
+    """One exam of one mass: a row of the table.
+
+    Parameters
+    ----------
+    file, path
+        As the table has it, and where it is, absolute.
+    patient, visit, mass, replicate
+        Codes that name the exam.
+    side, reader
+        None where the table leaves them blank.
+    centre_mm
+        Place of the mass on the map; None takes the highest bump that can be a lump.
+    known
+        Properties of the body, by the names of `KNOWN`.
+    calibration
+        Name or path of a size calibration; None takes the campaign's.
+    line
+        Of the table.
+    """
+
+    file: str
+    path: Path
+    patient: str
+    visit: str
+    mass: str
+    replicate: int
+    side: str | None = None
+    reader: str | None = None
+    centre_mm: tuple[float, float] | None = None
+    known: tuple[tuple[str, float], ...] = ()
+    calibration: str | None = None
+    line: int = field(default=0)
+
+    @property
+    def of_mass(self) -> str:
+        """Name of the mass at this visit, which is also its folder's."""
+        return f"{self.patient}.v{self.visit}.m{self.mass}"
+
+    @property
+    def name(self) -> str:
+        """Name of the exam, which is also its folder's."""
+        return f"{self.of_mass}.r{self.replicate}"
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Sort key: patient, mass, visit and replicate, numbers by their value."""
+        return (*map(natural, (self.patient, self.mass, self.visit)), self.replicate)
+
+
+def natural(code: str) -> tuple[int, str]:
+    """Sort key of a code: whole numbers by their value, words before them."""
+    return (int(code) if code.isascii() and code.isdigit() else -1, code)
+
+
+def read_manifest(path: Path) -> list[Exam]:
+    """Read the table; exams come in the order of `Exam.order`, whatever the order of the rows.
+
+    Raises
+    ------
+    BadDataError
+        Naming the line, the column, the value and the way out: a cell that is not as ``exams.table.json`` has it, a
+        path that leaves the table's folder, half a place, rows of one mass that contradict each other.
+    """
+    table = read_table(path, SCHEMA)
+    exams = [_exam(table, row) for row in range(len(table))]
+    _check_masses(table, exams)
+    return sorted(exams, key=lambda exam: exam.order)
+
+
+def _exam(table: Table, row: int) -> Exam:
+    cells = {name: values[row] for name, values in table.columns.items()}
+    x, y = cells["centre_x_mm"], cells["centre_y_mm"]
+    if (x is None) != (y is None):
+        blank = "centre_x_mm" if x is None else "centre_y_mm"
+        raise table.error(row, blank, "is blank while the other coordinate is not", way_out="give both, or neither")
+    calibration = cells["calibration"]
+    if calibration is not None and calibration not in (*SHIPPED, NONE):
+        calibration = str(_inside(table, row, "calibration", calibration))
+    return Exam(
+        path=Path(os.path.abspath(_inside(table, row, "file", cells["file"]))),  # noqa: PTH100 (links stay links)
+        centre_mm=None if x is None else (x, y),
+        known=tuple((name, cells[f"known_{name}"]) for name in KNOWN if cells[f"known_{name}"] is not None),
+        calibration=calibration,
+        line=table.line_numbers[row],
+        **{name: cells[name] for name in _WRITTEN},
+    )
+
+
+def _inside(table: Table, row: int, column: str, name: str) -> Path:
+    """Path of a file that the table names; it must lie in the table's folder, links followed."""
+    folder = Path(os.path.realpath(table.path.parent))
+    path = table.path.parent / name
+    if Path(name).is_absolute() or not Path(os.path.realpath(path)).is_relative_to(folder):
+        shown = name if len(name) <= 80 else f"{name[:77]}..."
+        way_out = "give a path inside it, or put the table into a folder above the file"
+        raise table.error(row, column, f"{shown!r} leaves the table's folder", way_out=way_out)
+    return path
+
+
+def _check_masses(table: Table, exams: Sequence[Exam]) -> None:
+    """Refuse rows of one mass that differ in what belongs to the mass or its body."""
+    first: dict[tuple[str, str], int] = {}
+    for row, exam in enumerate(exams):
+        other = exams[first.setdefault((exam.patient, exam.mass), row)]
+        for column, what, here, there in (
+            ("side", "side", exam.side, other.side),
+            ("calibration", "calibration", exam.calibration, other.calibration),
+            ("mass", "known values", dict(exam.known), dict(other.known)),
+        ):
+            if here != there:
+                told = f"the {what} {here or 'blank'} differs from {there or 'blank'} on line {other.line}"
+                way_out = f"rows of patient {exam.patient}, mass {exam.mass} must agree: correct one"
+                raise table.error(row, column, f"{told}, of the same mass", way_out=way_out)
+
+
+def write_manifest(path: Path, rows: Iterable[Mapping[str, object]], *, force: bool = False) -> None:
+    """Write a table of exams; keys of the rows are columns, those that no row has are left out."""
+    write_text(path, table_text(list(rows), _columns()), force=force)
+
+
+def _columns() -> list[str]:
+    return [one["name"] for one in load_schema(SCHEMA)["fields"]]
+
+
+def table_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
+    """CSV text of rows; columns that no row fills are left out, None is a blank cell, numbers keep every digit."""
+    filled = [name for name in columns if any(row.get(name) is not None for row in rows)] or list(columns)
+    out = io.StringIO(newline="")
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(filled)
+    writer.writerows([_cell(row.get(name)) for name in filled] for row in rows)
+    return out.getvalue()
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value) if isinstance(value, float) else _plain(str(value))
+
+
+def _plain(text: str) -> str:
+    """Text as `read_table` takes it: without blanks around it, each unprintable character escaped."""
+    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text.strip())

@@ -1,0 +1,324 @@
+"""Steps of a campaign: the map, the estimate and the figures of an exam, the pooled size of a mass.
+
+A step runs in any process. It gets all that its result depends on, writes its files into one folder, and returns their
+digests, so that a later run can tell whether they are still what it made.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.pipeline.one_map import Answer
+    from tactile_bayes.scan import Scan
+
+SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
+SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.png", "size.png"
+POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"
+FILES: Final = {
+    "map": (SCAN, MAP),
+    "estimate": (ESTIMATE, POSTERIOR, SHAPE, THUMBNAIL),
+    "figures": (MAP_FIGURE, SIZE_FIGURE),
+    "pool": (POOLED, POOLED_DRAWS),
+}
+"""The files that each step may write."""
+UNWRITTEN: Final = "unwritten"
+"""Key of a result that the disk did not take: the campaign's fault, not the exam's."""
+_KINDS: Final = {"a map or posterior (netCDF)": "map", "an archive (.npz or a spreadsheet)": "npz"}
+"""What `kind_of` calls the files that are no scans."""
+_SAME: Final = {"patient": "subject", "side": "side", "reader": "examiner", "visit": "visit", "mass": "mass"}
+"""Columns of the table of exams, and what a scan calls the same."""
+
+Result = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One step of one exam or mass.
+
+    Parameters
+    ----------
+    step
+        One of `RUN`.
+    name
+        Of the exam or mass.
+    folder
+        Of the exam or mass.
+    digest
+        Of all that the step's files depend on.
+    source, source_sha256
+        map: the exam's file.
+    expected
+        map: what the table says of the exam, by its columns.
+    normalise
+        map: as the option of `map`.
+    settings
+        estimate, figures, pool: of the estimate.
+    members
+        pool: names and folders of the exams.
+    """
+
+    step: str
+    name: str
+    folder: Path
+    digest: str
+    source: Path = Path()
+    source_sha256: str = ""
+    expected: Mapping[str, str] = field(default_factory=dict)
+    normalise: str = ""
+    settings: Settings | None = None
+    members: tuple[tuple[str, Path], ...] = ()
+
+    @property
+    def key(self) -> str:
+        """Name in the store of the campaign's results."""
+        return f"{self.step} {self.name} {self.digest}"
+
+
+def run_step(task: Task) -> Result:
+    """Run a step; returns the digests of its files by name, the seconds it took and what else it found.
+
+    Raises
+    ------
+    TactileBayesError
+        What is wrong with the exam, without a path.
+    """
+    begun = time.perf_counter()
+    try:
+        found, writes = RUN[task.step](task)
+    except BadDataError as error:
+        raise BadDataError(error.what, way_out=error.way_out) from None
+    try:
+        task.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for name, write in writes.items():
+            write(task.folder / name)
+        for name in FILES[task.step]:
+            if name not in writes:  # of an earlier run
+                (task.folder / name).unlink(missing_ok=True)
+    except (UsageError, OSError) as error:
+        return {UNWRITTEN: str(error)}
+    files = _digests(task.folder, [*writes])
+    return {"files": files, "seconds": round(time.perf_counter() - begun, 3), **found}
+
+
+Writes = dict[str, Callable[[Path], object]]
+
+
+def _digests(folder: Path, names: list[str]) -> dict[str, str]:
+    from tactile_bayes.files.atomic import sha256
+
+    return {name: sha256(folder / name) for name in names}
+
+
+def _map(task: Task) -> tuple[Result, Writes]:
+    """Make the exam's map from its scan or arrays, or take the map that it is; refuse what belongs to another exam."""
+    from tactile_bayes.files.atomic import sha256
+    from tactile_bayes.files.kinds import kind_of
+
+    if sha256(task.source) != task.source_sha256:
+        raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
+    kind = _KINDS.get(kind_of(task.source), "")
+    if kind == "map":
+        return _given_map(task)
+    if kind == "npz":
+        return _imported_map(task)
+    return _scanned_map(task)
+
+
+def _scanned_map(task: Task) -> tuple[Result, Writes]:
+    from tactile_bayes.files.provenance import Provenance, scan_facts
+    from tactile_bayes.pipeline.scans import load_scans, map_provenance
+
+    (scan,), notes = load_scans([task.source])
+    check_facts(task.expected, scan.session)
+    settings = map_settings(task.normalise)
+    provenance: Provenance = map_provenance([task.source], [scan], settings)
+    return _built(task, scan, provenance, notes, scan_facts(task.source_sha256, scan.session))
+
+
+def _imported_map(task: Task) -> tuple[Result, Writes]:
+    """Bring in arrays as `import` does, and map the scan that they are."""
+    from tactile_bayes.files.arrays_npz import read_arrays
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.scan_mcap import write_scan
+
+    scan = read_arrays(task.source)
+    made = Provenance("import", {"as": "scan", "lost": []}, inputs={"source": task.source_sha256})
+    facts = {"sha256": task.source_sha256}
+    inputs = {"scan_1": task.source_sha256}
+    provenance = Provenance("map", map_settings(task.normalise), inputs, scans=[facts])
+    found, writes = _built(task, scan, provenance, [], facts)
+    return found, {SCAN: lambda path: write_scan(path, scan, provenance=made, force=True), **writes}
+
+
+def _built(
+    task: Task, scan: Scan, provenance: Any, notes: list[str], facts: Mapping[str, str]
+) -> tuple[Result, Writes]:
+    from tactile_bayes.files.map_nc import write_map
+    from tactile_bayes.mapping import build_map
+
+    tactile_map = build_map(scan, normalise=task.normalise)
+    found = {
+        "scans": [dict(facts)],
+        "notes": [note.removeprefix("scan 1: ") for note in notes],
+        "synthetic": scan.session.get("source") == "simulated",
+        "normalise": task.normalise,
+    }
+    return found, {MAP: lambda path: write_map(path, tactile_map, provenance=provenance, force=True)}
+
+
+def _given_map(task: Task) -> tuple[Result, Writes]:
+    """Take a map that was made before, byte for byte."""
+    from tactile_bayes.files.atomic import write_bytes
+    from tactile_bayes.files.map_nc import read_map_and_scans
+    from tactile_bayes.files.reading import NETCDF_BYTES, read_bytes
+
+    tactile_map, scans = read_map_and_scans(task.source)
+    for facts in scans:
+        check_facts(task.expected, facts)
+    data = read_bytes(task.source, most=NETCDF_BYTES)
+    found = {"scans": list(scans), "notes": [], "synthetic": None, "normalise": tactile_map.recipe.normalise}
+    return found, {MAP: lambda path: write_bytes(path, data, force=True)}
+
+
+def map_settings(normalise: str) -> dict[str, Any]:
+    """Settings of `map` by its options: their defaults, but for the normalisation."""
+    return {
+        "cell_mm": CELL_MM,
+        "pressure_window_kpa": list(PRESSURE_WINDOW_KPA),
+        "normalise": normalise,
+        "latency_ms": 0.0,
+        "plane_radius_mm": "all",
+        "flat_field": False,
+        "register_strokes": False,
+        "every": 1,
+    }
+
+
+def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
+    """Refuse a file that says it is of another exam than the table does; what either leaves out is not compared.
+
+    Parameters
+    ----------
+    expected
+        By the columns of the table of exams.
+    facts
+        By the keys of a scan's session.
+
+    Raises
+    ------
+    BadDataError
+        Naming both.
+    """
+    both = {ours: facts[theirs] for ours, theirs in _SAME.items() if facts.get(theirs) and expected.get(ours)}
+    differs = [name for name, value in both.items() if value != expected[name]]
+    if not differs:
+        return
+    shown = list(dict.fromkeys([*(name for name in ("patient", "side") if name in both), *differs]))
+    here, there = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
+    way_out = "is it another exam's file? correct the row or the file"
+    raise BadDataError(f"the table says {here}; the file says {there}", way_out=way_out)
+
+
+def _estimate(task: Task) -> tuple[Result, Writes]:
+    from tactile_bayes.files.atomic import write_bytes, write_text
+    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.files.shape_npz import write_shape
+    from tactile_bayes.pipeline.one_map import answer_of, estimate_file
+    from tactile_bayes.report.thumbnail import thumbnail_png
+
+    assert task.settings is not None
+    outcome = estimate_file(task.folder / MAP, task.settings)
+    answer = answer_of(outcome)
+    document = answer.document
+    assert document is not None
+    check_document(document, "estimate.schema.json", path=Path("the report"))
+    writes: Writes = {ESTIMATE: lambda path: write_text(path, dump_json(document), force=True)}
+    if outcome.estimate.status == "estimate":
+        writes[POSTERIOR] = lambda path: outcome.write(path, force=True)
+    shape = answer.shape
+    if shape is not None:
+        writes[SHAPE] = lambda path: write_shape(path, shape, force=True)
+    picture = thumbnail_png(outcome.tactile_map, document)
+    if picture is not None:
+        writes[THUMBNAIL] = lambda path: write_bytes(path, picture, force=True)
+    return {"exit_code": answer.exit_code}, writes
+
+
+def _figures(task: Task) -> tuple[Result, Writes]:
+    """Draw the figures of `estimate`; the estimate is made again, for it is not stored whole."""
+    from tactile_bayes.pipeline.one_map import estimate_file
+    from tactile_bayes.report.estimate_figures import draw_map, draw_size
+
+    assert task.settings is not None
+    settings = task.settings
+    outcome = estimate_file(task.folder / MAP, settings)
+    tactile_map, estimate = outcome.tactile_map, outcome.estimate
+    size, writes = estimate.size, Writes()
+    if tactile_map.covered.any():
+        writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, estimate, path, name=task.name, force=True)
+    if size is not None:
+        writes[SIZE_FIGURE] = lambda path: draw_size(
+            size, path, name=task.name, probability=settings.interval, force=True
+        )
+    return {}, writes
+
+
+def _pool(task: Task) -> tuple[Result, Writes]:
+    """Pool the exams of a mass as `estimate --pool` does, from what their estimates left in their folders."""
+    from tactile_bayes.files.atomic import write_text
+    from tactile_bayes.files.posterior_nc import write_pooled
+    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.pipeline.pooled import pool_answers
+
+    assert task.settings is not None
+    answers = [_answer(folder) for _, folder in task.members]
+    inputs = {f"map_{i}": folder / MAP for i, (_, folder) in enumerate(task.members, start=1)}
+    names = [name for name, _ in task.members]
+    outcome = pool_answers(answers, task.settings, names=names, inputs=inputs)
+    check_document(outcome.document, "pooled.schema.json", path=Path("the report"))
+    writes: Writes = {POOLED: lambda path: write_text(path, dump_json(outcome.document), force=True)}
+    size = outcome.pooled.size
+    if size is not None:
+        writes[POOLED_DRAWS] = lambda path: write_pooled(path, size, provenance=outcome.provenance, force=True)
+    return {}, writes
+
+
+def _answer(folder: Path) -> Answer:
+    """An exam's answer for pooling, from its folder."""
+    from tactile_bayes.files.documents import load_json
+    from tactile_bayes.files.map_nc import read_map
+    from tactile_bayes.files.shape_npz import read_shape
+    from tactile_bayes.pipeline.one_map import Answer
+
+    tactile_map: TactileMap = read_map(folder / MAP)
+    document = load_json(folder / ESTIMATE)
+    assert isinstance(document, dict)
+    return Answer(
+        document,
+        text="",
+        exit_code=0,
+        shape=read_shape(folder / SHAPE) if (folder / SHAPE).exists() else None,
+        normalise=tactile_map.recipe.normalise,
+        fingerprint=tactile_map.fingerprint,
+        head=tactile_map.head,
+    )
+
+
+RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
+    "map": _map,
+    "estimate": _estimate,
+    "figures": _figures,
+    "pool": _pool,
+}
+"""What makes each step's files: what it found, and how to write each file."""

@@ -1,0 +1,236 @@
+"""Tables of a campaign: exams done, failures, and the trial table that `validate` takes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.files.documents import load_json
+from tactile_bayes.files.manifest_csv import Exam, table_text
+from tactile_bayes.pipeline.campaign import Campaign
+from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
+from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED
+from tactile_bayes.records import dataclass
+
+DONE, FAILURES, TRIAL = "exams_done.csv", "failures.csv", "trial.csv"
+TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
+_TRIAL_COLUMNS: Final = (
+    "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",
+    "reader", "visit", "reason", "synthetic",
+)  # fmt: skip
+_DONE_COLUMNS: Final = (
+    "patient", "visit", "mass", "replicate", "side", "reader", "file", "folder", "scan_sha256", "status", "reason",
+    "size_mm", "sd_mm", "low_mm", "high_mm", "probability", "smallest_mm", "detected_probability", "centre_x_mm",
+    "centre_y_mm", "cautions", "checks", "synthetic",
+)  # fmt: skip
+_FAILURE_COLUMNS: Final = ("patient", "visit", "mass", "replicate", "file", "step", "reason")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """One exam as the tables and the contact sheet show it.
+
+    Parameters
+    ----------
+    exam
+        Of exams.csv.
+    document
+        The estimate's JSON object; None where a step failed.
+    step, fault
+        Which step failed and why; empty where none did.
+    scans, notes, synthetic
+        Of the file: digests and facts, what it lost, whether it is simulated (None: unknown).
+    outlying
+        Whether the exam lies apart from the others of its mass.
+    """
+
+    exam: Exam
+    document: Mapping[str, Any] | None
+    step: str = ""
+    fault: str = ""
+    scans: tuple[Mapping[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    synthetic: bool | None = None
+    outlying: bool = False
+
+    @property
+    def size(self) -> Mapping[str, float] | None:
+        """Largest size with its interval; None without one."""
+        return None if self.document is None else self.document["max_size_mm"]
+
+    @property
+    def reason(self) -> str:
+        """Why there is no size; empty where there is one."""
+        if self.document is None:
+            return f"{self.step} failed: {self.fault}"
+        return "" if self.size is not None else str(self.document["reason"])
+
+    @property
+    def status(self) -> str:
+        """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
+        return _status(self.document)
+
+    @property
+    def cautions(self) -> list[str]:
+        """What may put the size outside its interval, or the exam in doubt."""
+        found = {} if self.document is None else self.document["diagnostics"]
+        apart = ["lies apart from the other exams of its mass"] if self.outlying else []
+        return [*found.get("broken_assumptions", []), *found.get("outside_calibration", []), *apart, *self.notes]
+
+    @property
+    def checks(self) -> list[str]:
+        """What is to be looked at besides."""
+        if self.document is None:
+            return []
+        rises = len(self.document["other_rises"])
+        more = [f"{rises} other {'rise' if rises == 1 else 'rises'} on the map"] if rises else []
+        return [*self.document["diagnostics"].get("assumptions_to_check", []), *more]
+
+
+def _status(document: Mapping[str, Any] | None) -> str:
+    if document is None:
+        return "not_done"
+    if document["max_size_mm"] is not None:
+        return "detected"
+    return "not_detected" if document["status"] == "no_estimate" else "not_done"
+
+
+def exam_rows(campaign: Campaign) -> list[Row]:
+    """Every exam of the table, in its order."""
+    pooled = pooled_documents(campaign)
+    outlying = {one["map"] for document in pooled.values() for one in document["maps"] if one["outlying"]}
+    return [_row(campaign, exam, exam.name in outlying) for exam in campaign.exams]
+
+
+def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
+    fault = campaign.found.faults.get(exam.name)
+    mapped = campaign.found.of("map", exam.name) or {}
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": tuple(mapped.get("notes", ()))}
+    if fault is not None and fault.step != "figures":
+        return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
+    document = load_json(campaign.folder / EXAMS / exam.name / ESTIMATE)
+    assert isinstance(document, dict)
+    return Row(exam, document, synthetic=mapped.get("synthetic"), outlying=outlying, **facts)
+
+
+def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
+    """JSON object of each pooled mass, by its name."""
+    found = {name: load_json(campaign.folder / MASSES / name / POOLED) for name in campaign.found.results["pool"]}
+    return {name: document for name, document in found.items() if isinstance(document, dict)}
+
+
+def done_text(rows: Sequence[Row]) -> str:
+    """``exams_done.csv``: exams with an estimate, or with the reason for none."""
+    return table_text([_done(row) for row in rows if row.document is not None], _DONE_COLUMNS)
+
+
+def _done(row: Row) -> dict[str, object]:
+    document = row.document
+    assert document is not None
+    centre = document["centre_mm"] or {}
+    smallest = document["min_size_mm"]
+    return {
+        **_names(row.exam),
+        "side": row.exam.side,
+        "reader": row.exam.reader,
+        "folder": f"{EXAMS}/{row.exam.name}",
+        "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan) or None,
+        "status": row.status,
+        "reason": row.reason or None,
+        **_sizes(row.size),
+        "smallest_mm": None if smallest is None else smallest["median"],
+        "detected_probability": document["detected_probability"],
+        **{f"centre_{axis}_mm": value["median"] for axis, value in centre.items()},
+        "cautions": "; ".join(row.cautions) or None,
+        "checks": "; ".join(row.checks) or None,
+        "synthetic": row.synthetic,
+    }
+
+
+def _names(exam: Exam) -> dict[str, object]:
+    return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "file")}
+
+
+def _sizes(size: Mapping[str, float] | None) -> dict[str, object]:
+    if size is None:
+        return {}
+    names = {"size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability"}
+    return {column: size[name] for column, name in names.items()}
+
+
+def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
+    """``failures.csv``: exams, and masses that could not be pooled, with the step and the reason."""
+    failed = {row.exam.name: _names(row.exam) for row in rows}
+    failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
+    found = campaign.found.faults
+    lines = [
+        failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
+    ]
+    return table_text(lines, _FAILURE_COLUMNS)
+
+
+def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None) -> str:
+    """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
+
+    Parameters
+    ----------
+    masses
+        Patients and masses with a size after excision: the others are left out. None takes all.
+    """
+    taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
+    count: dict[tuple[str, str], int] = {}
+    readings = [_reading(row.exam, TACTILE, count, row.document, reason=row.reason, of=row) for row in taken]
+    count = {}
+    visits = {row.exam.of_mass: row for row in taken}
+    pooled = pooled_documents(campaign)
+    for name, row in visits.items() if campaign.found.results["pool"] else ():
+        document = pooled.get(name)
+        reason = _unpooled(campaign, name) if document is None else str(document["reason"])
+        readings.append(_reading(row.exam, POOLED_MODALITY, count, document, reason=reason))
+        readings[-1] |= {"synthetic": row.synthetic}
+    return table_text(readings, _TRIAL_COLUMNS)
+
+
+def _unpooled(campaign: Campaign, name: str) -> str:
+    """Why a mass was not pooled."""
+    fault = campaign.found.faults.get(name)
+    return "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
+
+
+def _reading(
+    exam: Exam,
+    modality: str,
+    count: dict[tuple[str, str], int],
+    document: Mapping[str, Any] | None,
+    *,
+    reason: str,
+    of: Row | None = None,
+) -> dict[str, object]:
+    """A reading; its number runs over the visits of the mass."""
+    mass = (exam.patient, exam.mass)
+    count[mass] = count.get(mass, 0) + 1
+    status = _status(document)
+    return {
+        "patient": exam.patient,
+        "mass": exam.mass,
+        "modality": modality,
+        "replicate": count[mass],
+        "status": status,
+        **_sizes(None if document is None else document["max_size_mm"]),
+        "reader": None if of is None else exam.reader,
+        "visit": exam.visit,
+        "reason": (reason or None) if status != "detected" else None,
+        "synthetic": None if of is None else of.synthetic,
+    }
+
+
+def write_tables(
+    campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None, folder: Path
+) -> None:
+    """Write the three tables."""
+    from tactile_bayes.files.atomic import write_text
+
+    texts = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows), TRIAL: trial_text(campaign, rows, masses)}
+    for name, text in texts.items():
+        write_text(folder / name, text, force=True)

@@ -1,0 +1,165 @@
+"""Contact sheet of a campaign: every exam on one self-contained page, worst first, with filters that need no server."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field
+from typing import Final
+
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.records import dataclass
+
+FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
+_STYLE = """
+body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;margin:1.5rem auto;padding:0 1.2rem;max-width:90rem}
+h1{font-size:1.5rem;margin:0 0 .2rem}h2{font-size:1rem;margin:0;overflow-wrap:anywhere}p{margin:.25rem 0}
+.mark{background:#fff3d6;padding:.35rem .7rem;border-left:4px solid #c8641e}.note{color:#5a5a5a;font-size:.84rem}
+form{display:flex;flex-wrap:wrap;gap:.4rem 1.2rem;margin:.8rem 0;align-items:center}input[type=search]{width:16rem}
+main{display:grid;grid-template-columns:repeat(auto-fill,minmax(19rem,1fr));gap:.8rem}
+article{border:1px solid #d5d5d5;border-top:4px solid #4a7d4f;padding:.6rem .7rem;break-inside:avoid}
+article.failed{border-top-color:#a22}article.without{border-top-color:#c8641e}article[hidden]{display:none}
+img{display:block;margin:.35rem 0;max-width:100%;image-rendering:pixelated}ul{margin:.25rem 0;padding-left:1.1rem}
+li,.why{font-size:.86rem;overflow-wrap:anywhere}.caution{color:#8f3d0c}.size{font-size:1.12rem;font-weight:600}
+"""
+_SCRIPT = """
+const form = document.querySelector("form"), cards = [...document.querySelectorAll("article")];
+const shown = document.getElementById("shown");
+function filter() {
+  const words = form.words.value.toLowerCase().split(/\\s+/).filter(Boolean);
+  let count = 0;
+  for (const card of cards) {
+    const text = card.textContent.toLowerCase();
+    card.hidden = !(words.every(word => text.includes(word)) &&
+      (!form.status.value || card.dataset.status === form.status.value) &&
+      (!form.flagged.checked || card.dataset.flagged === "yes"));
+    count += !card.hidden;
+  }
+  shown.textContent = count + " of " + cards.length + " shown";
+}
+form.hidden = false;
+form.addEventListener("input", filter);
+form.addEventListener("submit", event => event.preventDefault());
+filter();
+"""
+_CLASSES: Final = {FAILED: "failed", UNSIZED: "without", SIZED: "sized"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Card:
+    """One exam on the page.
+
+    Parameters
+    ----------
+    name, facts
+        Of the exam: its name, and what else the table says of it.
+    status
+        `FAILED`, `UNSIZED` or `SIZED`.
+    reason
+        Why there is no size; empty where there is one.
+    size
+        Median, ends, probability and SD of the largest size, mm; None without one.
+    cautions, checks
+        What puts the size in doubt, and what is to be looked at.
+    thumbnail
+        PNG of the map; None without one.
+    links
+        Files in the exam's folder, by the words of their links.
+    """
+
+    name: str
+    status: str
+    facts: tuple[str, ...] = ()
+    reason: str = ""
+    size: Mapping[str, float] | None = None
+    cautions: tuple[str, ...] = ()
+    checks: tuple[str, ...] = ()
+    thumbnail: bytes | None = None
+    links: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def badness(self) -> tuple[int, int, float]:
+        """Sort key: failures, exams without a size, cautions, checks, and wide intervals come first."""
+        wide = 0.0 if self.size is None else (self.size["high"] - self.size["low"]) / self.size["median"]
+        order = (FAILED, UNSIZED, SIZED).index(self.status)
+        return order, -(10 * len(self.cautions) + len(self.checks)), -wide
+
+
+def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping[str, str], version: str) -> str:
+    """Full page; every text is escaped, nothing is loaded, and the only script is the page's own filter.
+
+    Parameters
+    ----------
+    cards
+        Shown worst first.
+    lines
+        Summary, in sentences.
+    links
+        Files beside the page, by the words of their links.
+    version
+        Of the program.
+    """
+    script_hash = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{script_hash}'"
+    title = "Exams of a campaign"
+    parts = [
+        "<!doctype html>",
+        '<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{title}</h1>",
+        *(f"<p>{html.escape(line)}</p>" for line in lines),
+        f"<p>{_links(links)}</p>",
+        *_filters(cards),
+        "<main>",
+        *(part for card in sorted(cards, key=lambda one: (one.badness, one.name)) for part in _card(card)),
+        "</main>",
+        '<p class="note">Ring: the ellipse of the estimated size. Colours of each map span its own values. '
+        f"tactile-bayes {html.escape(version)}.</p>",
+        f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
+        f"<script>{_SCRIPT}</script></body></html>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _filters(cards: Sequence[Card]) -> Iterator[str]:
+    """The form that the script shows; without scripts the page shows every exam."""
+    counts = {status: sum(card.status == status for card in cards) for status in _CLASSES}
+    options = "".join(f'<option value="{name}">{name} ({count})</option>' for name, count in counts.items())
+    yield (
+        '<form hidden><label>Find <input type="search" name="words" placeholder="patient, visit, reason..."></label>'
+        f'<label>Show <select name="status"><option value="">all ({len(cards)})</option>{options}</select></label>'
+        '<label><input type="checkbox" name="flagged"> with cautions or checks</label><span id="shown"></span></form>'
+    )
+
+
+def _card(card: Card) -> Iterator[str]:
+    flagged = "yes" if card.cautions or card.checks else "no"
+    yield f'<article class="{_CLASSES[card.status]}" data-status="{card.status}" data-flagged="{flagged}">'
+    yield f"<h2>{html.escape(card.name)}</h2>"
+    yield f'<p class="note">{html.escape(", ".join(card.facts))}</p>'
+    if card.thumbnail is not None:
+        data = base64.b64encode(card.thumbnail).decode("ascii")
+        yield f'<img alt="Map of {html.escape(card.name)}" src="data:image/png;base64,{data}">'
+    yield _size(card)
+    flags = [("caution", one) for one in card.cautions] + [("check", one) for one in card.checks]
+    if flags:
+        yield "<ul>" + "".join(f'<li class="{kind}">{html.escape(text)}</li>' for kind, text in flags) + "</ul>"
+    if card.links:
+        yield f'<p class="note">{_links(card.links)}</p>'
+    yield "</article>"
+
+
+def _size(card: Card) -> str:
+    if card.size is None:
+        return f'<p class="why">{html.escape(f"{card.status}: {card.reason}")}</p>'
+    q = card.size
+    interval = f"{100 * q['probability']:g} %: {q['low']:.1f} to {q['high']:.1f} mm"
+    return f'<p><span class="size">{q["median"]:.1f} mm</span> ({html.escape(interval)})</p>'
+
+
+def _links(links: Mapping[str, str]) -> str:
+    return " · ".join(f'<a href="{html.escape(target)}">{html.escape(words)}</a>' for words, target in links.items())

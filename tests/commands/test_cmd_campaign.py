@@ -1,0 +1,502 @@
+"""`campaign`: from a folder of exams to the trial's report; faults stay with their exam, and runs go on."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaign_files import JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
+from in_process import run_here
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+FAST = ("--method", "laplace")
+SIZED = ("07.v1.m1.r1", "07.v1.m1.r2", "09.v1.m1.r1")
+STEPS_OF_ALL = 4 + 4 + 3
+"""Maps and estimates of the exams that are sound, and masses."""
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study")
+    write_study(folder)
+    write_table(folder / "exams.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(study: Path) -> Path:
+    """The output of one run that nothing interrupted."""
+    done = campaign(study)
+    assert done.returncode == 0, done.stderr
+    return study / "out"
+
+
+@pytest.fixture
+def own(study: Path, tmp_path: Path) -> Path:
+    """A copy of the study's inputs, to be changed."""
+    shutil.copytree(study / "scans", tmp_path / "scans")
+    for name in ("exams.csv", "excision.csv"):
+        shutil.copy(study / name, tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def finished(own: Path, undisturbed: Path) -> Path:
+    """A copy of the study with the output of the undisturbed run."""
+    shutil.copytree(undisturbed, own / "out")
+    return own
+
+
+def campaign(folder: Path, *more: object) -> subprocess.CompletedProcess[str]:
+    return run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, *more, cwd=folder)
+
+
+# --- the table
+
+
+def test_init_writes_what_the_scans_carry_and_names_what_it_leaves_out(study: Path, tmp_path: Path) -> None:
+    shutil.copytree(study / "scans", tmp_path / "scans")
+    (tmp_path / "scans" / "cut.mcap").write_bytes(b"\x89MCAP0\r\n and no more")
+    write(tmp_path / "scans" / "later.mcap", thinned(1, 4, subject="07", side="left", visit="2", mass="b"))
+    done = run_here("campaign", "init", "scans", "-o", "exams.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[0] == "exams.csv: 7 exams of 4 patients"
+    assert "left out: scans/cut.mcap: is cut off in its header" in done.stderr
+    rows = {row["file"]: row for row in rows_of(tmp_path / "exams.csv")}
+    assert rows["scans/07-b.mcap"] == {
+        "file": "scans/07-b.mcap",
+        "patient": "07",
+        "visit": "1",
+        "mass": "1",
+        "replicate": "2",
+        "side": "left",
+        "reader": "R2",
+    }
+    assert [rows["scans/later.mcap"][name] for name in ("visit", "mass", "replicate")] == ["2", "b", "1"]
+    assert rows["scans/swapped.mcap"]["patient"] == "09"
+
+
+def test_init_leaves_blank_what_no_scan_says_and_run_asks_for_it(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", thinned(0, 3))
+    done = run_here("campaign", "init", ".", "-o", "exams.csv", cwd=tmp_path)
+    assert "1 scans do not say whose they are: fill in the column patient" in done.stdout
+    refused = run_here("campaign", "run", "exams.csv", "-o", "out", cwd=tmp_path)
+    assert (refused.returncode, refused.stderr.count("\n")) == (3, 1)
+    assert not (tmp_path / "out").exists()
+
+
+FAULTS = {
+    "a path that leaves": ("../x.mcap,1,1,1,1", "'../x.mcap' leaves the table's folder"),
+    "a path that leaves inside": ("scans/../../x.mcap,1,1,1,1", "leaves the table's folder"),
+    "an absolute path": ("/etc/passwd,1,1,1,1", "'/etc/passwd' leaves the table's folder"),
+    "a link that leaves": ("link.mcap,1,1,1,1", "'link.mcap' leaves the table's folder"),
+    "a formula": ("=cmd.mcap,1,1,1,1", "does not match"),
+    "a path for a patient": ("a.mcap,../p,1,1,1", "does not match"),
+    "no replicate": ("a.mcap,1,1,1,0", "'0' is not at least 1"),
+    "an escape": ('"a\x1b[2J.mcap",1,1,1,1', "unprintable"),
+    "a cell too many": ("a.mcap,1,1,1,1,left,7", "cells under"),
+    "the same exam twice": ("a.mcap,1,1,1,1\nb.mcap,1,1,1,1", "stands on line 2 already"),
+    "two sides of one mass": (
+        "a.mcap,1,1,1,1,left\nb.mcap,1,2,1,1,right",
+        "the side right differs from left on line 2",
+    ),
+    "an endless cell": ("a.mcap,1,1,1,1," + "x" * 200_000, "not CSV"),
+    "an open quote": ('"a.mcap,1,1,1,1', "not CSV"),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_a_fault_of_the_table_is_one_line_and_no_work(case: str, tmp_path: Path) -> None:
+    body, fault = FAULTS[case]
+    (tmp_path / "link.mcap").symlink_to(tmp_path.parent / "elsewhere.mcap")
+    sides = body.count(",") > 4 * (body.count("\n") + 1)
+    (tmp_path / "exams.csv").write_text(f"file,patient,visit,mass,replicate{',side' if sides else ''}\n{body}\n")
+    done = run_here("campaign", "run", "exams.csv", "-o", "out", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
+    assert fault in done.stderr
+    assert len(done.stderr) < 1000
+    assert not (tmp_path / "out").exists()
+
+
+def test_half_a_place_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "exams.csv").write_text("file,patient,visit,mass,replicate,centre_x_mm\na.mcap,1,1,1,1,4\n")
+    done = run_here("campaign", "run", "exams.csv", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "column centre_y_mm: is blank while the other coordinate is not" in done.stderr
+
+
+# --- one run
+
+
+def test_every_exam_has_its_row_and_its_status(undisturbed: Path) -> None:
+    trial = {(row["patient"], row["modality"], row["replicate"]): row for row in rows_of(undisturbed / "trial.csv")}
+    status = {key: row["status"] for key, row in trial.items() if key[1] == "tactile"}
+    assert status == {
+        ("07", "tactile", "1"): "detected",
+        ("07", "tactile", "2"): "detected",
+        ("07", "tactile", "3"): "not_done",
+        ("09", "tactile", "1"): "detected",
+        ("11", "tactile", "1"): "not_detected",
+        ("12", "tactile", "1"): "not_done",
+    }
+    assert trial["11", "tactile", "1"]["reason"].startswith("no lump found")
+    assert trial["12", "tactile-pooled", "1"]["reason"] == "every exam failed"
+    pooled = json.loads((undisturbed / "masses" / "07.v1.m1" / "pooled.json").read_text())
+    assert float(trial["07", "tactile-pooled", "1"]["size_mm"]) == pooled["max_size_mm"]["median"]
+    assert [row["patient"] for row in rows_of(undisturbed / "exams_done.csv")] == ["07", "07", "09", "11"]
+
+
+def test_a_swapped_and_a_damaged_file_are_failures_that_say_why(undisturbed: Path) -> None:
+    failures = {row["file"]: row for row in rows_of(undisturbed / "failures.csv")}
+    assert set(failures) == {"scans/swapped.mcap", "scans/12-a.mcap"}
+    told = failures["scans/swapped.mcap"]["reason"]
+    assert told.startswith("the table says patient 07, side left; the file says patient 09, side right;")
+    assert failures["scans/12-a.mcap"]["reason"].startswith("is damaged (")
+    for name in ("07.v1.m1.r3", "12.v1.m1.r1"):
+        assert not (undisturbed / "exams" / name).exists()
+
+
+def test_an_exam_has_what_the_single_commands_give(undisturbed: Path, study: Path, tmp_path: Path) -> None:
+    for name, scan in (("07.v1.m1.r1", "07-a"), ("07.v1.m1.r2", "07-b")):
+        made = undisturbed / "exams" / name
+        run_here("map", study / "scans" / f"{scan}.mcap", "-o", f"{scan}.nc", cwd=tmp_path)
+        told = run_here("estimate", f"{scan}.nc", *FAST, "--json", "-o", f"{scan}-post.nc", cwd=tmp_path)
+        assert (made / "map.nc").read_bytes() == (tmp_path / f"{scan}.nc").read_bytes()
+        assert (made / "posterior.nc").read_bytes() == (tmp_path / f"{scan}-post.nc").read_bytes()
+        assert (made / "estimate.json").read_text() == told.stdout
+    told = run_here("estimate", "07-a.nc", "07-b.nc", "--pool", *FAST, "--json", cwd=tmp_path)
+    wanted = told.stdout.replace("07-a.nc", "07.v1.m1.r1").replace("07-b.nc", "07.v1.m1.r2")
+    assert (undisturbed / "masses" / "07.v1.m1" / "pooled.json").read_text() == wanted
+
+
+def test_an_estimate_names_the_scan_it_comes_from(undisturbed: Path, study: Path) -> None:
+    from tactile_bayes.files.atomic import sha256
+
+    document = json.loads((undisturbed / "exams" / "07.v1.m1.r1" / "estimate.json").read_text())
+    digest = sha256(study / "scans" / "07-a.mcap")
+    facts = {"subject": "07", "side": "left", "posture": "phantom", "examiner": "R1"}
+    assert document["provenance"]["scans"] == [{"sha256": digest, **facts}]
+
+
+def test_validate_takes_the_trial_table_as_it_is(finished: Path) -> None:
+    done = campaign(finished, "--excision", "excision.csv")
+    assert done.returncode == 0, done.stderr
+    told = run_here("validate", "out/trial.csv", "--excision", "excision.csv", cwd=finished)
+    assert told.returncode == 0, told.stderr
+    assert done.stdout.endswith(told.stdout)
+    as_json = run_here("validate", "out/trial.csv", "--excision", "excision.csv", "--json", cwd=finished)
+    assert as_json.stdout == (finished / "out" / "report.json").read_text()
+    counts = json.loads(as_json.stdout)["modalities"]["tactile"]
+    assert (counts["n"], counts["detected"], counts["masses_not_done"]) == (3, 2, 1)
+    assert 'href="report.html"' in (finished / "out" / "index.html").read_text()
+    campaign(finished)
+    assert not (finished / "out" / "report.json").exists()
+
+
+def test_a_protocol_fixes_the_analysis(finished: Path) -> None:
+    (finished / "p.toml").write_text('title = "Agreed"\n[analysis]\nintervals = "jackknife"\nseed = 7\n')
+    campaign(finished, "--excision", "excision.csv", "--protocol", "p.toml")
+    document = json.loads((finished / "out" / "report.json").read_text())
+    assert (document["title"], document["provenance"]["seed"]) == ("Agreed", 7)
+    alone = campaign(finished, "--protocol", "p.toml")
+    assert alone.returncode == 2
+    assert "--protocol is for the trial's report; give --excision too" in alone.stderr
+
+
+def test_files_are_for_their_owner_alone(undisturbed: Path) -> None:
+    for path in (undisturbed, *undisturbed.rglob("*.*")):
+        assert path.is_dir() or path.stat().st_mode & 0o777 == 0o600, path
+    assert undisturbed.stat().st_mode & 0o777 == 0o700
+
+
+def test_two_workers_give_the_same_bytes(undisturbed: Path, own: Path, run_cli: Run) -> None:
+    words = ("campaign", "run", "exams.csv", "-o", "out", *FAST, "--workers", 2)
+    done = run_cli(*words, cwd=own)
+    assert done.returncode == 0, done.stderr
+    assert contents(own / "out") == contents(undisturbed)
+
+
+def test_the_order_of_the_rows_changes_nothing(finished: Path, undisturbed: Path) -> None:
+    write_table(finished / "exams.csv", reversed(ROWS))
+    campaign(finished)
+    assert contents(finished / "out") == contents(undisturbed)
+
+
+def test_without_excision_sizes_there_is_a_trial_table_and_no_report(own: Path) -> None:
+    write_table(own / "exams.csv", [ROWS[3]])
+    done = run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, cwd=own)
+    assert done.returncode == 0, done.stderr
+    assert "no mass pooled: no mass has several exams at one visit" in done.stdout
+    assert not (own / "out" / "report.json").exists()
+    assert [row["modality"] for row in rows_of(own / "out" / "trial.csv")] == ["tactile"]
+
+
+def test_masses_that_were_not_excised_are_left_out_of_the_trial_by_name(finished: Path) -> None:
+    own = finished
+    (own / "excision.csv").write_text("patient,mass,ex_vivo_mm\n07,1,15\n")
+    done = campaign(own, "--excision", "excision.csv")
+    assert "no size after excision, left out of trial.csv: 09 1, 11 1, 12 1" in done.stdout
+    assert {row["patient"] for row in rows_of(own / "out" / "trial.csv")} == {"07"}
+    assert (own / "out" / "report.html").exists()
+
+
+def test_arrays_and_maps_are_exams_too(undisturbed: Path, own: Path) -> None:
+    scan = thinned(0, 3)
+    np.savez(
+        own / "arrays.npz",
+        counts=scan.frames.counts,
+        frame_time_s=scan.frames.time_s,
+        position_mm=scan.poses.position_mm,
+        quaternion_wxyz=scan.poses.quaternion_wxyz,
+        pose_time_s=scan.poses.time_s,
+        gain_kpa_per_count=scan.element_calibration.gain_kpa_per_count,
+        offset_kpa=scan.element_calibration.offset_kpa,
+        pitch_mm=scan.head.pitch_mm,
+        array_from_tracker=scan.head.scanhead_from_tracker,
+        head_surface_mm=scan.head.surface_mm,
+    )
+    shutil.copy(undisturbed / "exams" / "09.v1.m1.r1" / "map.nc", own / "map.nc")
+    shutil.copy(own / "map.nc", own / "map2.nc")
+    rows = [("arrays.npz", "20", 1, "left"), ("map.nc", "09", 1, "right")]
+    write_table(own / "exams.csv", rows)
+    done = run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, cwd=own)
+    assert "2 exams: 2 sized" in done.stdout, done.stdout + done.stderr
+    assert (own / "out/exams/09.v1.m1.r1/map.nc").read_bytes() == (own / "map.nc").read_bytes()
+    run_here("import", "arrays.npz", "-o", "arrays.mcap", cwd=own)
+    assert (own / "out/exams/20.v1.m1.r1/scan.mcap").read_bytes() == (own / "arrays.mcap").read_bytes()
+    write_table(own / "exams.csv", [("map.nc", "20", 2, "right")])
+    run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, cwd=own)
+    assert "the file says patient 09" in rows_of(own / "out" / "failures.csv")[0]["reason"]
+
+
+def test_a_file_in_two_rows_is_a_fault_unless_each_mass_has_its_place(own: Path) -> None:
+    shutil.copy(own / "scans" / "07-a.mcap", own / "scans" / "copy.mcap")
+    write_table(own / "exams.csv", [("scans/07-a.mcap", "07", 1, "left"), ("scans/copy.mcap", "07", 2, "left")])
+    campaign(own)
+    told = [row["reason"] for row in rows_of(own / "out" / "failures.csv")]
+    assert told[0].startswith("holds the same bytes as 07.v1.m1.r2 (scans/copy.mcap);")
+    assert told[1].startswith("holds the same bytes as 07.v1.m1.r1 (scans/07-a.mcap);")
+    head = "file,patient,visit,mass,replicate,side,centre_x_mm,centre_y_mm\n"
+    (own / "exams.csv").write_text(f"{head}scans/07-a.mcap,07,1,1,1,left,0,0\nscans/07-a.mcap,07,1,2,1,left,18,9\n")
+    done = run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, cwd=own)
+    assert "1 sized, 1 without a size, 0 failed" in done.stdout
+    first, second = (json.loads((own / f"out/exams/07.v1.m{m}.r1/estimate.json").read_text()) for m in (1, 2))
+    assert first["provenance"]["settings"]["centre_mm"] == [0.0, 0.0]
+    assert second["provenance"]["settings"]["centre_mm"] == [18.0, 9.0]
+
+
+# --- going on
+
+
+def test_a_second_run_does_nothing_again_but_what_failed(undisturbed: Path, study: Path) -> None:
+    before, journal = contents(undisturbed), (undisturbed / JOURNAL).read_text()
+    done = campaign(study)
+    assert f"2 steps run, {STEPS_OF_ALL} kept from earlier runs" in done.stdout
+    assert contents(undisturbed) == before
+    assert (undisturbed / JOURNAL).read_text() == journal
+
+
+def test_a_changed_scan_redoes_what_depends_on_it(finished: Path) -> None:
+    count = len(steps(finished / "out"))
+    write(finished / "scans" / "09-a.mcap", thinned(1, 4, subject="09", side="right"))
+    campaign(finished)
+    assert steps(finished / "out")[count:] == ["map 09.v1.m1.r1", "estimate 09.v1.m1.r1", "pool 09.v1.m1"]
+
+
+def test_a_changed_setting_redoes_estimates_and_no_map(finished: Path) -> None:
+    write_table(finished / "exams.csv", ROWS[:2])
+    count = len(steps(finished / "out"))
+    campaign(finished, "--seed", 2)
+    assert steps(finished / "out")[count:] == ["estimate 07.v1.m1.r1", "estimate 07.v1.m1.r2", "pool 07.v1.m1"]
+    run_here("campaign", "run", "exams.csv", "-o", "fresh", *FAST, "--seed", 2, cwd=finished)
+    there = {
+        name: data for name, data in contents(finished / "out").items() if "/09." not in name and "/11." not in name
+    }
+    assert there == contents(finished / "fresh")
+
+
+def test_a_file_that_was_changed_or_removed_is_made_again(undisturbed: Path, finished: Path) -> None:
+    (finished / "out/exams/07.v1.m1.r1/map.nc").write_bytes(b"changed")
+    (finished / "out/exams/09.v1.m1.r1/posterior.nc").unlink()
+    (finished / "out/index.html").unlink()
+    count = len(steps(finished / "out"))
+    campaign(finished)
+    assert steps(finished / "out")[count:] == ["map 07.v1.m1.r1", "estimate 09.v1.m1.r1"]
+    assert contents(finished / "out") == contents(undisturbed)
+
+
+def test_files_of_an_exam_that_fails_now_are_removed_and_unlisted_exams_stay(finished: Path) -> None:
+    scan = finished / "scans" / "07-a.mcap"
+    scan.write_bytes(scan.read_bytes()[:1000])
+    write_table(finished / "exams.csv", [*ROWS[:2], ROWS[4]])
+    done = campaign(finished)
+    assert "1 sized, 1 without a size, 1 failed" in done.stdout
+    assert "folders of exams that the table does not list: exams/09.v1.m1.r1, masses/09.v1.m1" in done.stdout
+    assert not (finished / "out/exams/07.v1.m1.r1").exists()
+    assert (finished / "out/exams/09.v1.m1.r1/map.nc").exists()
+    assert "09" not in {row["patient"] for row in rows_of(finished / "out/exams_done.csv")}
+
+
+def test_figures_are_drawn_on_demand_and_estimates_stay(finished: Path) -> None:
+    write_table(finished / "exams.csv", [ROWS[3], ROWS[4]])
+    count = len(steps(finished / "out"))
+    campaign(finished, "--figures")
+    out = finished / "out"
+    assert steps(out)[count:] == ["figures 09.v1.m1.r1", "figures 11.v1.m1.r1"]
+    assert (out / "exams/09.v1.m1.r1/size.png").read_bytes().startswith(b"\x89PNG")
+    assert not (out / "exams/11.v1.m1.r1/size.png").exists()
+    assert 'href="exams/11.v1.m1.r1/map.png"' in (out / "index.html").read_text()
+
+
+def test_a_dry_run_says_what_it_would_do_and_writes_nothing(finished: Path) -> None:
+    before = contents(finished / "out")
+    done = campaign(finished, "--seed", 2, "--dry-run")
+    assert "map: 2 to do, 4 done\nestimate: 6 to do, 0 done\npool: 4 to do, 0 done\n" in done.stdout
+    assert contents(finished / "out") == before
+    assert re.search(r"^About [0-9]+ s by the times measured here\.$", done.stdout, flags=re.MULTILINE)
+    fresh = run_here("campaign", "run", "exams.csv", "-o", "new", "--dry-run", cwd=finished)
+    assert "map: 6 to do, 0 done" in fresh.stdout
+    assert "How long is not known: no map, estimate, pool was run here yet." in fresh.stdout
+    assert not (finished / "new").exists()
+
+
+def start(folder: Path, environment: dict[str, str], *more: str) -> subprocess.Popen[str]:
+    words = [sys.executable, "-m", "tactile_bayes", "campaign", "run", "exams.csv"]
+    return subprocess.Popen(
+        [*words, "-o", "out", *FAST, *more], cwd=folder, env=environment, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for_steps(folder: Path, wanted: int, process: subprocess.Popen[str]) -> None:
+    """Wait until the journal holds so many steps; a process that ended earlier is a fault."""
+    journal = folder / "out" / JOURNAL
+    while process.poll() is None:
+        if journal.exists() and journal.read_bytes().count(b"\n") > wanted:
+            return
+        time.sleep(0.002)
+    pytest.fail(f"ended with {process.returncode} before step {wanted}: {process.communicate()[1]}")
+
+
+def check_resumed(folder: Path, undisturbed: Path) -> None:
+    """Finish a campaign that was ended; the same bytes, and nothing that was done is done again."""
+    finished = campaign(folder)
+    assert finished.returncode == 0, finished.stderr
+    assert contents(folder / "out") == contents(undisturbed)
+    done = steps(folder / "out")
+    assert len(done) == len(set(done)) == STEPS_OF_ALL
+
+
+@pytest.mark.parametrize("after", [0, 3, 7])
+def test_a_killed_run_ends_in_the_same_bytes(
+    after: int, undisturbed: Path, own: Path, child_environment: dict[str, str]
+) -> None:
+    process = start(own, child_environment)
+    wait_for_steps(own, after, process)
+    time.sleep(random.Random(after).uniform(0.0, 0.15))
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    check_resumed(own, undisturbed)
+
+
+@pytest.mark.slow
+def test_fifty_kills_at_any_moment_end_in_the_same_bytes(
+    undisturbed: Path, own: Path, child_environment: dict[str, str]
+) -> None:
+    rng = random.Random(110)
+    for number in range(50):
+        shutil.rmtree(own / "out", ignore_errors=True)
+        workers = "2" if number % 2 else "1"
+        for _ in range(rng.randint(1, 3)):
+            process = start(own, child_environment, "--workers", workers)
+            try:
+                process.wait(rng.uniform(0.1, 6.0))
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal.SIGKILL)
+            process.communicate()
+        check_resumed(own, undisturbed)
+
+
+def test_ctrl_c_keeps_what_is_done_and_says_so(undisturbed: Path, own: Path, child_environment: dict[str, str]) -> None:
+    process = start(own, child_environment)
+    wait_for_steps(own, 1, process)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate()
+    assert process.returncode == 130, told
+    assert re.search(r"^interrupted: \d+ of \d+ done; .*campaign\.journal keeps them, run again to go on$", told, re.M)
+    check_resumed(own, undisturbed)
+
+
+FULL = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
+from tactile_bayes.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize(("limit", "workers"), [(100_000, 1), (400_000, 2), (300, 1)])
+def test_a_full_disk_is_one_line_and_loses_nothing(
+    limit: int, workers: int, undisturbed: Path, own: Path, run_python: Run
+) -> None:
+    """A limit on the size of files stands for the disk: maps do not fit, then draws, then the journal."""
+    words = ("campaign", "run", "exams.csv", "-o", "out", *FAST, "--workers", workers)
+    done = run_python("-c", FULL, limit, *words, cwd=own)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "cannot be written (File too large)" in done.stderr
+    assert "run again" in done.stderr
+    if limit == 400_000:
+        assert sum(step.startswith("map") for step in steps(own / "out")) == 4
+    assert not list((own / "out").rglob("*.part"))
+    check_resumed(own, undisturbed)
+
+
+def test_two_runs_at_once_are_refused(undisturbed: Path, study: Path) -> None:
+    import fcntl
+
+    with (undisturbed / JOURNAL).open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        done = campaign(study)
+    assert done.returncode == 2
+    assert "is in use by another run" in done.stderr
+
+
+def test_an_output_that_holds_something_else_is_refused(own: Path) -> None:
+    (own / "out").mkdir()
+    (own / "out" / "thesis.tex").write_text("x")
+    done = campaign(own)
+    assert done.returncode == 2
+    assert "holds files, and no campaign; choose a new folder" in done.stderr
+    assert os.listdir(own / "out") == ["thesis.tex"]  # noqa: PTH208
+
+
+def test_exams_inside_the_output_are_refused(finished: Path) -> None:
+    write_table(finished / "exams.csv", [("out/exams/07.v1.m1.r1/map.nc", "07", 1, "left")])
+    done = campaign(finished)
+    assert done.returncode == 2
+    assert "lies in the output folder out" in done.stderr
+
+
+def test_a_missing_file_is_its_own_row(own: Path) -> None:
+    write_table(own / "exams.csv", [("scans/gone.mcap", "07", 1, "left"), ROWS[1]])
+    done = campaign(own)
+    assert "1 sized, 0 without a size, 1 failed" in done.stdout
+    (row,) = rows_of(own / "out" / "failures.csv")
+    assert (row["step"], row["reason"]) == ("read", "cannot be read (No such file or directory); check the path")
+
+
+def test_a_trial_without_a_reading_has_no_report_and_the_reason(finished: Path) -> None:
+    (finished / "excision.csv").write_text("patient,mass,ex_vivo_mm\nother,1,15\n")
+    done = campaign(finished, "--excision", "excision.csv")
+    assert done.returncode == 0, done.stderr
+    assert "no trial report: holds a header and no rows" in done.stdout
