@@ -20,6 +20,11 @@ from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
 
 OF_A_LUMP = ("seat", "depth_mm", "stiffness_ratio")
 """Known properties that are of one lump, not of the whole body."""
+FLANK_IN_WIDTHS = 2.5
+LEAST_SHARE = 0.15
+"""Of the first lump's amplitude, for a size from the map less the first lump: of two with less, 21 mm from a lump 13
+times as high, one came out twice as large as it was, and what a lump leaves of itself is some per cent of it."""
+BOTH = "scan again with more lines over both"
 Estimator = Callable[[TactileMap, EstimateOptions], Estimate]
 
 
@@ -40,7 +45,9 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     others = _others_options(options)
     for rise in _rises(tactile_map, first, options):
         mass = _sized_at(tactile_map, rise, first, others, estimator)
-        if all(np.hypot(mass.x_mm - one.x_mm, mass.y_mm - one.y_mm) > 2 * SMOOTHING_MM for one in found):
+        if mass is not None and all(
+            np.hypot(mass.x_mm - one.x_mm, mass.y_mm - one.y_mm) > 2 * SMOOTHING_MM for one in found
+        ):
             found.append(mass)
     found.sort(key=lambda one: (-(one.largest_mm or 0.0), -_amplitude(one.estimate)))
     kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
@@ -88,13 +95,19 @@ def _rises(tactile_map: TactileMap, first: Estimate, options: EstimateOptions) -
 
 def _sized_at(
     tactile_map: TactileMap, rise: Rise, first: Estimate, options: EstimateOptions, estimator: Estimator
-) -> Mass:
-    """The mass at a rise: by the whole map if it shows a lump there, else by the map less the first lump."""
+) -> Mass | None:
+    """The mass at a rise: by the whole map if it shows a lump there, else by the map less the first lump.
+
+    None where the whole map shows no lump and the first one is too far away to be the reason.
+    """
     given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
     found = estimator(tactile_map, given)
     if first.map_posterior is not None and not _stays(found, rise, first):
+        if found.code == "undetected" and not _reaches(first, rise, options):
+            return None
         # frames felt both lumps, whatever is taken off the cells
-        found = estimator(replace(without(tactile_map, first.map_posterior), frames=None), given)
+        less = estimator(replace(without(tactile_map, first.map_posterior), frames=None), given)
+        found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
     if not _stays(found, rise, first):
         none = replace(_no_size(found), bump=_bump_of(rise), detection=found.detection)
         return Mass(rise.x_mm, rise.y_mm, rise.probability, none)
@@ -109,12 +122,30 @@ def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
     return bool(moved < apart / 2.0)
 
 
+def _reaches(first: Estimate, rise: Rise, options: EstimateOptions) -> bool:
+    """Whether the first lump's flank is in the window of a rise."""
+    assert first.bump is not None
+    away = np.hypot(rise.x_mm - first.bump.x_mm, rise.y_mm - first.bump.y_mm)
+    wide = max(first.bump.sigma_x_mm, first.bump.sigma_y_mm)
+    return bool(away < options.fit.radius_mm + FLANK_IN_WIDTHS * wide)
+
+
+def _stands(found: Estimate, first: Estimate) -> bool:
+    """Whether what is left after the first lump is subtracted is high enough to be sized."""
+    return _amplitude(found) >= LEAST_SHARE * _amplitude(first)
+
+
+def _in_the_flank(found: Estimate) -> Estimate:
+    reason = f"it stands in the flank of a lump more than {1 / LEAST_SHARE:.0f} times as high, which hides its shape"
+    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH)
+
+
 def _no_size(found: Estimate) -> Estimate:
     """The reason for no size of a mass that is not told from the first lump."""
     if found.status == "no_estimate":
         return found
     reason = "its fit moves to the lump beside it: the map does not tell them apart"
-    return Estimate("no_estimate", reason, code="unresolved", advice="scan again with more lines over both")
+    return Estimate("no_estimate", reason, code="unresolved", advice=BOTH)
 
 
 def _bump_of(rise: Rise) -> ModalBump:
