@@ -5,8 +5,8 @@
     python -m benchmarks.masses report DIR
 
 Both steps go on where they were interrupted. The exams are those of `masses_scenes`: 100 with two lumps 20 to 40 mm
-apart, 200 with one. Every exam goes through `build_map` and `estimate` with their defaults. A listed mass is a lump's if
-it lies within 10 mm of its true place (and 2/5 of the lumps' distance); any other is false.
+apart, 200 with one. Every exam goes through `build_map` and `estimate` with their defaults. A listed mass is a lump's
+if it lies within 10 mm of its true place (and 2/5 of the lumps' distance); any other is false.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +135,7 @@ def report(folder: Path) -> None:
     print(f"exams with two lumps: {len(two)}, one of them listed in {len(beside)}")
     print(f"the other one listed too: {share(sum(row['listed'] for row in beside), len(beside))}")
     for name, (value, edges) in BINS.items():
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in pairwise(edges):
             these = [row for row in beside if low <= value(row) < high]
             print(f"  {name}, {low:g} to {high:g}: {share(sum(row['listed'] for row in these), len(these))}")
     _first(two)

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM
 from tactile_bayes.posterior.options import EstimateOptions
@@ -45,9 +46,7 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     others = _others_options(options)
     for rise in _rises(tactile_map, first, options):
         mass = _sized_at(tactile_map, rise, first, others, estimator)
-        if mass is not None and all(
-            np.hypot(mass.x_mm - one.x_mm, mass.y_mm - one.y_mm) > 2 * SMOOTHING_MM for one in found
-        ):
+        if mass is not None and all(_apart(mass, one) for one in found):
             found.append(mass)
     found.sort(key=lambda one: (-(one.largest_mm or 0.0), -_amplitude(one.estimate)))
     kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
@@ -55,6 +54,11 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     masses = tuple(replace(one, reported=one.estimate is reported) for one in found)
     rises = tuple(_rise(one, masses) for one in masses if not one.reported)
     return replace(reported, candidates=first.candidates, masses=masses, other_rises=rises)
+
+
+def _apart(one: Mass, other: Mass) -> bool:
+    """Whether two masses are not the same, found twice."""
+    return bool(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm) > 2 * SMOOTHING_MM)
 
 
 def _probability(estimate: Estimate) -> float:
@@ -101,17 +105,25 @@ def _sized_at(
     None where the whole map shows no lump and the first one is too far away to be the reason.
     """
     given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
-    found = estimator(tactile_map, given)
+    found = _estimated(tactile_map, given, estimator)
     if first.map_posterior is not None and not _stays(found, rise, first):
         if found.code == "undetected" and not _reaches(first, rise, options):
             return None
         # frames felt both lumps, whatever is taken off the cells
-        less = estimator(replace(without(tactile_map, first.map_posterior), frames=None), given)
+        less = _estimated(replace(without(tactile_map, first.map_posterior), frames=None), given, estimator)
         found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
     if not _stays(found, rise, first):
         none = replace(_no_size(found), bump=_bump_of(rise), detection=found.detection)
         return Mass(rise.x_mm, rise.y_mm, rise.probability, none)
     return Mass(*_place(found), max(rise.probability, _probability(found)), found)
+
+
+def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Estimator) -> Estimate:
+    """An estimate; where the method asked for does not converge the reason for none, for the first lump has its own."""
+    try:
+        return estimator(tactile_map, options)
+    except NotConvergedError as error:
+        return Estimate("no_estimate", f"no method converged: {error}", code="method")
 
 
 def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
