@@ -7,7 +7,7 @@ that finds no lump there, the map less the first lump decides.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,16 +44,19 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     """
     found = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
     others = _others_options(options)
-    for rise in _rises(tactile_map, first, options):
+    rises = [*other_rises(tactile_map, first, options)]
+    for rise in [*_in_scene(first), *rises]:
         mass = _sized_at(tactile_map, rise, first, others, estimator)
+        if mass is None and rise not in rises:
+            mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _hidden(rise))
         if mass is not None and all(_apart(mass, one) for one in found):
             found.append(mass)
     found.sort(key=lambda one: (-(one.largest_mm or 0.0), -_amplitude(one.estimate)))
     kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
     reported = first if kept or not found or found[0].largest_mm is None else found[0].estimate
     masses = tuple(replace(one, reported=one.estimate is reported) for one in found)
-    rises = tuple(_rise(one, masses) for one in masses if not one.reported)
-    return replace(reported, candidates=first.candidates, masses=masses, other_rises=rises)
+    beside = tuple(_rise(one, masses) for one in masses if not one.reported)
+    return replace(reported, candidates=first.candidates, masses=masses, other_rises=beside)
 
 
 def _apart(one: Mass, other: Mass) -> bool:
@@ -85,16 +88,17 @@ def _others_options(options: EstimateOptions) -> EstimateOptions:
     return replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
 
 
-def _rises(tactile_map: TactileMap, first: Estimate, options: EstimateOptions) -> Iterator[Rise]:
-    """A second lump in the first one's scene, then other rises of the map."""
+def _in_scene(first: Estimate) -> list[Rise]:
+    """The second lump of the first one's scene, if the evidence put it there."""
     choice = first.scene
-    if choice is not None and choice.fit.scene.extra == "second lump":
-        (asked,) = (one for one in choice.structures if one.name == "second lump")
-        if asked.supported:
-            x, y, log_width = (float(value) for value in choice.fit.mode[-3:])
-            width = float(np.exp(log_width))
-            yield Rise(x, y, None, 0.0, width, width, asked.odds / (1.0 + asked.odds))
-    yield from other_rises(tactile_map, first, options)
+    if choice is None or choice.fit.scene.extra != "second lump":
+        return []
+    (asked,) = (one for one in choice.structures if one.name == "second lump")
+    if not asked.supported:
+        return []
+    x, y, log_width = (float(value) for value in choice.fit.mode[-3:])
+    width = float(np.exp(log_width))
+    return [Rise(x, y, None, 0.0, width, width, asked.odds / (1.0 + asked.odds))]
 
 
 def _sized_at(
@@ -102,20 +106,20 @@ def _sized_at(
 ) -> Mass | None:
     """The mass at a rise: by the whole map if it shows a lump there, else by the map less the first lump.
 
-    None where the whole map shows no lump and the first one is too far away to be the reason.
+    None where neither shows a lump.
     """
     given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
     found = _estimated(tactile_map, given, estimator)
-    if first.map_posterior is not None and not _stays(found, rise, first):
-        if found.code == "undetected" and not _reaches(first, rise, options):
-            return None
+    near = first.map_posterior is not None and _reaches(first, rise, options)
+    if first.map_posterior is not None and near and not _stays(found, rise, first):
         # frames felt both lumps, whatever is taken off the cells
         less = _estimated(replace(without(tactile_map, first.map_posterior), frames=None), given, estimator)
         found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
-    if not _stays(found, rise, first):
-        none = replace(_no_size(found), bump=_bump_of(rise), detection=found.detection)
-        return Mass(rise.x_mm, rise.y_mm, rise.probability, none)
-    return Mass(*_place(found), max(rise.probability, _probability(found)), found)
+    if found.code == "undetected":
+        return None
+    if _stays(found, rise, first):
+        return Mass(*_place(found), max(rise.probability, _probability(found)), found)
+    return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(_no_size(found), bump=_bump_of(rise)))
 
 
 def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Estimator) -> Estimate:
@@ -157,7 +161,13 @@ def _no_size(found: Estimate) -> Estimate:
     if found.status == "no_estimate":
         return found
     reason = "its fit moves to the lump beside it: the map does not tell them apart"
-    return Estimate("no_estimate", reason, code="unresolved", advice=BOTH)
+    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH)
+
+
+def _hidden(rise: Rise) -> Estimate:
+    """A second lump of a scene that is none without that scene."""
+    reason = "the map shows it beside the first lump only, not by itself"
+    return Estimate("no_estimate", reason, code="unresolved", advice=BOTH, bump=_bump_of(rise))
 
 
 def _bump_of(rise: Rise) -> ModalBump:
