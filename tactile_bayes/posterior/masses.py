@@ -139,7 +139,9 @@ def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
 
 
 def _reaches(first: Estimate, rise: Rise, options: EstimateOptions) -> bool:
-    """Whether the first lump's flank is in the window of a rise."""
+    """Whether the first lump bears on the window of a rise: by its flank, or by the residuals of independent errors."""
+    if not options.fit.correlated:
+        return True
     assert first.bump is not None
     away = np.hypot(rise.x_mm - first.bump.x_mm, rise.y_mm - first.bump.y_mm)
     wide = max(first.bump.sigma_x_mm, first.bump.sigma_y_mm)
