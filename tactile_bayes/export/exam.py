@@ -1,0 +1,280 @@
+"""What an export is made from: a map's file, and what an estimate's file says of each mass."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.atomic import sha256
+from tactile_bayes.files.documents import load_json, parse_json
+from tactile_bayes.files.kinds import HDF5_MAGIC
+from tactile_bayes.files.netcdf import open_netcdf
+from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
+from tactile_bayes.files.reading import open_input
+from tactile_bayes.files.schema import check_document
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.tactile_map import TactileMap
+
+_WAY_OUT: Final = "give a map (.nc), a posterior (.nc), or the JSON of `estimate --json`"
+_SCHEMAS: Final = {"tactile-bayes/estimate/1": "estimate.schema.json", "tactile-bayes/pooled/1": "pooled.schema.json"}
+_SIZES: Final = ("max_size_mm", "min_size_mm")
+Facts = Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapFile:
+    """A map with its file's digest and the facts of its scans.
+
+    Parameters
+    ----------
+    digest
+        SHA-256 of the file.
+    facts
+        What all of its scans say alike of the exam; see `EXAM_FACTS`.
+    """
+
+    path: Path
+    digest: str
+    tactile_map: TactileMap
+    facts: Facts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """One mass of an estimate.
+
+    Parameters
+    ----------
+    number
+        From 1, in the order of the estimate.
+    largest, smallest
+        Quantities in mm as the estimate's JSON has them; None without a size.
+    code
+        Reason code of the estimate where there is no number; empty with a size.
+    reason
+        Why there is no number, or no size.
+    probability
+        That there is a lump; None where the file does not tell.
+    centre_mm, centre_patient_mm
+        Medians of x and y in `plane` and in `patient`; None where the file does not tell.
+    """
+
+    number: int
+    largest: Mapping[str, Any] | None
+    smallest: Mapping[str, Any] | None
+    code: str = ""
+    reason: str = ""
+    probability: float | None = None
+    centre_mm: tuple[float, float] | None = None
+    centre_patient_mm: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimateFile:
+    """An estimate: of one map, pooled from several, or the draws of either.
+
+    Parameters
+    ----------
+    kind
+        ``"estimate"``, ``"pooled"`` or ``"posterior"``.
+    digest
+        SHA-256 of the estimate's content.
+    maps
+        SHA-256 of the maps that it was made from; empty where the file does not tell.
+    cautions
+        What may put the size outside its interval, as the report's first lines say it.
+    """
+
+    path: Path
+    kind: str
+    digest: str
+    document: Mapping[str, Any]
+    findings: tuple[Finding, ...]
+    maps: tuple[str, ...]
+    facts: Facts
+    cautions: tuple[str, ...] = ()
+
+    @property
+    def sized(self) -> bool:
+        """Whether any mass has a size."""
+        return any(one.largest is not None for one in self.findings)
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Origin of the estimate."""
+        found: Mapping[str, Any] = self.document["provenance"]
+        return found
+
+    @property
+    def method_words(self) -> str:
+        """Method and calibration in a phrase."""
+        settings = self.provenance.get("settings", {})
+        calibration = settings.get("size_calibration") or settings.get("calibration")
+        method = settings.get("method") or "unknown"
+        return f"method {method}, size calibration {calibration or 'solid (shipped)'}"
+
+
+def read_exam(path: Path) -> MapFile | list[EstimateFile]:
+    """Read a file of this program, whichever kind it is; a list of estimates gives several.
+
+    Raises
+    ------
+    BadDataError
+        When it is neither a map nor an estimate nor a posterior, or is damaged.
+    """
+    with open_input(path) as file:
+        head = file.read(8)
+    if head.startswith(HDF5_MAGIC):
+        with open_netcdf(path, way_out=_WAY_OUT) as file:
+            group = file.group("posterior")
+            attributes = None if group is None else group.attributes()
+        return _read_map(path) if attributes is None else [_read_posterior(path, attributes)]
+    if not head.lstrip().startswith((b"{", b"[")):
+        from tactile_bayes.files.kinds import kind_of
+
+        kind = kind_of(path) or "none of these"
+        raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
+    document = load_json(path, way_out=_WAY_OUT)
+    listed = document if isinstance(document, list) else [document]
+    if not listed:
+        raise BadDataError("is an empty list", way_out=_WAY_OUT, path=str(path))
+    return [_of_document(one, path) for one in listed]
+
+
+def _read_map(path: Path) -> MapFile:
+    from tactile_bayes.files.map_nc import read_map_and_scans
+
+    tactile_map, scans = read_map_and_scans(path)
+    return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
+
+
+def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """What all scans say alike of the exam; where they differ or one is silent, nothing is said."""
+    listed = list(scans)
+    if not listed:
+        return {}
+    first = listed[0]
+    return {
+        name: first[name] for name in EXAM_FACTS if name in first and all(one.get(name) == first[name] for one in listed)
+    }
+
+
+def _of_document(document: object, path: Path) -> EstimateFile:
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if not isinstance(document, dict) or schema not in _SCHEMAS:
+        from tactile_bayes.files.kinds import schema_kind
+
+        raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
+    check_document(document, _SCHEMAS[schema], path=path)
+    kind = schema.split("/")[1]
+    text = json.dumps(document, sort_keys=True)
+    return EstimateFile(
+        path,
+        kind,
+        hashlib.sha256(text.encode()).hexdigest(),
+        document,
+        _findings(document),
+        _map_digests(document["provenance"]),
+        shared_facts(scans_of(document["provenance"])),
+        tuple(_cautions(document)),
+    )
+
+
+def _findings(document: Mapping[str, Any]) -> tuple[Finding, ...]:
+    code = "" if document["max_size_mm"] else document.get("reason_code") or "no size"
+    one = Finding(
+        1,
+        *(document[name] for name in _SIZES),
+        code,
+        document["reason"] if code else "",
+        document.get("detected_probability"),
+        _point(document.get("centre_mm")),
+        _point(document.get("centre_patient_mm")),
+    )
+    return (one,)
+
+
+def _point(point: Mapping[str, Any] | None) -> tuple[float, float] | None:
+    if point is None or point["x"] is None or point["y"] is None:
+        return None
+    return float(point["x"]["median"]), float(point["y"]["median"])
+
+
+def _cautions(document: Mapping[str, Any]) -> Iterable[str]:
+    """The report's cautions, which go wherever the size goes."""
+    diagnostics = document.get("diagnostics", {})
+    for text in (*document.get("outside_calibration", ()), *(diagnostics.get("outside_calibration") or ())):
+        yield f"outside the calibration's range: {text}"
+    yield from diagnostics.get("broken_assumptions") or ()
+    for i, one in enumerate(document.get("maps", ()), start=1):
+        yield from (f"map {i}: {text}" for text in one["broken_assumptions"])
+        if one["outlying"]:
+            yield f"map {i} lies apart from the others"
+    if document.get("fat_apart_mm"):
+        yield "the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(
+            *document["fat_apart_mm"]
+        )
+
+
+def _map_digests(provenance: object) -> tuple[str, ...]:
+    inputs = provenance.get("inputs") if isinstance(provenance, dict) else None
+    if not isinstance(inputs, list):
+        return ()
+    known = [one for one in inputs if isinstance(one, dict) and isinstance(one.get("sha256"), str)]
+    return tuple(one["sha256"] for one in known if str(one.get("role", "")).startswith("map"))
+
+
+def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
+    """Sizes of a posterior's draws, with the interval of the estimate that wrote them."""
+    from tactile_bayes.files.posterior_nc import read_posterior
+    from tactile_bayes.inference.summary import summarise
+
+    held = read_posterior(path)
+    provenance = parse_json(attributes.get("provenance", "{}"), name="provenance")
+    if not isinstance(provenance, dict):
+        raise BadDataError("has no provenance", way_out=_WAY_OUT, path=str(path))
+    probability = (provenance.get("settings") or {}).get("interval", 0.95)
+    if not isinstance(probability, float) or not 0 < probability < 1:
+        raise BadDataError(f"its interval is {probability!r}", way_out=_WAY_OUT, path=str(path))
+    sizes: dict[str, Any] = dict.fromkeys(_SIZES)
+    if all(name in held.draws for name in _SIZES):
+        sizes = {name: summarise(held.draws[name], probability=probability).as_dict() for name in _SIZES}
+    reason = "" if sizes["max_size_mm"] else "the draws are of widths only"
+    document = {"provenance": provenance, **sizes, "diagnostics": held.diagnostics}
+    finding = Finding(1, *sizes.values(), "no size" if reason else "", reason)
+    facts = shared_facts(scans_of(provenance))
+    maps = _map_digests(provenance)
+    return EstimateFile(path, "posterior", sha256(path), document, (finding,), maps, facts, tuple(_cautions(document)))
+
+
+def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> None:
+    """Refuse maps and estimates of which one was not made from the other.
+
+    Raises
+    ------
+    UsageError
+        Naming both files.
+    """
+    for estimate in estimates:
+        for one in maps:
+            if not estimate.maps:
+                raise UsageError(
+                    f"{estimate.path} does not say which map it is of; estimate the file: "
+                    f"`tactile-bayes estimate {one.path} --json`"
+                )
+            if one.digest not in estimate.maps:
+                raise UsageError(
+                    f"{estimate.path} is not an estimate of {one.path} (the SHA-256 of its map differs); "
+                    f"make it again: `tactile-bayes estimate {one.path} --json`"
+                )
+        missing = len(set(estimate.maps) - {one.digest for one in maps})
+        if maps and missing:
+            raise UsageError(
+                f"{estimate.path} is of {len(estimate.maps)} maps, and {missing} of them are not given; give all"
+            )
