@@ -45,7 +45,6 @@ SIDES: Final = {"left": Code("7771000", "SCT", "Left"), "right": Code("24028007"
 BREASTS: Final = {"left": Code("80248007", "SCT", "Left breast"), "right": Code("73056007", "SCT", "Right breast")}
 # TID 4015 and CID 6048: 0 to 100 %, by a device
 CERTAINTY: Final = Code("111012", "DCM", "Certainty of Finding")
-FINDING: Final = Code("121071", "DCM", "Finding")
 COMMENT: Final = Code("121106", "DCM", "Comment")
 REPORT_TITLE: Final = Code("126000", "DCM", "Imaging Measurement Report")
 
@@ -56,6 +55,7 @@ PRESSURE: Final = Code("mean-pressure", OWN_SCHEME, "Mean pressure of the readin
 INTERVAL_LOW: Final = Code("interval-low", OWN_SCHEME, "Lower end of the credible interval")
 INTERVAL_HIGH: Final = Code("interval-high", OWN_SCHEME, "Upper end of the credible interval")
 INTERVAL_PROBABILITY: Final = Code("interval-prob", OWN_SCHEME, "Probability of the credible interval")
+OUTCOME: Final = Code("outcome", OWN_SCHEME, "Outcome of the estimate")
 NOT_DETECTED: Final = Code("no-lump-shown", OWN_SCHEME, "The map shows no lump that can be measured")
 NOT_SIZED: Final = Code("not-sized", OWN_SCHEME, "A lump may be there, without a size")
 SIZED: Final = Code("sized", OWN_SCHEME, "Lump with a size")
@@ -67,6 +67,7 @@ OWN: Final = (
     INTERVAL_LOW,
     INTERVAL_HIGH,
     INTERVAL_PROBABILITY,
+    OUTCOME,
     NOT_DETECTED,
     NOT_SIZED,
     SIZED,

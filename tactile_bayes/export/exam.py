@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.export.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.kinds import HDF5_MAGIC
@@ -73,6 +74,13 @@ class Finding:
     probability: float | None = None
     centre_mm: tuple[float, float] | None = None
     centre_patient_mm: tuple[float, float] | None = None
+
+    @property
+    def outcome(self) -> Code:
+        """Whether the mass has a size, and if not, whether a lump was detected."""
+        if self.largest is not None:
+            return SIZED
+        return NOT_DETECTED if self.code in ("undetected", "empty") else NOT_SIZED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +169,9 @@ def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
         return {}
     first = listed[0]
     return {
-        name: first[name] for name in EXAM_FACTS if name in first and all(one.get(name) == first[name] for one in listed)
+        name: first[name]
+        for name in EXAM_FACTS
+        if name in first and all(one.get(name) == first[name] for one in listed)
     }
 
 
@@ -190,7 +200,8 @@ def _findings(document: Mapping[str, Any]) -> tuple[Finding, ...]:
     code = "" if document["max_size_mm"] else document.get("reason_code") or "no size"
     one = Finding(
         1,
-        *(document[name] for name in _SIZES),
+        document["max_size_mm"],
+        document["min_size_mm"],
         code,
         document["reason"] if code else "",
         document.get("detected_probability"),
@@ -247,7 +258,7 @@ def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
         sizes = {name: summarise(held.draws[name], probability=probability).as_dict() for name in _SIZES}
     reason = "" if sizes["max_size_mm"] else "the draws are of widths only"
     document = {"provenance": provenance, **sizes, "diagnostics": held.diagnostics}
-    finding = Finding(1, *sizes.values(), "no size" if reason else "", reason)
+    finding = Finding(1, sizes["max_size_mm"], sizes["min_size_mm"], "no size" if reason else "", reason)
     facts = shared_facts(scans_of(provenance))
     maps = _map_digests(provenance)
     return EstimateFile(path, "posterior", sha256(path), document, (finding,), maps, facts, tuple(_cautions(document)))

@@ -173,9 +173,7 @@ def _check_text(name: str, value: str) -> None:
 def _check_name(name: str, value: str) -> None:
     groups = value.split("=")
     if len(groups) > 3 or any(len(group) > 64 or group.count("^") > 4 for group in groups):
-        raise UsageError(
-            f"{name} is {_short(value)}; give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters"
-        )
+        raise UsageError(f"{name} is {_short(value)}; give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters")
 
 
 def _short(value: str) -> str:

@@ -42,31 +42,29 @@ class ImagePlane:
     ----------
     values : (rows, columns) array
         Row 0 on top; NaN without data.
-    row_direction, column_direction : (3,) arrays or None
-        Unit vectors in L, P, S along which the columns and the rows count up; None without a place in the patient.
-    corner_mm : (3,) array or None
+    row_direction, column_direction : (3,) arrays
+        Unit vectors in L, P, S: along a row, and down a column.
+    corner_mm : (3,) array
         Centre of the first value of the first row.
     """
 
     values: FloatArray
-    row_direction: FloatArray | None = None
-    column_direction: FloatArray | None = None
-    corner_mm: FloatArray | None = None
+    row_direction: FloatArray
+    column_direction: FloatArray
+    corner_mm: FloatArray
 
 
-def image_plane(tactile_map: TactileMap, *, placed: bool) -> ImagePlane:
-    """Image of a map's means, with its place in the patient if `placed` and there are landmarks."""
+def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:
+    """Image of a map's means, placed by a (4, 4) transform from its plane."""
     view = orientation_of(tactile_map)
     values = np.where(tactile_map.covered, tactile_map.mean, np.nan)
-    shown = np.ascontiguousarray(view.screen(values))
-    transform = lps_from_plane(tactile_map)
-    if transform is None or not placed:
-        return ImagePlane(shown)
     axes = {"x": (tactile_map.x_mm, transform[:3, 0]), "y": (tactile_map.y_mm, transform[:3, 1])}
-    corner, directions = {}, []
+    corner, directions = dict[str, float](), list[FloatArray]()
     for towards, sign in ((view.right, 1.0), (view.up, -1.0)):
         centres, axis = axes[towards[1]]
-        forward = (sign if towards[0] == "+" else -sign) > 0
-        corner[towards[1]] = float(centres[0] if forward else centres[-1])
-        directions.append(axis if forward else -axis)
-    return ImagePlane(shown, *directions, on_plane(transform, (corner["x"], corner["y"])))
+        step = sign if towards[0] == "+" else -sign
+        corner[towards[1]] = float(centres[0] if step > 0 else centres[-1])
+        directions.append(step * axis)
+    shown = np.ascontiguousarray(view.screen(values))
+    along, down = directions
+    return ImagePlane(shown, along, down, on_plane(transform, (corner["x"], corner["y"])))

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from tactile_bayes.errors import UsageError
+from tactile_bayes.export.codes import NOT_DETECTED, NOT_SIZED, SIZED
 from tactile_bayes.export.exam import EstimateFile, Finding
 from tactile_bayes.export.identity import Identity
 from tactile_bayes.export.uids import content_uuid
@@ -148,7 +149,9 @@ def _record_id(estimate: EstimateFile, finding: Finding, identity: Identity, *, 
     patient = identity.patient_id
     if id_from_scan and not patient:
         if "subject" not in facts:
-            raise UsageError(f"{estimate.path} names no subject; give --patient-id, or leave out --patient-id-from-scan")
+            raise UsageError(
+                f"{estimate.path} names no subject; give --patient-id, or leave out --patient-id-from-scan"
+            )
         patient = facts["subject"]
     several = [str(finding.number)] if len(estimate.findings) > 1 else []
     if not patient:
@@ -164,7 +167,7 @@ def _record_id(estimate: EstimateFile, finding: Finding, identity: Identity, *, 
 
 def _row(estimate: EstimateFile, finding: Finding, identity: Identity) -> dict[str, str]:
     facts, provenance = estimate.facts, estimate.provenance
-    status = "1" if finding.largest else "3" if finding.code == "undetected" else "2"
+    status = {SIZED: "1", NOT_SIZED: "2", NOT_DETECTED: "3"}[finding.outcome]
     row = {
         "tb_status": status,
         "tb_reason": finding.reason,
