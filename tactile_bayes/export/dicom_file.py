@@ -20,6 +20,13 @@ MANUFACTURER: Final = "tactile_bayes (research software)"
 MODEL: Final = "tactile-bayes"
 UTF_8: Final = "ISO_IR 192"
 EXPLICIT_LITTLE_ENDIAN: Final = "1.2.840.10008.1.2.1"
+# What highdicom writes by the clock; all may be left out.
+_OF_THE_CLOCK: Final = (
+    "InstanceCreationDate",
+    "InstanceCreationTime",
+    "DateOfSecondaryCapture",
+    "TimeOfSecondaryCapture",
+)
 # Written where the standard wants a serial number and nobody gave one.
 NO_SERIAL_NUMBER: Final = "unknown"
 
@@ -144,7 +151,7 @@ def declare_scheme(dataset: Any) -> None:
 def dicom_bytes(dataset: Any) -> bytes:
     """The dataset as a file of DICOM's part 10; nothing in it depends on the clock."""
     pydicom = required("pydicom")
-    for name in ("InstanceCreationDate", "InstanceCreationTime"):
+    for name in _OF_THE_CLOCK:
         if name in dataset:
             delattr(dataset, name)
     meta = pydicom.dataset.FileMetaDataset()

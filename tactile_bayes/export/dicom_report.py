@@ -47,7 +47,7 @@ def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], evidence:
         title=coded(codes.REPORT_TITLE),
     )
     for text in (RESEARCH_USE, *(f"CAUTION: {text}" for text in estimate.cautions), *_sources(estimate)):
-        report[0].ContentSequence.append(_text(codes.COMMENT, text, relationship="CONTAINS"))
+        report[0].ContentSequence.append(_text(codes.COMMENT, text))
     dataset = sr.Comprehensive3DSR(
         evidence=evidence,
         content=report[0],
@@ -98,8 +98,9 @@ def _group(estimate: EstimateFile, finding: Finding, maps: Sequence[MapFile], ev
         group = sr.MeasurementsAndQualitativeEvaluations(**what)
     else:
         group = sr.PlanarROIMeasurementsAndQualitativeEvaluations(**what, referenced_region=region)
-    if finding.reason:
-        group[0].ContentSequence.append(_text(codes.COMMENT, finding.reason, relationship="CONTAINS"))
+    for text in (finding.reason, finding.another_exam):
+        if text:
+            group[0].ContentSequence.append(_text(codes.COMMENT, text))
     return group
 
 
@@ -174,10 +175,10 @@ def _number(concept: Code, value: float, unit: Code) -> Any:
     )
 
 
-def _text(concept: Code, text: str, *, relationship: str) -> Any:
+def _text(concept: Code, text: str) -> Any:
     sr = required("highdicom").sr
     line = " ".join(text.split())[:_MOST_TEXT]
-    return sr.TextContentItem(name=coded(concept), value=line, relationship_type=relationship)
+    return sr.TextContentItem(name=coded(concept), value=line, relationship_type=sr.RelationshipTypeValues.CONTAINS)
 
 
 def _sources(estimate: EstimateFile) -> Iterator[str]:

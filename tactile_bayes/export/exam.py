@@ -64,6 +64,8 @@ class Finding:
         That there is a lump; None where the file does not tell.
     centre_mm, centre_patient_mm
         Medians of x and y in `plane` and in `patient`; None where the file does not tell.
+    another_exam
+        The interval if exams of the mass differ more, in words; empty where the file does not tell.
     """
 
     number: int
@@ -74,6 +76,7 @@ class Finding:
     probability: float | None = None
     centre_mm: tuple[float, float] | None = None
     centre_patient_mm: tuple[float, float] | None = None
+    another_exam: str = ""
 
     @property
     def outcome(self) -> Code:
@@ -189,32 +192,48 @@ def _of_document(document: object, path: Path) -> EstimateFile:
         kind,
         hashlib.sha256(text.encode()).hexdigest(),
         document,
-        _findings(document),
+        findings_of(document),
         _map_digests(document["provenance"]),
         shared_facts(scans_of(document["provenance"])),
         tuple(_cautions(document)),
     )
 
 
-def _findings(document: Mapping[str, Any]) -> tuple[Finding, ...]:
-    code = "" if document["max_size_mm"] else document.get("reason_code") or "no size"
-    one = Finding(
-        1,
-        document["max_size_mm"],
-        document["min_size_mm"],
+def findings_of(document: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """The masses of an estimate's JSON object: those that it lists, or the one that it is of."""
+    listed = document.get("masses") or ({"number": 1, **document},)
+    return tuple(_finding(one) for one in listed)
+
+
+def _finding(mass: Mapping[str, Any]) -> Finding:
+    code = "" if mass["max_size_mm"] else mass.get("reason_code") or "no size"
+    return Finding(
+        int(mass["number"]),
+        mass["max_size_mm"],
+        mass["min_size_mm"],
         code,
-        document["reason"] if code else "",
-        document.get("detected_probability"),
-        _point(document.get("centre_mm")),
-        _point(document.get("centre_patient_mm")),
+        mass["reason"] if code else "",
+        mass.get("detected_probability"),
+        _point(mass.get("centre_mm")),
+        _point(mass.get("centre_patient_mm")),
+        _another_exam(mass.get("another_exam")),
     )
-    return (one,)
 
 
 def _point(point: Mapping[str, Any] | None) -> tuple[float, float] | None:
+    """x and y in mm; of a quantity its median."""
     if point is None or point["x"] is None or point["y"] is None:
         return None
-    return float(point["x"]["median"]), float(point["y"]["median"])
+    x, y = (point[axis]["median"] if isinstance(point[axis], Mapping) else point[axis] for axis in "xy")
+    return float(x), float(y)
+
+
+def _another_exam(another: Mapping[str, Any] | None) -> str:
+    size = another["max_size_mm"] if another else None
+    if another is None or size is None:
+        return ""
+    ends = "{probability:.0%} interval {low:.1f} to {high:.1f} mm".format(**size)
+    return f"If exams differ by {100 * another['between_map_sd']:.0f} %: largest size {size['median']:.1f} mm, {ends}"
 
 
 def _cautions(document: Mapping[str, Any]) -> Iterable[str]:

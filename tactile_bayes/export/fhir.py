@@ -124,6 +124,7 @@ class _Exam:
     def _observation(self, role: str, code: dict[str, Any], finding: Finding) -> dict[str, Any]:
         site = codes.BREASTS.get(self.estimate.facts.get("side", ""))
         notes = [RESEARCH_USE, *(f"CAUTION: {text}" for text in self.estimate.cautions)]
+        notes += [finding.another_exam] if finding.another_exam else []
         if len(self.estimate.findings) > 1:
             notes.append(f"Mass {finding.number} of {len(self.estimate.findings)}")
         return {
@@ -167,6 +168,8 @@ def _lines(estimate: EstimateFile) -> Iterator[str]:
         ends = "{probability:.0%} credible interval {low:.1f} to {high:.1f} mm"
         yield f"{mass}Largest size {one.largest['median']:.1f} mm, {ends.format(**one.largest)}."
         yield f"{mass}Smallest size {one.smallest['median']:.1f} mm, {ends.format(**one.smallest)}."
+        if one.another_exam:
+            yield f"{mass}{one.another_exam}."
     yield from (f"CAUTION: {text}." for text in estimate.cautions)
     yield RESEARCH_USE
 
