@@ -22,8 +22,6 @@ from tactile_bayes.presets import RESEARCH_USE
 SERIES: Final = 3
 _MM: Final = Code("mm", "UCUM", "millimeter")
 _PERCENT: Final = Code("%", "UCUM", "percent")
-_MOST_TEXT: Final = 8000
-"""Characters of a comment; the file's own limit is much higher, readers' is not."""
 
 
 def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], evidence: Sequence[Any], study: Study) -> Any:
@@ -105,9 +103,8 @@ def _group(estimate: EstimateFile, finding: Finding, maps: Sequence[MapFile], ev
 
 
 def _algorithm(estimate: EstimateFile) -> Any:
-    version = str(estimate.provenance.get("version") or __version__)
     return required("highdicom").sr.AlgorithmIdentification(
-        name=MODEL, version=version, parameters=[estimate.method_words]
+        name=MODEL, version=estimate.version or __version__, parameters=[estimate.method_words]
     )
 
 
@@ -177,8 +174,7 @@ def _number(concept: Code, value: float, unit: Code) -> Any:
 
 def _text(concept: Code, text: str) -> Any:
     sr = required("highdicom").sr
-    line = " ".join(text.split())[:_MOST_TEXT]
-    return sr.TextContentItem(name=coded(concept), value=line, relationship_type=sr.RelationshipTypeValues.CONTAINS)
+    return sr.TextContentItem(name=coded(concept), value=text, relationship_type=sr.RelationshipTypeValues.CONTAINS)
 
 
 def _sources(estimate: EstimateFile) -> Iterator[str]:

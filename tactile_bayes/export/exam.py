@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _WAY_OUT: Final = "give a map (.nc), a posterior (.nc), or the JSON of `estimate --json`"
 _SCHEMAS: Final = {"tactile-bayes/estimate/1": "estimate.schema.json", "tactile-bayes/pooled/1": "pooled.schema.json"}
+_MOST_TEXT: Final = 2000
 _SIZES: Final = ("max_size_mm", "min_size_mm")
 Facts = Mapping[str, str]
 
@@ -125,10 +126,21 @@ class EstimateFile:
     @property
     def method_words(self) -> str:
         """Method and calibration in a phrase."""
-        settings = self.provenance.get("settings", {})
-        calibration = settings.get("size_calibration") or settings.get("calibration")
-        method = settings.get("method") or "unknown"
-        return f"method {method}, size calibration {calibration or 'solid (shipped)'}"
+        settings = self.provenance.get("settings")
+        said = settings if isinstance(settings, Mapping) else {}
+        calibration = said.get("size_calibration") or said.get("calibration") or "solid (shipped)"
+        return plain_line(f"method {said.get('method') or 'unknown'}, size calibration {calibration}")
+
+    @property
+    def version(self) -> str:
+        """Version of the program that made it; empty where the file does not tell."""
+        return plain_line(str(self.provenance.get("version") or ""))
+
+
+def plain_line(text: str) -> str:
+    """A text from a file in one line of printable characters, of bounded length."""
+    line = " ".join("".join(one if one.isprintable() else " " for one in text).split())
+    return line if len(line) <= _MOST_TEXT else f"{line[:_MOST_TEXT]}..."
 
 
 def read_exam(path: Path) -> MapFile | list[EstimateFile]:
@@ -212,7 +224,7 @@ def _finding(mass: Mapping[str, Any]) -> Finding:
         mass["max_size_mm"],
         mass["min_size_mm"],
         code,
-        mass["reason"] if code else "",
+        plain_line(mass["reason"]) if code else "",
         mass.get("detected_probability"),
         _point(mass.get("centre_mm")),
         _point(mass.get("centre_patient_mm")),
@@ -239,17 +251,21 @@ def _another_exam(another: Mapping[str, Any] | None) -> str:
 def _cautions(document: Mapping[str, Any]) -> Iterable[str]:
     """The report's cautions, which go wherever the size goes."""
     diagnostics = document.get("diagnostics", {})
-    for text in (*document.get("outside_calibration", ()), *(diagnostics.get("outside_calibration") or ())):
+    for text in (*_texts(document.get("outside_calibration")), *_texts(diagnostics.get("outside_calibration"))):
         yield f"outside the calibration's range: {text}"
-    yield from diagnostics.get("broken_assumptions") or ()
+    yield from _texts(diagnostics.get("broken_assumptions"))
     for i, one in enumerate(document.get("maps", ()), start=1):
-        yield from (f"map {i}: {text}" for text in one["broken_assumptions"])
+        yield from (f"map {i}: {text}" for text in _texts(one["broken_assumptions"]))
         if one["outlying"]:
             yield f"map {i} lies apart from the others"
     if document.get("fat_apart_mm"):
         yield "the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(
             *document["fat_apart_mm"]
         )
+
+
+def _texts(value: object) -> list[str]:
+    return [plain_line(text) for text in value if isinstance(text, str)] if isinstance(value, list) else []
 
 
 def _map_digests(provenance: object) -> tuple[str, ...]:
@@ -269,7 +285,8 @@ def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
     provenance = parse_json(attributes.get("provenance", "{}"), name="provenance")
     if not isinstance(provenance, dict):
         raise BadDataError("has no provenance", way_out=_WAY_OUT, path=str(path))
-    probability = (provenance.get("settings") or {}).get("interval", 0.95)
+    settings = provenance.get("settings")
+    probability = settings.get("interval", 0.95) if isinstance(settings, dict) else 0.95
     if not isinstance(probability, float) or not 0 < probability < 1:
         raise BadDataError(f"its interval is {probability!r}", way_out=_WAY_OUT, path=str(path))
     sizes: dict[str, Any] = dict.fromkeys(_SIZES)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.export.exam import EstimateFile, MapFile
+
+_MOST_NOTE: Final = 400
+"""Characters that have a place above the figure."""
 
 if TYPE_CHECKING:
     from tactile_bayes.report.map_figure import FitContour, Place
@@ -45,7 +48,7 @@ def _note(estimate: EstimateFile) -> str:
     from tactile_bayes.report.estimate_text import no_estimate_line
 
     reasons = [one.reason for one in estimate.findings if one.largest is None]
-    return no_estimate_line(reasons[0]) if reasons and not estimate.sized else ""
+    return no_estimate_line(reasons[0][:_MOST_NOTE]) if reasons and not estimate.sized else ""
 
 
 def _places(document: Any) -> list[Place]:
@@ -58,10 +61,11 @@ def _contour(document: Any) -> FitContour | None:
     """Ellipse and size at the medians."""
     from tactile_bayes.report.map_figure import FitContour
 
-    if document["centre_mm"] is None or document["sigma_x_mm"] is None:
+    names = ("sigma_x_mm", "sigma_y_mm", "background", "amplitude")
+    centre = document["centre_mm"] or {"x": None}
+    if centre["x"] is None or centre["y"] is None or any(document[name] is None for name in names):
         return None
-    middle = {name: document[name]["median"] for name in ("sigma_x_mm", "sigma_y_mm", "background", "amplitude")}
-    centre = document["centre_mm"]
+    middle = {name: document[name]["median"] for name in names}
     size = None
     if document["d_x_mm"] is not None and document["d_y_mm"] is not None:
         size = (document["d_x_mm"]["median"], document["d_y_mm"]["median"])

@@ -166,7 +166,7 @@ def _record_id(estimate: EstimateFile, finding: Finding, identity: Identity, *, 
 
 
 def _row(estimate: EstimateFile, finding: Finding, identity: Identity) -> dict[str, str]:
-    facts, provenance = estimate.facts, estimate.provenance
+    facts = estimate.facts
     status = {SIZED: "1", NOT_SIZED: "2", NOT_DETECTED: "3"}[finding.outcome]
     row = {
         "tb_status": status,
@@ -183,7 +183,7 @@ def _row(estimate: EstimateFile, finding: Finding, identity: Identity) -> dict[s
         "tb_lump_prob": _number(finding.probability),
         "tb_caution": "; ".join(estimate.cautions),
         "tb_method": estimate.method_words,
-        "tb_version": str(provenance.get("version", "")),
+        "tb_version": estimate.version,
         "tb_map_sha256": next(iter(estimate.maps), ""),
         "tb_estimate_sha256": estimate.digest,
         "tb_research_use": RESEARCH_USE,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.export.extras import required
 from tactile_bayes.export.identity import Identity
 from tactile_bayes.files.documents import load_json
@@ -45,7 +48,7 @@ def read_worklist(path: Path) -> Identity:
     """
     data = read_bytes(path, most=_MOST_BYTES)
     if not data.lstrip().startswith((b"{", b"[")):
-        return _identity(_of_dicom(_read_dicom(path)), path)
+        return _identity(_of_dicom(_read_dicom(path), path), path)
     document = load_json(path, way_out=_WAY_OUT)
     if isinstance(document, list):
         if len(document) != 1:
@@ -54,7 +57,7 @@ def read_worklist(path: Path) -> Identity:
     if not isinstance(document, dict):
         raise BadDataError("is no worklist item", way_out=_WAY_OUT, path=str(path))
     if document and all(_TAG.fullmatch(key) for key in document):
-        return _identity(_of_dicom(_from_dicom_json(document, path)), path)
+        return _identity(_of_dicom(_from_dicom_json(document, path), path), path)
     refuse_unknown(document, load_schema(SCHEMA)["properties"], path=path)
     check_document(document, SCHEMA, path=path)
     return _identity({name: value for name, value in document.items() if value}, path)
@@ -69,32 +72,42 @@ def _identity(given: dict[str, str], path: Path) -> Identity:
 
 def _read_dicom(path: Path) -> Any:
     pydicom = required("pydicom")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return pydicom.dcmread(path, stop_before_pixels=True)
-        except Exception as error:  # a broken file ends in errors of many kinds
-            what = f"is neither JSON nor a DICOM file ({type(error).__name__})"
-            raise BadDataError(what, way_out=_WAY_OUT, path=str(path)) from None
+    with _decoding(path, "is neither JSON nor a DICOM file"):
+        return pydicom.dcmread(path, stop_before_pixels=True)
 
 
 def _from_dicom_json(document: dict[str, Any], path: Path) -> Any:
     pydicom = required("pydicom")
+    with _decoding(path, "is no DICOM JSON"):
+        return pydicom.Dataset.from_json(document)
+
+
+@contextlib.contextmanager
+def _decoding(path: Path, what: str) -> Iterator[None]:
+    """Whatever a broken file ends in is one line; the library's warnings and its log are not shown."""
+    log = logging.getLogger("pydicom")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            return pydicom.Dataset.from_json(document)
-        except Exception as error:
-            what = f"is no DICOM JSON ({type(error).__name__})"
-            raise BadDataError(what, way_out=_WAY_OUT, path=str(path)) from None
+            yield
+        except TactileBayesError:
+            raise
+        except Exception as error:  # pydicom's faults are of many kinds
+            raise BadDataError(f"{what} ({type(error).__name__})", way_out=_WAY_OUT, path=str(path)) from None
+        finally:
+            log.setLevel(level)
 
 
-def _of_dicom(dataset: Any) -> dict[str, str]:
+def _of_dicom(dataset: Any, path: Path) -> dict[str, str]:
     """Identity by the names of `Identity`; attributes that are empty are left out."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with _decoding(path, "holds what cannot be read"):
         found = {name: str(dataset.get(keyword) or "").strip() for name, keyword in _ATTRIBUTES.items()}
         birth = str(dataset.get("PatientBirthDate") or "").strip()
     if birth:
         found["birth_date"] = f"{birth[:4]}-{birth[4:6]}-{birth[6:]}" if len(birth) == 8 else birth
-    return {name: value for name, value in found.items() if value}
+    found = {name: value for name, value in found.items() if value}
+    if not found:
+        raise BadDataError("says nothing of a patient or study", way_out=_WAY_OUT, path=str(path))
+    return found
