@@ -26,6 +26,7 @@ _OF_THE_CLOCK: Final = (
     "InstanceCreationTime",
     "DateOfSecondaryCapture",
     "TimeOfSecondaryCapture",
+    "ContributionDateTime",
 )
 # Written where the standard wants a serial number and nobody gave one.
 NO_SERIAL_NUMBER: Final = "unknown"
@@ -151,9 +152,10 @@ def declare_scheme(dataset: Any) -> None:
 def dicom_bytes(dataset: Any) -> bytes:
     """The dataset as a file of DICOM's part 10; nothing in it depends on the clock."""
     pydicom = required("pydicom")
-    for name in _OF_THE_CLOCK:
-        if name in dataset:
-            delattr(dataset, name)
+    for one in (dataset, *dataset.get("ContributingEquipmentSequence", ())):
+        for name in _OF_THE_CLOCK:
+            if name in one:
+                delattr(one, name)
     meta = pydicom.dataset.FileMetaDataset()
     meta.MediaStorageSOPClassUID = dataset.SOPClassUID
     meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID

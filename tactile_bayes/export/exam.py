@@ -128,7 +128,7 @@ class EstimateFile:
         """Method and calibration in a phrase."""
         settings = self.provenance.get("settings")
         said = settings if isinstance(settings, Mapping) else {}
-        calibration = said.get("size_calibration") or said.get("calibration") or "solid (shipped)"
+        calibration = said.get("size_calibration") or said.get("calibration") or "as shipped"
         return plain_line(f"method {said.get('method') or 'unknown'}, size calibration {calibration}")
 
     @property
