@@ -161,7 +161,7 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
     if not head.lstrip().startswith((b"{", b"[")):
         from tactile_bayes.files.kinds import kind_of
 
-        kind = kind_of(path) or "none of these"
+        kind = kind_of(path) or ("none of these" if head else "empty")
         raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
     document = load_json(path, way_out=_WAY_OUT)
     listed = document if isinstance(document, list) else [document]
@@ -192,7 +192,7 @@ def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
 
 def _of_document(document: object, path: Path) -> EstimateFile:
     schema = document.get("schema") if isinstance(document, dict) else None
-    if not isinstance(document, dict) or schema not in _SCHEMAS:
+    if not isinstance(document, dict) or not isinstance(schema, str) or schema not in _SCHEMAS:
         from tactile_bayes.files.kinds import schema_kind
 
         raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))

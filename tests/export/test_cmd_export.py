@@ -37,6 +37,9 @@ REFUSED = {
     "a subject in nrrd": (("map.nc", "--to", "nrrd", "--patient-id-from-scan"), "no patient"),
     "no subject": (("phantom.json", "--to", "fhir", "--patient-id-from-scan"), "--patient-id instead"),
     "another kind": (("size.json", "--to", "csv"), "is a size calibration (JSON)"),
+    "an odd schema": (("odd.json", "--to", "csv"), "is no estimate"),
+    "an empty file": (("nothing.json", "--to", "csv"), "is empty"),
+    "a folder": ((".", "--to", "csv"), "is a directory"),
     "no kind at all": (("notes.txt", "--to", "csv"), "is none of these"),
     "no file": (("--to", "fhir"), "no file was given"),
     "a dictionary elsewhere": (("map.json", "--to", "fhir", "--dictionary", "d.csv"), "with --to csv"),
@@ -50,6 +53,8 @@ def folder(exam: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(exam, place)
     shutil.copy(place / "map.json", place / "copy.json")
     (place / "notes.txt").write_text("hello\n")
+    (place / "odd.json").write_text('{"schema": ["tactile-bayes/estimate/1"]}')
+    (place / "nothing.json").write_text("")
     return place
 
 
@@ -63,6 +68,19 @@ def test_what_does_not_fit_is_told_in_one_line(case: str, folder: Path, tmp_path
     assert told in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("key", ["settings", "inputs", "scans", "version"])
+@pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
+def test_an_odd_provenance_is_no_fault(key: str, value: Any, estimate: Any, tmp_path: Path) -> None:
+    """What is in an estimate's provenance, and in its diagnostics, has no schema: anything may stand there."""
+    odd = estimate | {"provenance": estimate["provenance"] | {key: value}, "diagnostics": {"broken_assumptions": value}}
+    (tmp_path / "e.json").write_text(json.dumps(odd))
+    for to in ("csv", "fhir"):
+        if to == "fhir":
+            pytest.importorskip("fhir.resources")
+        exported(tmp_path, "e.json", "--to", to, "-o", tmp_path / f"out.{to}")
+        assert "\\u202e" not in (tmp_path / f"out.{to}").read_text(encoding="utf-8")
 
 
 def test_an_estimate_of_no_file_is_refused_beside_a_map(estimate: dict[str, Any], folder: Path, tmp_path: Path) -> None:
