@@ -23,7 +23,7 @@ def dicom_names(maps: int, *, estimated: bool) -> list[str]:
     return [*names, *([f"{REPORT}.dcm"] if estimated else [])]
 
 
-def dicom_files(maps: Sequence[MapFile], estimate: EstimateFile | None, identity: Identity) -> dict[str, bytes]:
+def dicom_files(maps: Sequence[MapFile], estimate: EstimateFile | None, *, identity: Identity) -> dict[str, bytes]:
     """Bytes of the files by their names.
 
     Maps whose place in the patient is not known have a picture and no values: a Parametric Map must have a place.
@@ -45,9 +45,9 @@ def dicom_files(maps: Sequence[MapFile], estimate: EstimateFile | None, identity
     for number, one in enumerate(maps, start=1):
         name = next(names)
         if frame_of_reference(one) is not None:
-            objects[name] = parametric_map(one, study, number=number)
+            objects[name] = parametric_map(one, study=study, number=number)
     for number, one in enumerate(maps, start=1):
-        objects[next(names)] = secondary_capture(one, estimate, study, number=number)
+        objects[next(names)] = secondary_capture(one, estimate, study=study, number=number)
     if estimate is not None:
-        objects[next(names)] = structured_report(estimate, maps, list(objects.values()), study)
+        objects[next(names)] = structured_report(estimate, maps, evidence=list(objects.values()), study=study)
     return {name: dicom_bytes(dataset) for name, dataset in objects.items()}

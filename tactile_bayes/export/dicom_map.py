@@ -32,7 +32,7 @@ def frame_of_reference(source: MapFile) -> str | None:
     return content_uid("frame of reference", source.digest)
 
 
-def parametric_map(source: MapFile, study: Study, *, number: int) -> Any:
+def parametric_map(source: MapFile, *, study: Study, number: int) -> Any:
     """The map's means as a Parametric Map of one frame that faces the viewer as the program's pictures do.
 
     Cells without data are NaN, which is also the padding value. A Parametric Map must lie in a frame of reference, so a

@@ -13,7 +13,7 @@ from tactile_bayes.presets import RESEARCH_USE
 SERIES: Final = 2
 
 
-def secondary_capture(source: MapFile, estimate: EstimateFile | None, study: Study, *, number: int) -> Any:
+def secondary_capture(source: MapFile, estimate: EstimateFile | None, *, study: Study, number: int) -> Any:
     """The figure as a Secondary Capture in red, green and blue.
 
     Parameters

@@ -24,7 +24,7 @@ _MM: Final = Code("mm", "UCUM", "millimeter")
 _PERCENT: Final = Code("%", "UCUM", "percent")
 
 
-def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], evidence: Sequence[Any], study: Study) -> Any:
+def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, evidence: Sequence[Any], study: Study) -> Any:
     """The estimate as a structured report, preliminary and unverified.
 
     A size is the median; the ends of its interval, with its probability, are properties of that measurement. A mass

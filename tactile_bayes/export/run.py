@@ -140,7 +140,7 @@ def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity:
     estimate = _one_estimate(estimates, "dicom") if estimates else None
     if estimate is None and len(maps) > 1:
         raise UsageError("several maps without an estimate may be of several exams; give one map, or their pooled size")
-    files = dicom_files(maps, estimate, identity)
+    files = dicom_files(maps, estimate, identity=identity)
     notes = _no_patient(identity)
     if estimate is None:
         one = maps[0].path

@@ -80,7 +80,7 @@ def test_an_odd_provenance_is_no_fault(key: str, value: Any, estimate: Any, tmp_
         if to == "fhir":
             pytest.importorskip("fhir.resources")
         exported(tmp_path, "e.json", "--to", to, "-o", tmp_path / f"out.{to}")
-        assert "\\u202e" not in (tmp_path / f"out.{to}").read_text(encoding="utf-8")
+        assert "\u202e" not in (tmp_path / f"out.{to}").read_text(encoding="utf-8")
 
 
 def test_an_estimate_of_no_file_is_refused_beside_a_map(estimate: dict[str, Any], folder: Path, tmp_path: Path) -> None:
@@ -111,6 +111,22 @@ def test_a_missing_extra_is_named_with_its_command(
         2,
         f"error: this needs the package {package}; install it with pip install 'tactile-bayes[{extra}]'\n",
     )
+
+
+def test_the_command_offers_every_format() -> None:
+    from tactile_bayes.commands import export
+    from tactile_bayes.export import run
+
+    assert export._FORMATS == run.FORMATS
+    assert tuple(name for name, _, _ in export._IDENTITY) == run.TAKES["dicom"]
+
+
+def test_the_guide_lists_the_codes_of_the_own_scheme() -> None:
+    from tactile_bayes.export.codes import OWN
+    from tests.conftest import ROOT
+
+    guide = (ROOT / "docs" / "guides" / "export.md").read_text(encoding="utf-8")
+    assert [f"| `{one.value}` | {one.meaning} |" in guide for one in OWN] == [True] * len(OWN)
 
 
 def test_a_csv_needs_no_extra(run_python: Run, folder: Path, tmp_path: Path) -> None:
