@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "diagnose": ("diagnose", "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures."),
     "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),
     "campaign": ("campaign", "From a folder of exams to the trial's report: `campaign init`, `campaign run`."),
+    "export": ("export", "Write maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."),
     "plan": ("plan", "Plan a trial: power and the worth of more maps, by simulation."),
     "study": ("study", "Run the forward study: amplitude and width over sizes, depths, stiffnesses."),
     "tables": ("tables", "Compute Tables 1 and 2 of the paper again."),
