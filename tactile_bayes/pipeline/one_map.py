@@ -341,10 +341,12 @@ def answer_of(outcome: Outcome) -> Answer:
     from tactile_bayes.report.estimate_document import estimate_document, estimate_quantities
     from tactile_bayes.report.estimate_summary import estimate_summary
     from tactile_bayes.report.estimate_text import estimate_text
+    from tactile_bayes.report.lump_place import lump_place
 
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
     prior = BumpPrior(**(settings.prior or {}))
     quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
+    place = lump_place(estimate.map_posterior, tactile_map, outcome.provenance.scans)
     document = estimate_document(
         estimate,
         tactile_map,
@@ -352,9 +354,12 @@ def answer_of(outcome: Outcome) -> Answer:
         prior=prior,
         provenance=outcome.provenance,
         quantities=quantities,
+        place=place,
     )
-    text = estimate_summary(estimate, quantities, probability=settings.interval)
-    full_text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
+    text = estimate_summary(estimate, quantities, probability=settings.interval, place=place)
+    full_text = estimate_text(
+        estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities, place=place
+    )
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
     return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)

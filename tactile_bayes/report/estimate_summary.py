@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.posterior.result import Estimate, Rise
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import (
@@ -28,7 +29,13 @@ MOST_CAUTIONS = 3
 MOST_RISES = 3
 
 
-def estimate_summary(estimate: Estimate, quantities: Mapping[str, Quantity], *, probability: float) -> str:
+def estimate_summary(
+    estimate: Estimate,
+    quantities: Mapping[str, Quantity],
+    *,
+    probability: float,
+    place: ClockPosition | None = None,
+) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
     Parameters
@@ -37,8 +44,11 @@ def estimate_summary(estimate: Estimate, quantities: Mapping[str, Quantity], *, 
         As `estimate_quantities` gives them; empty without an estimate.
     probability
         Of the intervals.
+    place
+        Of the lump about the nipple, where it is known.
     """
-    body = _nothing(estimate) if estimate.status == "no_estimate" else _something(estimate, quantities, probability)
+    nothing = estimate.status == "no_estimate"
+    body = _nothing(estimate) if nothing else _something(estimate, quantities, probability, place)
     return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
 
 
@@ -46,12 +56,14 @@ def _nothing(estimate: Estimate) -> list[str]:
     return [no_estimate_line(estimate.reason), *advice_lines(estimate), *_rises(estimate.other_rises)]
 
 
-def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probability: float) -> list[str]:
+def _something(
+    estimate: Estimate, quantities: Mapping[str, Quantity], probability: float, place: ClockPosition | None
+) -> list[str]:
     lines = _cautions(estimate)
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
     table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
     lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
-    lines += _lump(estimate, quantities)
+    lines += _lump(estimate, quantities, place)
     lines += _rises(estimate.other_rises)
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
@@ -72,12 +84,14 @@ def _cautions(estimate: Estimate) -> list[str]:
     return joined(texts, most=MOST_CAUTIONS, lead="CAUTION: ")
 
 
-def _lump(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
+def _lump(estimate: Estimate, quantities: Mapping[str, Quantity], place: ClockPosition | None) -> list[str]:
     """Probability of a lump, and its place."""
     parts = [] if estimate.detection is None else [f"Probability of a lump {estimate.detection.probability:.3f}"]
     if "amplitude" in quantities:
         parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
-    if "centre_patient_mm.x" in quantities:
+    if place is not None:
+        parts.append(place.text())
+    elif "centre_patient_mm.x" in quantities:
         x, y = (quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")
         parts.append(
             f"{abs(x):.0f} mm {'right' if x >= 0 else 'left'} of the xiphoid and "

@@ -6,12 +6,14 @@ from collections.abc import Iterable, Mapping
 
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import ANOTHER_EXAM, estimate_quantities
+from tactile_bayes.report.lump_place import place_line
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.rise_text import rise_lines
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
@@ -63,10 +65,11 @@ def estimate_text(
     probability: float,
     prior: BumpPrior | None = None,
     quantities: Mapping[str, Quantity] | None = None,
+    place: ClockPosition | None = None,
 ) -> str:
     """Full report of one map: findings with intervals, sources of uncertainty, omissions.
 
-    `quantities` where they are at hand.
+    `quantities` where they are at hand, `place` where the lump's about the nipple is known.
     """
     if estimate.status == "no_estimate":
         first = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
@@ -77,6 +80,7 @@ def estimate_text(
     lines = [*_cautions(estimate), *table, ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
+    lines += [] if place is None else [place_line(place, probability)]
     lines += [
         *_findings(estimate, quantities),
         *_scene(estimate),
