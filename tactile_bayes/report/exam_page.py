@@ -1,0 +1,230 @@
+"""An exam as one self-contained page that prints to one side of A4: no script, nothing loaded, every text escaped."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator
+from typing import Final
+
+from tactile_bayes import __version__
+from tactile_bayes.mapping.orientation import orientation_of
+from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.report.exam import Exam, Quantity
+from tactile_bayes.report.exam_dial import breast_dial
+from tactile_bayes.report.exam_picture import colour_bar, exam_picture, pictures, size_mm
+from tactile_bayes.report.exam_words import (
+    caution_sentences,
+    facts,
+    headline,
+    largest,
+    mass_row,
+    narrowing_sentences,
+    nothing_sentences,
+    place_sentence,
+    quality_rows,
+    size_sentences,
+    why_no_clock,
+)
+
+TITLE: Final = "Tactile exam"
+MOST_REPEATS: Final = 6
+MOST_MASSES: Final = 6
+_LONGEST: Final = 400
+_PICTURE_MM: Final = (108.0, 96.0)
+_REPEAT_MM: Final = 30.0
+_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_STYLE: Final = """
+@page{size:A4 portrait;margin:10mm}
+*{box-sizing:border-box}
+body{font:15px/1.4 system-ui,"Liberation Sans",Arial,sans-serif;color:#111;background:#fff;margin:1rem auto;
+max-width:56rem;padding:0 1rem;overflow-wrap:anywhere}
+h1{font-size:1.05rem;font-weight:600;margin:0}h2{font-size:.95rem;margin:.7rem 0 .2rem;border-bottom:1px solid #bbb}
+p{margin:.2rem 0}.finding{font-size:1.5rem;font-weight:700;line-height:1.25;
+margin:.4rem 0 .3rem}.place{display:flex;flex-wrap:wrap;gap:0 1rem;align-items:center}.place>div{flex:1 1 12rem}
+.facts{display:flex;flex-wrap:wrap;gap:0 1.1rem;margin:.1rem 0}.facts span b{font-weight:600}
+.mark{border:1.5px solid #111;padding:.2rem .5rem;font-weight:600;display:inline-block;margin:.3rem 0}
+.caution{border-left:4px solid #111;padding:.15rem .5rem;margin:.25rem 0;background:#eee}
+.columns{display:flex;flex-wrap:wrap;gap:0 1.2rem}.columns>div{flex:1 1 20rem;min-width:0}
+.picture{text-align:center}.picture svg.map{max-width:100%;height:auto}.small{font-size:.8rem;color:#333}
+table{border-collapse:collapse;width:100%;font-size:.87rem}th{text-align:left;font-weight:600;padding-right:.7rem;
+vertical-align:top;white-space:nowrap}td,th{border-bottom:1px solid #ddd;padding-top:.08rem;padding-bottom:.08rem}
+.masses td{padding-right:.7rem;vertical-align:top}
+.repeats{display:flex;flex-wrap:wrap;gap:.4rem .8rem}.repeats figure{margin:0;font-size:.8rem;text-align:center}
+.ruler,.bar,.dial{max-width:100%}svg text{font-family:system-ui,"Liberation Sans",Arial,sans-serif}
+svg image{image-rendering:pixelated}
+@media print{html{font-size:9.2pt}body{font-size:1rem;line-height:1.28;margin:0;padding:0;max-width:none}
+.columns{flex-wrap:nowrap;gap:0 4mm}.columns>div.figure{flex:0 0 108mm}h2{margin:.45rem 0 .1rem}
+.caution,.mark{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
+"""
+
+
+def exam_page(exam: Exam) -> str:
+    """Full HTML page of an exam; equal exams give equal text."""
+    title = _cut(exam.title, 120) or TITLE
+    parts = [
+        "<!doctype html>",
+        '<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{html.escape(title)}</h1>",
+        *_facts(exam),
+        f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
+        f'<p class="finding">{html.escape(headline(exam))}</p>',
+        *_paragraphs(caution_sentences(exam), kind="caution"),
+        '<div class="columns"><div class="figure">',
+        *_picture(exam),
+        *_place(exam),
+        "</div><div>",
+        *_findings(exam),
+        "</div></div>",
+        *_several_masses(exam),
+        *_repeats(exam),
+        *_quality(exam),
+        *_foot(exam),
+        "</body></html>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _cut(text: str, longest: int = _LONGEST) -> str:
+    """A text in one line of at most so many letters."""
+    line = " ".join(text.split())
+    return line if len(line) <= longest else f"{line[: longest - 1]}…"
+
+
+def _paragraphs(sentences: list[str], *, kind: str = "") -> Iterator[str]:
+    named = f' class="{kind}"' if kind else ""
+    for text in sentences:
+        yield f"<p{named}>{html.escape(_cut(text))}</p>"
+
+
+def _facts(exam: Exam) -> Iterator[str]:
+    found = [f"<span><b>{name}</b> {html.escape(_cut(text, 80))}</span>" for name, text in facts(exam)]
+    if found:
+        yield f'<p class="facts">{"".join(found)}</p>'
+
+
+def _picture(exam: Exam) -> Iterator[str]:
+    """The map, as large as it is where the page has room, with its colours and what the lines are."""
+    width, height = size_mm(exam.main.tactile_map)
+    scale = min(1.0, _PICTURE_MM[0] / width, _PICTURE_MM[1] / height)
+    yield f'<div class="picture">{exam_picture(exam.main, label=f"Map: {headline(exam)}", scale=scale)}</div>'
+    yield colour_bar(exam.main)
+    lines = ["Full line: the estimated size; dashed: the ends of its interval."] if largest(exam) is not None else []
+    if not exam.main.masses:
+        lines.append("Crosses: the highest rises, none of which is a lump.")
+    view = orientation_of(exam.main.tactile_map)
+    lines.append(f"{view.words[0].upper()}{view.words[1:]}. Striped: few readings; grey: none.")
+    lines.append(f"{'Life size' if scale == 1.0 else f'{scale:.2f} of life size'} when printed at 100 %.")
+    yield f'<p class="small">{html.escape(" ".join(lines))}</p>'
+
+
+def _findings(exam: Exam) -> Iterator[str]:
+    size = largest(exam)
+    if size is None:
+        yield from _paragraphs(list(nothing_sentences(exam)))
+    else:
+        yield "<h2>Size</h2>"
+        yield _ruler(exam, size)
+        yield from _paragraphs(list(size_sentences(exam)))
+    narrowing = narrowing_sentences(exam)
+    if narrowing:
+        yield "<h2>How sure</h2>"
+        yield from _paragraphs(narrowing)
+
+
+def _place(exam: Exam) -> Iterator[str]:
+    """Where the lump lies, beside a clock face of the breast."""
+    if not exam.main.masses:
+        return
+    mass, size = exam.main.masses[0], largest(exam)
+    yield f'<h2>Place</h2><div class="place">{breast_dial(exam.main.masses)}<div>'
+    yield from _paragraphs([place_sentence(mass, INTERVAL if size is None else size["probability"])])
+    if mass.probability is not None:
+        yield from _paragraphs([f"Probability that it is a lump, by this map: {_chance(mass.probability)}."])
+    yield from (f'<p class="small">{html.escape(text)}</p>' for text in [why_no_clock(exam)] if text)
+    yield "</div></div>"
+
+
+def _chance(probability: float) -> str:
+    return "above 0.999" if probability > 0.999 else f"{probability:.3f}"
+
+
+def _ruler(exam: Exam, size: Quantity) -> str:
+    """Inline SVG of both intervals of the largest size on a scale in mm."""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    rows = [("this exam", size)]
+    if document.get("another_exam") is not None:
+        sd = document["another_exam"]["between_map_sd"]
+        rows.append((f"exams differ by {100 * sd:.0f} %", document["another_exam"]["max_size_mm"]))
+    end = max(q["high"] for _, q in rows) * 1.08
+    step = next(one for one in (1, 2, 5, 10, 20, 50, 100, 1000) if end / one <= 8)
+    scale = 70.0 / end
+    parts = []
+    for i, (words, q) in enumerate(rows):
+        y, left, right = 4.0 + 7.5 * i, scale * q["low"], scale * q["high"]
+        text = f'<text x="{(left + right) / 2:.2f}" y="{y - 1.4:.1f}" text-anchor="middle" font-size="2.7">{words}</text>'
+        parts.append(text)
+        parts.append(f'<path d="M{left:.2f} {y}H{right:.2f}" stroke="#111" stroke-width="{1.6 - 0.6 * i:g}"/>')
+        parts.append(f'<path d="M{scale * q["median"]:.2f} {y - 1.3}v2.6" stroke="#111" stroke-width="0.7"/>')
+    bottom = 4.0 + 7.5 * len(rows) - 2.5
+    parts.append(f'<path d="M0 {bottom}H70" stroke="#111" stroke-width="0.25"/>')
+    for tick in range(0, int(end) + 1, step):
+        x = scale * tick
+        parts.append(f'<path d="M{x:.2f} {bottom}v1" stroke="#111" stroke-width="0.25"/>')
+        parts.append(f'<text x="{x:.2f}" y="{bottom + 4}" text-anchor="middle" font-size="2.7">{tick}</text>')
+    parts.append(f'<text x="70" y="{bottom - 0.8}" text-anchor="end" font-size="2.7">mm</text>')
+    return (
+        f'<svg class="ruler" role="img" aria-label="Intervals of the largest diameter" viewBox="-2 -1 74 {bottom + 6}" '
+        f'width="74mm" height="{bottom + 6}mm">{"".join(parts)}</svg>'
+    )
+
+
+def _several_masses(exam: Exam) -> Iterator[str]:
+    masses = sorted(exam.main.masses, key=lambda one: one.number)
+    if len(masses) < 2:
+        return
+    yield '<h2>All masses on the map</h2><table class="masses">'
+    yield "<tr><th>No.</th><th>Largest diameter</th><th>Place</th></tr>"
+    for mass in masses[:MOST_MASSES]:
+        cells = "".join(f"<td>{html.escape(_cut(text, 200))}</td>" for text in mass_row(mass, INTERVAL))
+        yield f"<tr>{cells}</tr>"
+    yield "</table>"
+    if len(masses) > MOST_MASSES:
+        yield from _paragraphs([f"And {len(masses) - MOST_MASSES} more."])
+
+
+def _repeats(exam: Exam) -> Iterator[str]:
+    """Repeat maps, small, each with its own size."""
+    if len(exam.maps) < 2:
+        return
+    assert exam.pooled is not None
+    yield f"<h2>The {len(exam.maps)} maps of this mass</h2>"
+    shown = exam.maps[:MOST_REPEATS]
+    yield '<div class="repeats">'
+    for number, (one, picture) in enumerate(zip(shown, pictures(shown, width_mm=_REPEAT_MM), strict=True), start=1):
+        size = one.document["max_size_mm"]
+        alone = "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"
+        yield f"<figure>{picture}<figcaption>{number}: {alone}</figcaption></figure>"
+    yield "</div>"
+    if len(exam.maps) > MOST_REPEATS:
+        yield from _paragraphs([f"And {len(exam.maps) - MOST_REPEATS} more maps, pooled too."])
+
+
+def _quality(exam: Exam) -> Iterator[str]:
+    first = " (of the first map)" if len(exam.maps) > 1 else ""
+    yield f"<h2>How good the exam was{first}</h2><table>"
+    for name, text in quality_rows(exam):
+        yield f"<tr><th>{html.escape(name)}</th><td>{html.escape(_cut(text, 240))}</td></tr>"
+    yield "</table>"
+
+
+def _foot(exam: Exam) -> Iterator[str]:
+    digests = [scan["sha256"][:12] for scan in exam.scans if scan.get("sha256")][:MOST_REPEATS]
+    settings = exam.main.document["provenance"]
+    parts = [f"tactile-bayes {__version__}", f"method {settings['settings'].get('method', 'unknown')}"]
+    parts += [f"seed {settings['seed']}"] if settings.get("seed") is not None else []
+    parts += [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
+    text = f"{'; '.join(parts)}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
+    yield f'<p class="small">{html.escape(text)}</p>'
