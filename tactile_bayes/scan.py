@@ -211,7 +211,6 @@ class Landmarks:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _check_finite(getattr(self, name), name=name, shape=(3,)))
 
-
     def points(self) -> dict[str, FloatArray]:
         """(3,) points in `base` by name: ``sternal_notch``, ``xiphoid``, and ``nipple`` where it was touched."""
         named = {"sternal_notch": self.sternal_notch_mm, "xiphoid": self.xiphoid_mm}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from html import escape
@@ -223,6 +223,18 @@ class SizeEstimate(_Sized):
 
         return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self.name, force=force)
 
+    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
+        """Write one page of the exam as HTML, as ``tactile-bayes report`` does.
+
+        Parameters
+        ----------
+        path
+            Usually ``*.html``.
+        title, name, day
+            To print on the page; nothing is where they are not given.
+        """
+        _write_report((self,), path_of(path), self.outcome.settings, (title, name, day), force=force)
+
     def save(self, path: PathLike, *, force: bool = False) -> None:
         """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
 
@@ -254,6 +266,7 @@ class PooledSize(_Sized):
     maps: tuple[SizeEstimate, ...]
     probability: float
     name: str = field(default="")
+    settings: Settings = field(default_factory=Settings)
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -268,6 +281,10 @@ class PooledSize(_Sized):
     def document(self) -> dict[str, Any]:
         """What ``estimate --pool --json`` prints."""
         return self.outcome.document
+
+    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
+        """Write one page of the exam as HTML, with the repeat maps; see `SizeEstimate.report`."""
+        _write_report(self.maps, path_of(path), self.settings, (title, name, day), force=force)
 
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the posterior of the size; with a path also write it.
@@ -284,6 +301,17 @@ class PooledSize(_Sized):
             raise UsageError(f"there is no size to draw: {self.why}")
         name = self.name or f"{len(self.maps)} maps pooled"
         return draw_size(size, path_of(path), name=name, probability=self.probability, force=force)
+
+
+def _write_report(
+    maps: Sequence[SizeEstimate], path: Path, settings: Settings, words: tuple[str, str, str], *, force: bool
+) -> None:
+    from tactile_bayes.files.atomic import write_text
+    from tactile_bayes.pipeline.exam_report import EstimatedMap, Given, make_exam
+    from tactile_bayes.report.exam_page import exam_page
+
+    found = [EstimatedMap(one.outcome.tactile_map, one.answer, one.outcome.provenance.scans) for one in maps]
+    write_text(path, exam_page(make_exam(found, settings, Given(*words))), force=force)
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -387,7 +415,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
         raise UsageError("a map is given twice; give each map once")
     names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
     outcome = pool_answers([one.answer for one in found], used, names=names, inputs={})
-    return PooledSize(outcome, found, used.interval)
+    return PooledSize(outcome, found, used.interval, settings=used)
 
 
 def _several(maps: Iterable[Any]) -> list[Any]:

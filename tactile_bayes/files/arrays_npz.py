@@ -112,7 +112,9 @@ def _check_units(arrays: Arrays) -> None:
 
 def _check_nipple(arrays: Arrays, metres: str) -> None:
     if "landmarks_mm" not in arrays:
-        raise BadDataError("nipple_mm is without landmarks_mm", way_out="give notch and xiphoid too: they say what is up")
+        raise BadDataError(
+            "nipple_mm is without landmarks_mm", way_out="give notch and xiphoid too: they say what is up"
+        )
     near = float(np.linalg.norm(arrays["landmarks_mm"] - arrays["nipple_mm"], axis=1).min())
     if near < 10.0:
         raise BadDataError(f"nipple_mm is {near:.4g} from a point of landmarks_mm", way_out=metres)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -92,6 +92,18 @@ class Exam:
     def main(self) -> ExamMap:
         """The map that is drawn large."""
         return self.maps[0]
+
+    @property
+    def drawn(self) -> ExamMap:
+        """The map that is drawn large; of several maps its first mass has the pooled size, in its own shape."""
+        if self.pooled is None or self.pooled["max_size_mm"] is None or not self.main.masses:
+            return self.main
+        first, *others = self.main.masses
+        if first.axes_mm is None or first.largest is None:
+            return self.main
+        size = self.pooled["max_size_mm"]
+        along, across = (axis * size["median"] / first.largest["median"] for axis in first.axes_mm)
+        return replace(self.main, masses=(replace(first, axes_mm=(along, across), largest=size), *others))
 
     @property
     def figures(self) -> Mapping[str, Any]:

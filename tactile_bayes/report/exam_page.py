@@ -11,9 +11,10 @@ from tactile_bayes.mapping.orientation import orientation_of
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.exam import Exam, Quantity
 from tactile_bayes.report.exam_dial import breast_dial
-from tactile_bayes.report.exam_picture import colour_bar, exam_picture, pictures, size_mm
+from tactile_bayes.report.exam_picture import Frame, colour_bar, exam_picture, small_pictures
 from tactile_bayes.report.exam_words import (
     caution_sentences,
+    detail_sentence,
     facts,
     headline,
     largest,
@@ -107,16 +108,19 @@ def _facts(exam: Exam) -> Iterator[str]:
 
 def _picture(exam: Exam) -> Iterator[str]:
     """The map, as large as it is where the page has room, with its colours and what the lines are."""
-    width, height = size_mm(exam.main.tactile_map)
-    scale = min(1.0, _PICTURE_MM[0] / width, _PICTURE_MM[1] / height)
-    yield f'<div class="picture">{exam_picture(exam.main, label=f"Map: {headline(exam)}", scale=scale)}</div>'
+    tactile_map = exam.main.tactile_map
+    frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=_PICTURE_MM[1])
+    yield f'<div class="picture">{exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")}</div>'
     yield colour_bar(exam.main)
     lines = ["Full line: the estimated size; dashed: the ends of its interval."] if largest(exam) is not None else []
     if not exam.main.masses:
-        lines.append("Crosses: the highest rises, none of which is a lump.")
-    view = orientation_of(exam.main.tactile_map)
-    lines.append(f"{view.words[0].upper()}{view.words[1:]}. Striped: few readings; grey: none.")
-    lines.append(f"{'Life size' if scale == 1.0 else f'{scale:.2f} of life size'} when printed at 100 %.")
+        lines.append("Crosses: the highest rises, none of which was taken for a lump.")
+    view = orientation_of(tactile_map)
+    sides = "; R, L: the patient's right and left; H: head, F: feet" if view.notch is not None else ""
+    lines.append(f"{view.words[0].upper()}{view.words[1:]}{sides}.")
+    lines += ["Striped: few readings; grey: none."] if tactile_map.counts_known else []
+    size = "Life size" if frame.scale == 1.0 else f"{frame.scale:.2f} of life size"
+    lines.append(f"{size} when printed at 100 %.")
     yield f'<p class="small">{html.escape(" ".join(lines))}</p>'
 
 
@@ -124,6 +128,7 @@ def _findings(exam: Exam) -> Iterator[str]:
     size = largest(exam)
     if size is None:
         yield from _paragraphs(list(nothing_sentences(exam)))
+        yield from (f'<p class="small">{html.escape(_cut(text))}</p>' for text in [detail_sentence(exam)] if text)
     else:
         yield "<h2>Size</h2>"
         yield _ruler(exam, size)
@@ -154,7 +159,7 @@ def _chance(probability: float) -> str:
 def _ruler(exam: Exam, size: Quantity) -> str:
     """Inline SVG of both intervals of the largest size on a scale in mm."""
     document = exam.main.document if exam.pooled is None else exam.pooled
-    rows = [("this exam", size)]
+    rows = [("this exam" if exam.pooled is None else "these exams", size)]
     if document.get("another_exam") is not None:
         sd = document["another_exam"]["between_map_sd"]
         rows.append((f"exams differ by {100 * sd:.0f} %", document["another_exam"]["max_size_mm"]))
@@ -164,7 +169,9 @@ def _ruler(exam: Exam, size: Quantity) -> str:
     parts = []
     for i, (words, q) in enumerate(rows):
         y, left, right = 4.0 + 7.5 * i, scale * q["low"], scale * q["high"]
-        text = f'<text x="{(left + right) / 2:.2f}" y="{y - 1.4:.1f}" text-anchor="middle" font-size="2.7">{words}</text>'
+        text = (
+            f'<text x="{(left + right) / 2:.2f}" y="{y - 1.4:.1f}" text-anchor="middle" font-size="2.7">{words}</text>'
+        )
         parts.append(text)
         parts.append(f'<path d="M{left:.2f} {y}H{right:.2f}" stroke="#111" stroke-width="{1.6 - 0.6 * i:g}"/>')
         parts.append(f'<path d="M{scale * q["median"]:.2f} {y - 1.3}v2.6" stroke="#111" stroke-width="0.7"/>')
@@ -203,7 +210,9 @@ def _repeats(exam: Exam) -> Iterator[str]:
     yield f"<h2>The {len(exam.maps)} maps of this mass</h2>"
     shown = exam.maps[:MOST_REPEATS]
     yield '<div class="repeats">'
-    for number, (one, picture) in enumerate(zip(shown, pictures(shown, width_mm=_REPEAT_MM), strict=True), start=1):
+    for number, (one, picture) in enumerate(
+        zip(shown, small_pictures(shown, width_mm=_REPEAT_MM), strict=True), start=1
+    ):
         size = one.document["max_size_mm"]
         alone = "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"
         yield f"<figure>{picture}<figcaption>{number}: {alone}</figcaption></figure>"

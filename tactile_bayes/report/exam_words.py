@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.clock_face import clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
+from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
@@ -35,7 +36,7 @@ def headline(exam: Exam) -> str:
         return f"Lump of about {size['median']:.1f} mm, {interval}{others}"
     if masses:
         return f"Lump seen, no size{others}"
-    return "No lump found" if exam.main.document["reason_code"] in UNDETECTED else "No size"
+    return "No lump found in the area covered" if exam.main.document["reason_code"] in UNDETECTED else "No size"
 
 
 def largest(exam: Exam) -> Quantity | None:
@@ -60,10 +61,13 @@ def size_sentences(exam: Exam) -> Iterator[str]:
     yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{alike}."
     if document.get("another_exam") is not None:
         other, sd = document["another_exam"]["max_size_mm"], document["another_exam"]["between_map_sd"]
-        yield (
-            f"If exams of a lump differ by {100 * sd:.0f} %, as those of patients did in the published trial, it lies "
-            f"between {other['low']:.1f} and {other['high']:.1f} mm ({share})."
-        )
+        apart = f"If exams of a lump differ by {100 * sd:.0f} %, as those of patients did in the published trial"
+        if exam.pooled is not None:
+            apart = (
+                "If exams of a lump may differ as much as those of patients did in the published trial "
+                f"({100 * sd:.0f} % after these maps)"
+            )
+        yield f"{apart}, it lies between {other['low']:.1f} and {other['high']:.1f} mm ({share})."
     least = document["min_size_mm"]
     if least is not None:
         ends = f"{share}: {least['low']:.1f} to {least['high']:.1f} mm"
@@ -75,14 +79,23 @@ def size_sentences(exam: Exam) -> Iterator[str]:
 def nothing_sentences(exam: Exam) -> Iterator[str]:
     """Why there is no size, what would help, and what was covered."""
     document = exam.main.document if exam.pooled is None else exam.pooled
-    reason = document["reason"]
-    if reason:
-        yield f"{reason[0].upper()}{reason[1:]}."
+    if exam.main.document["reason_code"] in UNDETECTED:
+        yield f"No lump was found in the area that was covered: {covered_text(exam.main.tactile_map)}."
+        chance = exam.main.document["detected_probability"]
+        if chance is not None:
+            yield f"Probability that the likeliest rise on the map is a lump: {chance_text(chance)}."
     if document.get("advice"):
         yield f"What would help: {document['advice']}."
     if not exam.main.masses:
         yield "A lump may lie outside the area that was covered, or be too small, too deep or too soft to show."
         yield "The program does not say from one map how small a lump it would have found."
+
+
+def detail_sentence(exam: Exam) -> str:
+    """Why there is no size, as the program's other reports give it; empty where there is one."""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    reason = document["reason"] if largest(exam) is None else ""
+    return f"In detail: {reason}." if reason else ""
 
 
 def place_sentence(mass: ExamMass, probability: float) -> str:
