@@ -119,7 +119,7 @@ def _from_document(maps: Sequence[Path], documents: Sequence[Path], given: Given
     if len(maps) > 1 or len(documents) > 1:
         raise UsageError("an estimate's JSON goes with one map; several maps are estimated and pooled: give maps alone")
     (path,), (source,) = maps, documents
-    document = load_json(source, way_out="give what `estimate --json` printed for one map")
+    document: Any = load_json(source, way_out="give what `estimate --json` printed for one map")
     check_document(document, "estimate.schema.json", path=source)
     digests = [one.get("sha256") for one in document["provenance"].get("inputs", []) if one.get("role") == "map"]
     if sha256(path) not in digests:

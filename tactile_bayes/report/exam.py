@@ -108,7 +108,9 @@ class Exam:
     @property
     def figures(self) -> Mapping[str, Any]:
         """Figures of the size: spread between exams, whether the lump is oval."""
-        return self.main.document["diagnostics"] if self.pooled is None else self.pooled["figures"]
+        document = self.main.document if self.pooled is None else self.pooled
+        found: Mapping[str, Any] = document["diagnostics" if self.pooled is None else "figures"]
+        return found
 
 
 def exam_map(tactile_map: TactileMap, document: Mapping[str, Any], *, side: str) -> ExamMap:

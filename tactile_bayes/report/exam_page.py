@@ -12,6 +12,7 @@ from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.exam import Exam, Quantity
 from tactile_bayes.report.exam_dial import breast_dial
 from tactile_bayes.report.exam_picture import Frame, colour_bar, exam_picture, small_pictures
+from tactile_bayes.report.exam_ruler import size_ruler
 from tactile_bayes.report.exam_words import (
     caution_sentences,
     detail_sentence,
@@ -131,7 +132,7 @@ def _findings(exam: Exam) -> Iterator[str]:
         yield from (f'<p class="small">{html.escape(_cut(text))}</p>' for text in [detail_sentence(exam)] if text)
     else:
         yield "<h2>Size</h2>"
-        yield _ruler(exam, size)
+        yield size_ruler(_intervals(exam, size))
         yield from _paragraphs(list(size_sentences(exam)))
     narrowing = narrowing_sentences(exam)
     if narrowing:
@@ -156,36 +157,13 @@ def _chance(probability: float) -> str:
     return "above 0.999" if probability > 0.999 else f"{probability:.3f}"
 
 
-def _ruler(exam: Exam, size: Quantity) -> str:
-    """Inline SVG of both intervals of the largest size on a scale in mm."""
-    document = exam.main.document if exam.pooled is None else exam.pooled
-    rows = [("this exam" if exam.pooled is None else "these exams", size)]
-    if document.get("another_exam") is not None:
-        sd = document["another_exam"]["between_map_sd"]
-        rows.append((f"exams differ by {100 * sd:.0f} %", document["another_exam"]["max_size_mm"]))
-    end = max(q["high"] for _, q in rows) * 1.08
-    step = next(one for one in (1, 2, 5, 10, 20, 50, 100, 1000) if end / one <= 8)
-    scale = 70.0 / end
-    parts = []
-    for i, (words, q) in enumerate(rows):
-        y, left, right = 4.0 + 7.5 * i, scale * q["low"], scale * q["high"]
-        text = (
-            f'<text x="{(left + right) / 2:.2f}" y="{y - 1.4:.1f}" text-anchor="middle" font-size="2.7">{words}</text>'
-        )
-        parts.append(text)
-        parts.append(f'<path d="M{left:.2f} {y}H{right:.2f}" stroke="#111" stroke-width="{1.6 - 0.6 * i:g}"/>')
-        parts.append(f'<path d="M{scale * q["median"]:.2f} {y - 1.3}v2.6" stroke="#111" stroke-width="0.7"/>')
-    bottom = 4.0 + 7.5 * len(rows) - 2.5
-    parts.append(f'<path d="M0 {bottom}H70" stroke="#111" stroke-width="0.25"/>')
-    for tick in range(0, int(end) + 1, step):
-        x = scale * tick
-        parts.append(f'<path d="M{x:.2f} {bottom}v1" stroke="#111" stroke-width="0.25"/>')
-        parts.append(f'<text x="{x:.2f}" y="{bottom + 4}" text-anchor="middle" font-size="2.7">{tick}</text>')
-    parts.append(f'<text x="70" y="{bottom - 0.8}" text-anchor="end" font-size="2.7">mm</text>')
-    return (
-        f'<svg class="ruler" role="img" aria-label="Intervals of the largest diameter" viewBox="-2 -1 74 {bottom + 6}" '
-        f'width="74mm" height="{bottom + 6}mm">{"".join(parts)}</svg>'
-    )
+def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
+    """Both intervals of the largest size, with what they suppose."""
+    another = (exam.main.document if exam.pooled is None else exam.pooled).get("another_exam")
+    found = [("this exam" if exam.pooled is None else "these exams", size)]
+    if another is not None:
+        found.append((f"exams differ by {100 * another['between_map_sd']:.0f} %", another["max_size_mm"]))
+    return found
 
 
 def _several_masses(exam: Exam) -> Iterator[str]:
@@ -210,9 +188,8 @@ def _repeats(exam: Exam) -> Iterator[str]:
     yield f"<h2>The {len(exam.maps)} maps of this mass</h2>"
     shown = exam.maps[:MOST_REPEATS]
     yield '<div class="repeats">'
-    for number, (one, picture) in enumerate(
-        zip(shown, small_pictures(shown, width_mm=_REPEAT_MM), strict=True), start=1
-    ):
+    small = small_pictures(shown, width_mm=_REPEAT_MM)
+    for number, (one, picture) in enumerate(zip(shown, small, strict=True), start=1):
         size = one.document["max_size_mm"]
         alone = "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"
         yield f"<figure>{picture}<figcaption>{number}: {alone}</figcaption></figure>"

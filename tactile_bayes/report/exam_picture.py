@@ -25,7 +25,7 @@ _MOST_PIXELS: Final = 1200
 _CELL_PX: Final = 4
 _STRIPES_PX: Final = 8
 _NO_DATA: Final = (222, 222, 222)
-# The colours' ends: shares of the well-read cells outside them, the least span of the level, amplitudes shown of a lump.
+# The colours' ends: shares of the well-read cells outside, the least span of the level, amplitudes shown of a lump.
 _ENDS: Final = (0.01, 0.995)
 _LEAST_SPAN: Final = 0.35
 _AMPLITUDES_SHOWN: Final = 1.25
@@ -205,7 +205,7 @@ def _edges(frame: Frame, *, small: bool) -> Iterator[str]:
 
 
 def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
-    """The ellipse of the size, those of its interval's ends, a cross at the centre, and the number of one of several."""
+    """The ellipse of the size, those of its interval's ends, a cross at the centre; numbers where there are several."""
     (x, y), arm = frame.at(mass.centre_mm), 0.6 if small else 1.6
     if mass.axes_mm is not None and mass.largest is not None:
         for end in () if small else ("low", "high"):
