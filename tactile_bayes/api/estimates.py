@@ -6,23 +6,18 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.sized import MassEstimate, Sized
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.posterior import SIZES
 
 if TYPE_CHECKING:
-    import pandas
     from matplotlib.figure import Figure
 
     from tactile_bayes.pipeline.pooled import PooledOutcome
@@ -31,92 +26,8 @@ if TYPE_CHECKING:
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 
 
-class _Sized:
-    """Base of the estimates from one map and from several."""
-
-    name: str
-    probability: float
-
-    @property
-    def _size(self) -> SizePosterior | None:
-        raise NotImplementedError
-
-    @property
-    def why(self) -> str:
-        """Why there is no size, or no estimate at all; empty where there is a size."""
-        raise NotImplementedError
-
-    def _of_size(self, name: str) -> Draws | None:
-        size = self._size
-        if size is None:
-            return None
-        return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
-
-    @property
-    def max_size_mm(self) -> Draws | None:
-        """Largest diameter; None without a size."""
-        return self._of_size("max_size_mm")
-
-    @property
-    def min_size_mm(self) -> Draws | None:
-        """Smallest diameter; None without a size."""
-        return self._of_size("min_size_mm")
-
-    @property
-    def max_size_another_exam_mm(self) -> Draws | None:
-        """Largest diameter if another exam of the mass may come out as far apart as the paper's maps.
-
-        None without a size, or where the spread between exams was stated: `max_size_mm` has it then.
-        """
-        size = None if self._size is None else self._size.another_exam
-        if size is None:
-            return None
-        return Draws(np.atleast_2d(size.max_size_mm), "mm", self.probability, size.replicates)
-
-    def _columns(self) -> dict[str, Draws]:
-        found = {name: self._of_size(name) for name in SIZES}
-        return {name: draws for name, draws in found.items() if draws is not None}
-
-    def to_dataframe(self) -> pandas.DataFrame:
-        """One row for each draw: chain, draw and a column for each quantity; no rows without an estimate."""
-        import pandas
-
-        columns = self._columns()
-        shape = next(iter(columns.values())).values.shape if columns else (0, 0)
-        chain, draw = (index.ravel() for index in np.indices(shape))
-        values = {name: draws.values.ravel() for name, draws in columns.items()}
-        return pandas.DataFrame({"chain": chain, "draw": draw, **values})
-
-    def to_arviz(self) -> Any:
-        """The draws as arviz has them, one group ``posterior``.
-
-        Raises
-        ------
-        UsageError
-            Without an estimate: there are no draws.
-        """
-        from tactile_bayes.inference.arviz_data import inference_data
-
-        columns = self._columns()
-        if not columns:
-            raise UsageError(f"there are no draws: {self.why}")
-        return inference_data({name: draws.values for name, draws in columns.items()})
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self._words()}>"
-
-    def _words(self) -> str:
-        return f"no size: {self.why}" if self.max_size_mm is None else f"largest size {self.max_size_mm}"
-
-    def _repr_html_(self) -> str:
-        rows = [("largest size", self.max_size_mm), ("smallest size", self.min_size_mm)]
-        cells = [f"<tr><th>{name}</th><td>{escape(repr(draws))}</td></tr>" for name, draws in rows if draws is not None]
-        table = f"<table>{''.join(cells)}</table>" if cells else f"<p>No size: {escape(self.why)}</p>"
-        return f"{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class SizeEstimate(_Sized):
+class SizeEstimate(Sized):
     """The estimate of one map.
 
     Parameters
@@ -185,6 +96,23 @@ class SizeEstimate(_Sized):
         """Centre of the lump on the map, along the head; None without an estimate."""
         return self._of_shape("y_mm")
 
+    @property
+    def masses(self) -> tuple[MassEstimate, ...]:
+        """All masses of the map, the largest first; this estimate is of the one that is `reported`."""
+        from tactile_bayes.report.masses_document import patient_mm
+
+        found, tactile_map = self.outcome.estimate, self.outcome.tactile_map
+        return tuple(
+            MassEstimate(
+                number,
+                mass,
+                patient_mm(tactile_map, mass.x_mm, mass.y_mm),
+                self.probability,
+                "" if mass.estimate.size is not None else found.reason if mass.reported else mass.estimate.reason,
+            )
+            for number, mass in enumerate(found.masses, start=1)
+        )
+
     def _of_shape(self, name: str) -> Draws | None:
         found = self.outcome.estimate
         if found.map_posterior is None or found.draws is None:
@@ -249,7 +177,7 @@ class SizeEstimate(_Sized):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PooledSize(_Sized):
+class PooledSize(Sized):
     """One size from several maps of one mass.
 
     Parameters

@@ -146,7 +146,7 @@ def estimate_one(
     from tactile_bayes.mapping.fine_cells import many_cells
     from tactile_bayes.posterior.drawn import fitting_calibration
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
-    from tactile_bayes.posterior.other_rises import other_rises
+    from tactile_bayes.posterior.masses import with_masses
     from tactile_bayes.report.population_text import calibration_line
     from tactile_bayes.report.site_text import site_words
     from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
@@ -166,10 +166,15 @@ def estimate_one(
 
         context = digests.get("size_calibration", "no calibration")
         options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
-    # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history
-    rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
-    estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
-    estimate = replace(estimate, other_rises=other_rises(tactile_map, estimate, options))
+
+    # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history,
+    # and a mass has the numbers that its place alone would give
+    def estimated(a_map: TactileMap, given: EstimateOptions) -> Estimate:
+        rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
+        told = progress if given is options else None
+        return estimate_map(a_map, calibration=calibration, options=given, rng=rng, progress=told)
+
+    estimate = with_masses(tactile_map, estimated(tactile_map, options), options, estimated)
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     posterior = estimate.map_posterior
@@ -338,10 +343,11 @@ def size_priors(settings: Settings) -> SizePriors:
 def answer_of(outcome: Outcome) -> Answer:
     """Report of an outcome as JSON and text."""
     from tactile_bayes.posterior.lump.bump import BumpPrior
-    from tactile_bayes.report.estimate_document import estimate_document, estimate_quantities
+    from tactile_bayes.report.estimate_document import estimate_document
     from tactile_bayes.report.estimate_summary import estimate_summary
     from tactile_bayes.report.estimate_text import estimate_text
     from tactile_bayes.report.lump_place import lump_place
+    from tactile_bayes.report.quantities import estimate_quantities
 
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
     prior = BumpPrior(**(settings.prior or {}))
@@ -356,10 +362,9 @@ def answer_of(outcome: Outcome) -> Answer:
         quantities=quantities,
         place=place,
     )
-    text = estimate_summary(estimate, quantities, probability=settings.interval, place=place)
-    full_text = estimate_text(
-        estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities, place=place
-    )
+    told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
+    text = estimate_summary(estimate, quantities, **told)
+    full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
     return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)

@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.result import Estimate
-    from tactile_bayes.report.map_figure import FitContour
+    from tactile_bayes.posterior.result import Estimate, Mass
+    from tactile_bayes.report.map_figure import FitContour, NumberedMass
     from tactile_bayes.size.posterior import SizePosterior
 
 
@@ -79,6 +79,7 @@ def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
         tactile_map,
         path,
         fit=_contour(estimate),
+        masses=[_numbered(number, mass) for number, mass in enumerate(estimate.masses, start=1)],
         looked_at=places,
         title=f"Tactile map: {name}",
         note=note,
@@ -99,3 +100,13 @@ def _contour(estimate: Estimate) -> FitContour | None:
     x, y, sigma_x, sigma_y, angle, level, amplitude = (float(np.median(getattr(found, name))) for name in names)
     sizes = None if size is None else (float(np.nanmedian(size.d_x_mm)), float(np.nanmedian(size.d_y_mm)))
     return FitContour((x, y), sigma_x, sigma_y, float(np.degrees(angle)), sizes, level, amplitude)
+
+
+def _numbered(number: int, mass: Mass) -> NumberedMass:
+    """A mass for the picture, its size at the medians."""
+    from tactile_bayes.report.map_figure import NumberedMass
+
+    contour = _contour(mass.estimate)
+    if contour is None:
+        return NumberedMass(number, (mass.x_mm, mass.y_mm))
+    return NumberedMass(number, contour.centre_mm, contour.size_mm, contour.angle_deg)

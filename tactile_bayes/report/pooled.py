@@ -9,9 +9,9 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
+from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.site_text import site_words
 from tactile_bayes.report.size_text import (
     SIZE_DECIMALS,
