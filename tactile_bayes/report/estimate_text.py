@@ -70,8 +70,7 @@ def estimate_text(
 ) -> str:
     """Full report of one map: findings with intervals, sources of uncertainty, omissions.
 
-    `quantities` and `masses` (see `masses_document`) where they are at hand, `place` where the lump's about the nipple is
-    known.
+    `quantities`, `masses` (see `masses_document`) and the lump's `place` about the nipple where they are at hand.
     """
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)

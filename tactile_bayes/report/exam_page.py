@@ -131,7 +131,7 @@ def _findings(exam: Exam) -> Iterator[str]:
         yield from _paragraphs(list(nothing_sentences(exam)))
         yield from (f'<p class="small">{html.escape(_cut(text))}</p>' for text in [detail_sentence(exam)] if text)
     else:
-        yield "<h2>Size</h2>"
+        yield f"<h2>Size{_of_mass(exam)}</h2>"
         yield size_ruler(_intervals(exam, size))
         yield from _paragraphs(list(size_sentences(exam)))
     narrowing = narrowing_sentences(exam)
@@ -140,12 +140,18 @@ def _findings(exam: Exam) -> Iterator[str]:
         yield from _paragraphs(narrowing)
 
 
+def _of_mass(exam: Exam) -> str:
+    """Which of several masses a section is about."""
+    masses = exam.main.masses
+    return f" of mass {masses[0].number}" if len(masses) > 1 else ""
+
+
 def _place(exam: Exam) -> Iterator[str]:
     """Where the lump lies, beside a clock face of the breast."""
     if not exam.main.masses:
         return
     mass, size = exam.main.masses[0], largest(exam)
-    yield f'<h2>Place</h2><div class="place">{breast_dial(exam.main.masses)}<div>'
+    yield f'<h2>Place{_of_mass(exam)}</h2><div class="place">{breast_dial(exam.main.masses)}<div>'
     yield from _paragraphs([place_sentence(mass, INTERVAL if size is None else size["probability"])])
     if mass.probability is not None:
         yield from _paragraphs([f"Probability that it is a lump, by this map: {_chance(mass.probability)}."])
@@ -171,7 +177,7 @@ def _several_masses(exam: Exam) -> Iterator[str]:
     if len(masses) < 2:
         return
     yield '<h2>All masses on the map</h2><table class="masses">'
-    yield "<tr><th>No.</th><th>Largest diameter</th><th>Place</th></tr>"
+    yield "<tr><th>No.</th><th>Largest diameter (interval)</th><th>Place</th></tr>"
     for mass in masses[:MOST_MASSES]:
         cells = "".join(f"<td>{html.escape(_cut(text, 200))}</td>" for text in mass_row(mass, INTERVAL))
         yield f"<tr>{cells}</tr>"

@@ -136,11 +136,12 @@ def colour_bar(exam: ExamMap) -> str:
     )
     words = html.escape(exam.tactile_map.recipe.value_words)
     return (
-        '<svg class="bar" role="img" aria-label="Colours of the map" viewBox="0 0 108 6" width="108mm" height="6mm">'
+        '<svg class="bar" role="img" aria-label="Colours of the map" viewBox="0 0 80 8.5" width="80mm" height="8.5mm">'
         f'<defs><linearGradient id="colours">{stops}</linearGradient></defs>'
-        f'<rect x="12" y="0.5" width="34" height="3" fill="url(#colours)" stroke="#333" stroke-width="0.15"/>'
-        f'<text x="11" y="3.2" text-anchor="end" font-size="3">{_value(low)}</text>'
-        f'<text x="47" y="3.2" font-size="3">{_value(high)}{more}  {words}</text></svg>'
+        f'<rect x="14" y="0.5" width="40" height="3" fill="url(#colours)" stroke="#333" stroke-width="0.15"/>'
+        f'<text x="13" y="3.2" text-anchor="end" font-size="3">{_value(low)}</text>'
+        f'<text x="55" y="3.2" font-size="3">{_value(high)}{more}</text>'
+        f'<text x="14" y="7.4" font-size="3">{words}</text></svg>'
     )
 
 

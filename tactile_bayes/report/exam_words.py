@@ -30,12 +30,12 @@ _LEFT_OUT: Final = (
 def headline(exam: Exam) -> str:
     """The finding in a few words."""
     size, masses = largest(exam), exam.main.masses
-    others = f" ({len(masses)} masses on the map)" if len(masses) > 1 else ""
     if size is not None:
+        what = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
         interval = f"{_percent(size)} interval {size['low']:.1f} to {size['high']:.1f} mm"
-        return f"Lump of about {size['median']:.1f} mm, {interval}{others}"
+        return f"{what} about {size['median']:.1f} mm, {interval}"
     if masses:
-        return f"Lump seen, no size{others}"
+        return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
     return "No lump found in the area covered" if exam.main.document["reason_code"] in UNDETECTED else "No size"
 
 
