@@ -143,13 +143,34 @@ class SizeEstimate(Sized):
         size = self.outcome.estimate.size
         if size is None:
             return self.plot_map(path, force=force)
-        return draw_size(size, path_of(path), name=self.name, probability=self.probability, force=force)
+        return draw_size(size, path_of(path), name=self._titled, probability=self.probability, force=force)
 
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
         from tactile_bayes.report.estimate_figures import draw_map
 
-        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self.name, force=force)
+        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
+
+    def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw data, fit and residual of the fit window side by side; without an estimate the map.
+
+        Parameters
+        ----------
+        path
+            Also write it there, as PNG, PDF or SVG.
+        """
+        from tactile_bayes.report.estimate_figures import draw_fit
+
+        if self.status != "estimate":
+            return self.plot_map(path, force=force)
+        return draw_fit(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
+
+    @property
+    def _titled(self) -> str:
+        """Name for the titles of figures, with the subject's code and the scan's digest."""
+        from tactile_bayes.report.figure_title import named_exam
+
+        return named_exam(self.name, self.outcome.provenance.scans)
 
     def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
         """Write one page of the exam as HTML, as ``tactile-bayes report`` does.

@@ -56,10 +56,7 @@ def test_the_json_of_an_estimate_gives_the_same_page_without_estimating(
 ) -> None:
     assert run_here("report", "a.nc", "-o", "alone.html", cwd=folder).returncode == 0
 
-    def none(*words: object, **options: object) -> None:
-        raise AssertionError("estimated")
-
-    monkeypatch.setattr("tactile_bayes.pipeline.exam_report.estimate_one", none)
+    monkeypatch.setattr("tactile_bayes.pipeline.exam_report.estimate_one", None)
     done = run_here("report", "a.json", "a.nc", "-o", "both.html", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert (folder / "both.html").read_bytes() == (folder / "alone.html").read_bytes()
@@ -109,8 +106,8 @@ def test_what_makes_no_page_is_one_clear_line(folder: Path, words: tuple[str, ..
 
 
 def test_without_a_printer_pdf_is_refused_before_any_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(printed.shutil, "which", lambda name: None)
-    monkeypatch.setattr(printed, "find_spec", lambda name: None)
+    monkeypatch.setattr(printed.shutil, "which", lambda _: None)
+    monkeypatch.setattr(printed, "find_spec", lambda _: None)
     done = run_here("report", "a.nc", "-o", "no.html", "--pdf", "no.pdf", cwd=folder)
     assert done.returncode == 2
     assert "--pdf needs Chromium or WeasyPrint and finds neither; install Chromium or `pip install" in done.stderr

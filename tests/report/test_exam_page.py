@@ -174,7 +174,8 @@ def test_a_lump_at_the_upper_outer_left_is_drawn_at_the_upper_right_and_told_so(
     row, column = np.unravel_index(np.nanargmax(tactile_map.mean), tactile_map.mean.shape)
     x, y = float(tactile_map.x_mm[column]), float(tactile_map.y_mm[row])
     placed = {**document, "centre_mm": {"x": {"median": x, "sd": 0.1}, "y": {"median": y, "sd": 0.1}}}
-    page = Page(exam_page(Exam((exam_map(tactile_map, placed, side="left"),), None, SCANS)))
+    text = exam_page(Exam((exam_map(tactile_map, placed, side="left"),), None, SCANS))
+    page = Page(text)
     (drawn,) = page.named("svg", **{"class": "map"})
     width, height = (float(n) for n in drawn["viewbox"].split()[2:])
     across, down = centre_of(page.named("path", **{"class": "size"})[0]["d"])
@@ -182,7 +183,7 @@ def test_a_lump_at_the_upper_outer_left_is_drawn_at_the_upper_right_and_told_so(
     assert down < 0.45 * (height - 10)
     corner = {one["data-side"]: one for one in page.named("text", **{"class": "edge"})}
     assert float(corner["right"]["x"]) > float(corner["left"]["x"])
-    letters = re.findall(r'data-side="(\w+)"[^>]*>(\w)<', exam_page(Exam((exam_map(tactile_map, placed, side="left"),))))
+    letters = re.findall(r'data-side="(\w+)"[^>]*>(\w)<', text)
     assert dict(letters) == {"left": "R", "right": "L", "top": "H", "bottom": "F"}
     assert _brightest(page) == ("upper", "right")
     assert "Left breast, 1:30 o'clock, 13 mm from the nipple (upper outer)" in page.words
@@ -276,7 +277,7 @@ def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() ->
 
 def test_a_nipple_off_the_map_is_pointed_to() -> None:
     tactile_map, document = demo()
-    far = replace(tactile_map, nipple_mm=tactile_map.nipple_mm + [200.0, 0.0, 0.0])
+    far = replace(tactile_map, nipple_mm=tactile_map.nipple_mm + np.array([200.0, 0.0, 0.0]))
     page = Page(exam_page(Exam((exam_map(far, document, side="left"),), None, SCANS)))
     assert len(page.named("path", **{"class": "nipple-off"})) == 1
     assert page.named("path", **{"class": "nipple"}) == []
