@@ -32,6 +32,8 @@ _AMPLITUDES_SHOWN: Final = 1.25
 _POINTS: Final = 72
 _SCALE_BARS_MM: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0)
 _LEAST_BAR_MM: Final = 8.0
+_BAR_MM: Final = 40.0
+_BAR_STEPS: Final = 40
 _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
 
 
@@ -130,15 +132,16 @@ def colour_bar(exam: ExamMap) -> str:
     low, high = colour_limits(exam)
     covered = exam.tactile_map.covered
     more = " or more" if covered.any() and float(exam.tactile_map.mean[covered].max()) > high else ""
-    stops = "".join(
-        f'<stop offset="{i / (len(COLOURS) - 1):g}" stop-color="#{"".join(f"{part:02x}" for part in colour)}"/>'
-        for i, colour in enumerate(COLOURS)
+    steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0))[0]
+    width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
+    boxes = "".join(
+        f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
+        for i, colour in enumerate(steps)
     )
     words = html.escape(exam.tactile_map.recipe.value_words)
     return (
         '<svg class="bar" role="img" aria-label="Colours of the map" viewBox="0 0 80 8.5" width="80mm" height="8.5mm">'
-        f'<defs><linearGradient id="colours">{stops}</linearGradient></defs>'
-        f'<rect x="14" y="0.5" width="40" height="3" fill="url(#colours)" stroke="#333" stroke-width="0.15"/>'
+        f'{boxes}<rect x="14" y="0.5" width="{_BAR_MM:g}" height="3" fill="none" stroke="#333" stroke-width="0.15"/>'
         f'<text x="13" y="3.2" text-anchor="end" font-size="3">{_value(low)}</text>'
         f'<text x="55" y="3.2" font-size="3">{_value(high)}{more}</text>'
         f'<text x="14" y="7.4" font-size="3">{words}</text></svg>'
@@ -240,10 +243,10 @@ def _stroked(path: str, width: float, *, kind: str, dash: str = "") -> str:
 
 def _text(x: float, y: float, text: str, *, size: float, anchor: str = "middle") -> str:
     """White text with a black edge."""
-    return (
-        f'<text x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size:g}" font-weight="600" fill="#fff" '
-        f'stroke="#000" stroke-width="{0.2 * size:g}" paint-order="stroke">{html.escape(text)}</text>'
-    )
+    place = f'x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size:g}" font-weight="600"'
+    words = html.escape(text)
+    under = f'<text {place} fill="none" stroke="#000" stroke-width="{0.2 * size:g}" aria-hidden="true">{words}</text>'
+    return f'{under}<text {place} fill="#fff">{words}</text>'
 
 
 def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
