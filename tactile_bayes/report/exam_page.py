@@ -29,11 +29,14 @@ from tactile_bayes.report.exam_words import (
 )
 
 TITLE: Final = "Tactile exam"
-MOST_REPEATS: Final = 6
-MOST_MASSES: Final = 6
+MOST_REPEATS: Final = 5
+MOST_MASSES: Final = 4
 _LONGEST: Final = 400
+_LONGEST_CAUTION: Final = 200
 _PICTURE_MM: Final = (108.0, 96.0)
-_REPEAT_MM: Final = 30.0
+_LOWER_MM: Final = 57.0
+"""Height of the picture on a crowded page: one that has both repeats and several masses below it."""
+_REPEAT_MM: Final = (30.0, 19.0)
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _STYLE: Final = """
 @page{size:A4 portrait;margin:10mm}
@@ -50,11 +53,13 @@ margin:.4rem 0 .3rem}.place{display:flex;flex-wrap:wrap;gap:0 1rem;align-items:c
 .picture{text-align:center}.picture svg.map{max-width:100%;height:auto}.small{font-size:.8rem;color:#333}
 table{border-collapse:collapse;width:100%;font-size:.87rem}th{text-align:left;font-weight:600;padding-right:.7rem;
 vertical-align:top;white-space:nowrap}td,th{border-bottom:1px solid #ddd;padding-top:.08rem;padding-bottom:.08rem}
-.masses td{padding-right:.7rem;vertical-align:top}
+.masses td{padding-right:.7rem;vertical-align:top}.masses td:last-child{width:42%}
 .repeats{display:flex;flex-wrap:wrap;gap:.4rem .8rem}.repeats figure{margin:0;font-size:.8rem;text-align:center}
 .ruler,.bar,.dial{max-width:100%}svg text{font-family:system-ui,"Liberation Sans",Arial,sans-serif}
 svg image{image-rendering:pixelated}
 @media print{html{font-size:9.2pt}body{font-size:1rem;line-height:1.28;margin:0;padding:0;max-width:none}
+.crowded{font-size:.85rem;line-height:1.2}.crowded h2{margin:.25rem 0 .05rem}.crowded p{margin:.1rem 0}
+.crowded .dial{height:27mm}.crowded .small{font-size:.72rem}
 .columns{flex-wrap:nowrap;gap:0 4mm}.columns>div.figure{flex:0 0 108mm}h2{margin:.45rem 0 .1rem}
 .caution,.mark{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
 """
@@ -62,18 +67,19 @@ svg image{image-rendering:pixelated}
 
 def exam_page(exam: Exam) -> str:
     """Full HTML page of an exam; equal exams give equal text."""
-    title = _cut(exam.title, 120) or TITLE
+    title = _cut(exam.title, 80) or TITLE
     parts = [
         "<!doctype html>",
         '<html lang="en"><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>",
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>",
+        '<body class="crowded">' if _crowded(exam) else "<body>",
         f"<h1>{html.escape(title)}</h1>",
         *_facts(exam),
         f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
         f'<p class="finding">{html.escape(headline(exam))}</p>',
-        *_paragraphs(caution_sentences(exam), kind="caution"),
+        *_paragraphs([_cut(text, _LONGEST_CAUTION) for text in caution_sentences(exam)], kind="caution"),
         '<div class="columns"><div class="figure">',
         *_picture(exam),
         *_place(exam),
@@ -102,15 +108,20 @@ def _paragraphs(sentences: list[str], *, kind: str = "") -> Iterator[str]:
 
 
 def _facts(exam: Exam) -> Iterator[str]:
-    found = [f"<span><b>{name}</b> {html.escape(_cut(text, 80))}</span>" for name, text in facts(exam)]
+    found = [f"<span><b>{name}</b> {html.escape(_cut(text, 60))}</span>" for name, text in facts(exam)]
     if found:
         yield f'<p class="facts">{"".join(found)}</p>'
+
+
+def _crowded(exam: Exam) -> bool:
+    return len(exam.maps) > 1 and len(exam.main.masses) > 1
 
 
 def _picture(exam: Exam) -> Iterator[str]:
     """The map, as large as it is where the page has room, with its colours and what the lines are."""
     tactile_map = exam.main.tactile_map
-    frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=_PICTURE_MM[1])
+    height_mm = _LOWER_MM if _crowded(exam) else _PICTURE_MM[1]
+    frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
     yield f'<div class="picture">{exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")}</div>'
     yield colour_bar(exam.main)
     lines = ["Full line: the estimated size; dashed: the ends of its interval."] if largest(exam) is not None else []
@@ -179,7 +190,7 @@ def _several_masses(exam: Exam) -> Iterator[str]:
     yield '<h2>All masses on the map</h2><table class="masses">'
     yield "<tr><th>No.</th><th>Largest diameter (interval)</th><th>Place</th></tr>"
     for mass in masses[:MOST_MASSES]:
-        cells = "".join(f"<td>{html.escape(_cut(text, 200))}</td>" for text in mass_row(mass, INTERVAL))
+        cells = "".join(f"<td>{html.escape(_cut(text, 62))}</td>" for text in mass_row(mass))
         yield f"<tr>{cells}</tr>"
     yield "</table>"
     if len(masses) > MOST_MASSES:
@@ -194,7 +205,7 @@ def _repeats(exam: Exam) -> Iterator[str]:
     yield f"<h2>The {len(exam.maps)} maps of this mass</h2>"
     shown = exam.maps[:MOST_REPEATS]
     yield '<div class="repeats">'
-    small = small_pictures(shown, width_mm=_REPEAT_MM)
+    small = small_pictures(shown, room_mm=_REPEAT_MM)
     for number, (one, picture) in enumerate(zip(shown, small, strict=True), start=1):
         size = one.document["max_size_mm"]
         alone = "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"

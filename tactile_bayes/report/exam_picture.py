@@ -117,9 +117,10 @@ def exam_picture(exam: ExamMap, frame: Frame, *, label: str, small: bool = False
     return "".join(parts)
 
 
-def small_pictures(maps: Sequence[ExamMap], *, width_mm: float) -> list[str]:
-    """Small pictures of repeat maps, all to the scale of the widest of them."""
-    scale = min(1.0, *(width_mm / Frame(one.tactile_map, 1.0).size_mm[0] for one in maps))
+def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> list[str]:
+    """Small pictures of repeat maps, all to one scale, by which each has room in a width and a height."""
+    sizes = [Frame(one.tactile_map, 1.0).size_mm for one in maps]
+    scale = min(1.0, *(room / size for one in sizes for room, size in zip(room_mm, one, strict=True)))
     frames = [Frame(one.tactile_map, scale) for one in maps]
     return [
         exam_picture(one, frame, label=f"Repeat map {number}", small=True)

@@ -17,7 +17,7 @@ from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
 
 UNDETECTED: Final = ("undetected", "empty")
-MOST_CAUTIONS: Final = 3
+MOST_CAUTIONS: Final = 2
 _OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
@@ -103,11 +103,17 @@ def place_sentence(mass: ExamMass, probability: float) -> str:
     if mass.place is not None:
         hours, (near, far) = mass.place.hours_between(probability), mass.place.distance_between(probability)
         clock = "" if hours is None else f"{clock_text(hours[0])} to {clock_text(hours[1])} o'clock, "
-        return f"{_capital(mass.place.text())}; {100 * probability:g} %: {clock}{near:.0f} to {far:.0f} mm."
+        return f"{short_place(mass)}; {100 * probability:g} %: {clock}{near:.0f} to {far:.0f} mm."
+    return f"{short_place(mass)}{'' if mass.patient_mm is not None else '; the scan names no landmarks'}."
+
+
+def short_place(mass: ExamMass) -> str:
+    """Where a mass lies, without intervals."""
+    if mass.place is not None:
+        return _capital(mass.place.text())
     if mass.patient_mm is not None:
-        return f"{_capital(_from_xiphoid(*mass.patient_mm))}."
-    x, y = mass.centre_mm
-    return f"At ({x:.0f}, {y:.0f}) mm on the map; the scan names no landmarks."
+        return _capital(_from_xiphoid(*mass.patient_mm))
+    return "At ({:.0f}, {:.0f}) mm on the map".format(*mass.centre_mm)
 
 
 def why_no_clock(exam: Exam) -> str:
@@ -236,14 +242,14 @@ def _age(exam: Exam) -> str:
     return f"{max(known)} day{'s' if max(known) != 1 else ''} old at the exam"
 
 
-def mass_row(mass: ExamMass, probability: float) -> tuple[str, str, str]:
+def mass_row(mass: ExamMass) -> tuple[str, str, str]:
     """Number, size with its interval, and place of a mass, for a table of several."""
     if mass.largest is None:
-        why = NOT_SIZED if mass.why == NOT_SIZED else f"no size: {mass.why}"
-        size = f"{why} (probability of a lump {mass.probability:.2f})" if mass.probability is not None else why
+        chance = "" if mass.probability is None else f" (probability of a lump {mass.probability:.2f})"
+        size = NOT_SIZED + chance if mass.why == NOT_SIZED else f"no size{chance}: {mass.why}"
     else:
         size = f"{mass.largest['median']:.1f} mm ({mass.largest['low']:.1f} to {mass.largest['high']:.1f})"
-    return str(mass.number), size, place_sentence(mass, probability)
+    return str(mass.number), size, short_place(mass)
 
 
 def facts(exam: Exam) -> Iterator[tuple[str, str]]:
@@ -254,7 +260,8 @@ def facts(exam: Exam) -> Iterator[tuple[str, str]]:
                        ("posture", "Posture"), ("examiner", "Examiner")):  # fmt: skip
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
-            yield words, ", ".join(value[:40] for value in values[:4])
+            more = f" and {len(values) - 2} more" if len(values) > 2 else ""
+            yield words, ", ".join(value[:24] for value in values[:2]) + more
     if exam.day:
         yield "Date", exam.day
 

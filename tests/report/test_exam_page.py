@@ -263,7 +263,7 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
     page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
     assert "2 masses, mass 1 about" in page.words
     assert "Size of mass 1" in page.words
-    assert "no size: its window reaches beyond the map (probability of a lump 0.99)" in page.words
+    assert "no size (probability of a lump 0.99): its window reaches beyond the map" in page.words
     assert len(page.named("path", **{"class": "centre"})) == 2
 
 
@@ -300,9 +300,39 @@ def test_a_page_from_python_is_the_same_and_private(tmp_path: Path) -> None:
         found.report(tmp_path / "a.html")
 
 
+def full() -> Exam:
+    """As much as a page can hold: repeats, masses, cautions, long texts, a tall map."""
+    tactile_map, document = demo()
+    mass = {
+        "number": 2,
+        "reported": False,
+        "centre_mm": {"x": 15.0, "y": 8.0},
+        "centre_patient_mm": None,
+        "detected_probability": 0.99,
+        "amplitude": None,
+        "max_size_mm": None,
+        "min_size_mm": None,
+        "another_exam": None,
+        "reason": "a reason that is long " * 20,
+        "reason_code": "window",
+        "advice": "",
+    }
+    masses = [{**mass, "number": 1, "reported": True}, *({**mass, "number": n} for n in range(2, 12))]
+    diagnostics = {**document["diagnostics"], "broken_assumptions": [f"caution {n} " * 80 for n in range(9)]}
+    told = {**document, "masses": masses, "diagnostics": diagnostics}
+    tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
+    size = {name: document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
+    pooled = {**size, "reason": "", "figures": document["diagnostics"], "fat_apart_mm": [5.0, 20.0]}
+    pooled["maps"] = [{"map": f"map {n}", "outlying": True} for n in range(12)]
+    facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
+    scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
+    maps = (exam_map(tall, told, side="left"),) * 12
+    return Exam(maps, pooled, scans, title="W" * 120, name="W" * 80, day="2026-03-01")
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, BROWSERS)), reason="no Chromium is installed")
-@pytest.mark.parametrize("made", [exam, without_lump])
+@pytest.mark.parametrize("made", [exam, without_lump, full])
 def test_a_page_prints_to_one_side_and_to_the_same_bytes(made: Any) -> None:
     page = exam_page(made())
     first, second = (find_printer()(page) for _ in range(2))
