@@ -14,7 +14,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 
 _FILE = FilePath()
-_LONGEST = {"title": 80, "name": 60}
+_LONGEST = {"title": 60, "name": 50}
 
 
 def _one_line(ctx: click.Context, param: click.Parameter, value: str | None) -> str:

@@ -16,7 +16,7 @@ SIDES: Final = ("left", "right")
 NIPPLE_SD_MM: Final = 3.0
 """SD of a touched nipple along each axis where repeats lie no further apart: assumed, not measured (record 0117)."""
 LEAST_KNOWN_HOURS: Final = 1.5
-"""A direction whose interval of 95 % reaches so far either way, out of its quadrant, is none: behind the nipple."""
+"""A direction whose interval of 95 % reaches so far either way (45 degrees) is none: behind the nipple."""
 _KNOWN: Final = 0.95
 _ON_AXIS_DEG: Final = 15.0
 _DEGREES_PER_HOUR: Final = 30.0

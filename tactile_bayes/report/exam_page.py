@@ -34,7 +34,7 @@ MOST_MASSES: Final = 4
 _LONGEST: Final = 400
 _LONGEST_CAUTION: Final = 200
 _PICTURE_MM: Final = (108.0, 96.0)
-_LOWER_MM: Final = 57.0
+_LOWER_MM: Final = 54.0
 """Height of the picture on a crowded page: one that has both repeats and several masses below it."""
 _REPEAT_MM: Final = (30.0, 19.0)
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -67,7 +67,7 @@ svg image{image-rendering:pixelated}
 
 def exam_page(exam: Exam) -> str:
     """Full HTML page of an exam; equal exams give equal text."""
-    title = _cut(exam.title, 80) or TITLE
+    title = _cut(exam.title, 60) or TITLE
     parts = [
         "<!doctype html>",
         '<html lang="en"><head><meta charset="utf-8">',
@@ -108,7 +108,7 @@ def _paragraphs(sentences: list[str], *, kind: str = "") -> Iterator[str]:
 
 
 def _facts(exam: Exam) -> Iterator[str]:
-    found = [f"<span><b>{name}</b> {html.escape(_cut(text, 60))}</span>" for name, text in facts(exam)]
+    found = [f"<span><b>{name}</b> {html.escape(_cut(text, 50))}</span>" for name, text in facts(exam)]
     if found:
         yield f'<p class="facts">{"".join(found)}</p>'
 
@@ -190,7 +190,8 @@ def _several_masses(exam: Exam) -> Iterator[str]:
     yield '<h2>All masses on the map</h2><table class="masses">'
     yield "<tr><th>No.</th><th>Largest diameter (interval)</th><th>Place</th></tr>"
     for mass in masses[:MOST_MASSES]:
-        cells = "".join(f"<td>{html.escape(_cut(text, 62))}</td>" for text in mass_row(mass))
+        longest = 62 if _crowded(exam) else 160
+        cells = "".join(f"<td>{html.escape(_cut(text, longest))}</td>" for text in mass_row(mass))
         yield f"<tr>{cells}</tr>"
     yield "</table>"
     if len(masses) > MOST_MASSES:
