@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -143,13 +143,46 @@ class SizeEstimate(Sized):
         size = self.outcome.estimate.size
         if size is None:
             return self.plot_map(path, force=force)
-        return draw_size(size, path_of(path), name=self.name, probability=self.probability, force=force)
+        return draw_size(size, path_of(path), name=self._titled, probability=self.probability, force=force)
 
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
         from tactile_bayes.report.estimate_figures import draw_map
 
-        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self.name, force=force)
+        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
+
+    def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw data, fit and residual of the fit window side by side; without an estimate the map.
+
+        Parameters
+        ----------
+        path
+            Also write it there, as PNG, PDF or SVG.
+        """
+        from tactile_bayes.report.estimate_figures import draw_fit
+
+        if self.status != "estimate":
+            return self.plot_map(path, force=force)
+        return draw_fit(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
+
+    @property
+    def _titled(self) -> str:
+        """Name for the titles of figures, with the subject's code and the scan's digest."""
+        from tactile_bayes.report.figure_title import named_exam
+
+        return named_exam(self.name, self.outcome.provenance.scans)
+
+    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
+        """Write one page of the exam as HTML, as ``tactile-bayes report`` does.
+
+        Parameters
+        ----------
+        path
+            Usually ``*.html``.
+        title, name, day
+            To print on the page; nothing is where they are not given.
+        """
+        _write_report((self,), path_of(path), self.outcome.settings, (title, name, day), force=force)
 
     def save(self, path: PathLike, *, force: bool = False) -> None:
         """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
@@ -182,6 +215,7 @@ class PooledSize(Sized):
     maps: tuple[SizeEstimate, ...]
     probability: float
     name: str = field(default="")
+    settings: Settings = field(default_factory=Settings)
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -196,6 +230,10 @@ class PooledSize(Sized):
     def document(self) -> dict[str, Any]:
         """What ``estimate --pool --json`` prints."""
         return self.outcome.document
+
+    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
+        """Write one page of the exam as HTML, with the repeat maps; see `SizeEstimate.report`."""
+        _write_report(self.maps, path_of(path), self.settings, (title, name, day), force=force)
 
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the posterior of the size; with a path also write it.
@@ -212,6 +250,17 @@ class PooledSize(Sized):
             raise UsageError(f"there is no size to draw: {self.why}")
         name = self.name or f"{len(self.maps)} maps pooled"
         return draw_size(size, path_of(path), name=name, probability=self.probability, force=force)
+
+
+def _write_report(
+    maps: Sequence[SizeEstimate], path: Path, settings: Settings, words: tuple[str, str, str], *, force: bool
+) -> None:
+    from tactile_bayes.files.atomic import write_text
+    from tactile_bayes.pipeline.exam_report import EstimatedMap, Given, make_exam
+    from tactile_bayes.report.exam_page import exam_page
+
+    found = [EstimatedMap(one.outcome.tactile_map, one.answer, one.outcome.provenance.scans) for one in maps]
+    write_text(path, exam_page(make_exam(found, settings, Given(*words))), force=force)
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -315,7 +364,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
         raise UsageError("a map is given twice; give each map once")
     names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
     outcome = pool_answers([one.answer for one in found], used, names=names, inputs={})
-    return PooledSize(outcome, found, used.interval)
+    return PooledSize(outcome, found, used.interval, settings=used)
 
 
 def _several(maps: Iterable[Any]) -> list[Any]:

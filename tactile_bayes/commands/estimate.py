@@ -63,6 +63,12 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="Draw the map with the lump's size, or with the places looked at.",
 )
 @click.option(
+    "--fit-figure",
+    metavar=METAVAR,
+    type=FigurePath(),
+    help="Draw data, fit and residual of the fit window, or the map where there is no estimate.",
+)
+@click.option(
     "--centre-mm",
     type=(FiniteRange(), FiniteRange()),
     metavar="X Y",
@@ -122,6 +128,7 @@ def command(
     as_json: bool,
     figure: Path | None,
     map_figure: Path | None,
+    fit_figure: Path | None,
     centre_mm: tuple[float, float] | None,
     accuracy_sd: float | None,
     scene: str,
@@ -159,20 +166,20 @@ def command(
         raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")
     if figure is not None and size_calibration == "none":
         raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
-    outputs = {"output": output, "figure": figure, "map figure": map_figure}
+    outputs = {"output": output, "figure": figure, "map figure": map_figure, "fit figure": fit_figure}
     _check_outputs([path for path in outputs.values() if path], maps, pool, force=force)
     also_read(_named(size_calibration))
     begun = time.perf_counter()
     if pool:
         from tactile_bayes.commands.estimate_pool import estimate_pool
 
-        if map_figure:
-            raise UsageError("--map-figure draws one map; leave out --pool")
+        if map_figure or fit_figure:
+            raise UsageError("--map-figure and --fit-figure draw one map; leave out --pool")
         answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
         printed = {"as_json": as_json, "verbose": verbose}
         ctx.exit(estimate_pool(maps, answers, settings, output, figure, **printed, force=force))
     if len(maps) == 1:
-        answers = [_one_map(maps[0], settings, output, figure, map_figure, force=force)]
+        answers = [_one_map(maps[0], settings, output, (figure, map_figure, fit_figure), force=force)]
     else:
         with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
@@ -205,8 +212,7 @@ def _one_map(
     path: Path,
     settings: Settings,
     output: Path | None,
-    figure: Path | None,
-    map_figure: Path | None,
+    figures: tuple[Path | None, Path | None, Path | None],
     *,
     force: bool,
 ) -> Answer:
@@ -219,12 +225,12 @@ def _one_map(
     tactile_map, estimate = outcome.tactile_map, outcome.estimate
     if output and estimate.status == "estimate":
         outcome.write(output, force=force)
-    if figure or map_figure:
+    if any(figures):
         from tactile_bayes.report.estimate_figures import draw_figures
+        from tactile_bayes.report.figure_title import named_exam
 
-        draw_figures(
-            tactile_map, estimate, figure, map_figure, name=path.stem, probability=settings.interval, force=force
-        )
+        name = named_exam(path.stem, outcome.provenance.scans)
+        draw_figures(tactile_map, estimate, *figures, name=name, probability=settings.interval, force=force)
     return answer_of(outcome)
 
 

@@ -104,6 +104,7 @@ def _map(path: Path) -> dict[str, Any]:
         "background": tactile_map.background,
         "frames": tactile_map.frame_count,
         "patient_frame": tactile_map.patient_from_plane is not None,
+        **({} if tactile_map.nipple_mm is None else {"nipple_mm": tactile_map.nipple_mm.tolist()}),
         "recipe": asdict(tactile_map.recipe),
         **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
         "quality": dict(tactile_map.quality),

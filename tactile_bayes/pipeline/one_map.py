@@ -346,11 +346,13 @@ def answer_of(outcome: Outcome) -> Answer:
     from tactile_bayes.report.estimate_document import estimate_document
     from tactile_bayes.report.estimate_summary import estimate_summary
     from tactile_bayes.report.estimate_text import estimate_text
+    from tactile_bayes.report.lump_place import lump_place
     from tactile_bayes.report.quantities import estimate_quantities
 
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
     prior = BumpPrior(**(settings.prior or {}))
     quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
+    place = lump_place(estimate.map_posterior, tactile_map, outcome.provenance.scans)
     document = estimate_document(
         estimate,
         tactile_map,
@@ -358,8 +360,9 @@ def answer_of(outcome: Outcome) -> Answer:
         prior=prior,
         provenance=outcome.provenance,
         quantities=quantities,
+        place=place,
     )
-    told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"]}
+    told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
     text = estimate_summary(estimate, quantities, **told)
     full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE

@@ -60,7 +60,7 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
     """
     if centre_mm is None:
         area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
-        return f"on the {area:.2g} cm2 that the map covers"
+        return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"
     half = tactile_map.recipe.cell_mm / 2.0
     ends = [(float(axis[0]) - half, float(axis[-1]) + half) for axis in (tactile_map.x_mm, tactile_map.y_mm)]
     if not all(low <= at <= high for at, (low, high) in zip(centre_mm, ends, strict=True)):

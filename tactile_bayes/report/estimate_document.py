@@ -8,6 +8,7 @@ from typing import Any
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.result import Estimate
@@ -28,6 +29,7 @@ def estimate_document(
     prior: BumpPrior,
     provenance: Provenance,
     quantities: Mapping[str, Quantity] | None = None,
+    place: ClockPosition | None = None,
 ) -> dict[str, Any]:
     """JSON object of one map, see data_schema/estimate.schema.json; `quantities` if already summarised."""
     if quantities is None:
@@ -51,6 +53,7 @@ def estimate_document(
         ANOTHER_EXAM: another_exam(estimate.size, quantities),
         "centre_mm": point("centre_mm"),
         "centre_patient_mm": point("centre_patient_mm"),
+        "position": None if place is None else place.as_dict(probability),
         "angle_deg": one("angle_deg"),
         "detected_probability": None if detection is None else _round(detection.probability),
         "variance_share": None if share is None else {k: _round(v) for k, v in share.items()},

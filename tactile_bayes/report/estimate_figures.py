@@ -19,16 +19,17 @@ def draw_figures(
     estimate: Estimate,
     figure: Path | None,
     map_figure: Path | None,
+    fit_figure: Path | None = None,
     *,
     name: str,
     probability: float,
     force: bool,
 ) -> None:
-    """Draw the requested figures. Without a size both show the map, the places looked at and the reason.
+    """Draw the requested figures. Without a size, or a fit, they show the map, the places looked at and the reason.
 
     Parameters
     ----------
-    figure, map_figure
+    figure, map_figure, fit_figure
         Where to; None draws nothing. A map without data cannot be drawn.
     name
         Of the map, for the titles.
@@ -38,8 +39,11 @@ def draw_figures(
     if figure is not None and estimate.size is not None:
         draw_size(estimate.size, figure, name=name, probability=probability, force=force)
         figure = None
+    if fit_figure is not None and estimate.draws is not None:
+        draw_fit(tactile_map, estimate, fit_figure, name=name, force=force)
+        fit_figure = None
     if tactile_map.covered.any():
-        for path in (figure, map_figure):
+        for path in (figure, map_figure, fit_figure):
             if path is not None:
                 draw_map(tactile_map, estimate, path, name=name, force=force)
 
@@ -63,6 +67,16 @@ def draw_size(size: SizePosterior, path: Path | None, *, name: str, probability:
         title=f"Size of the lump: {name}",
         force=force,
     )
+
+
+def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
+    """Draw data, fit and residual of the fit window side by side."""
+    from tactile_bayes.posterior.fitted import fitted_cells
+    from tactile_bayes.report.fit_figure import fit_figure
+
+    fitted = fitted_cells(estimate)
+    assert fitted is not None
+    return fit_figure(tactile_map, fitted, path, title=f"Fit: {name}", force=force)
 
 
 def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:

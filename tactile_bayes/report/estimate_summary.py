@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import (
@@ -35,6 +36,7 @@ def estimate_summary(
     *,
     probability: float,
     masses: Sequence[MassDocument] = (),
+    place: ClockPosition | None = None,
 ) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
@@ -46,24 +48,30 @@ def estimate_summary(
         Of the intervals.
     masses
         As `masses_document` gives them.
+    place
+        Of the lump about the nipple, where it is known.
     """
     if estimate.status == "no_estimate":
         body = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
         body += _masses(masses, room=MOST_MASSES)
     else:
-        body = _something(estimate, quantities, probability, masses)
+        body = _something(estimate, quantities, probability, masses, place)
     return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
 
 
 def _something(
-    estimate: Estimate, quantities: Mapping[str, Quantity], probability: float, masses: Sequence[MassDocument]
+    estimate: Estimate,
+    quantities: Mapping[str, Quantity],
+    probability: float,
+    masses: Sequence[MassDocument],
+    place: ClockPosition | None,
 ) -> list[str]:
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
     lines = _cautions(estimate)
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
     table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
     lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
-    lines += _lump(estimate, quantities, numbered(masses))
+    lines += _lump(estimate, quantities, numbered(masses), place)
     after = [f"No size: {estimate.reason}.", *advice_lines(estimate)] if estimate.reason else []
     doubts = [text.rstrip(".") for text in warnings(estimate)]
     last = [*_quality(estimate, {name: quantities[name] for name in shown})]
@@ -84,12 +92,16 @@ def _cautions(estimate: Estimate) -> list[str]:
     return joined(texts, most=MOST_CAUTIONS, lead="CAUTION: ")
 
 
-def _lump(estimate: Estimate, quantities: Mapping[str, Quantity], number: str) -> list[str]:
+def _lump(
+    estimate: Estimate, quantities: Mapping[str, Quantity], number: str, place: ClockPosition | None
+) -> list[str]:
     """Probability of a lump, and its place; `number` says which of several masses it is."""
     parts = [] if estimate.detection is None else [f"Probability of a lump {estimate.detection.probability:.3f}"]
     if "amplitude" in quantities:
         parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
-    if "centre_patient_mm.x" in quantities:
+    if place is not None:
+        parts.append(place.text())
+    elif "centre_patient_mm.x" in quantities:
         x, y = (quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")
         parts.append(
             f"{abs(x):.0f} mm {'right' if x >= 0 else 'left'} of the xiphoid and "

@@ -6,11 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.lump_place import place_line
 from tactile_bayes.report.masses_document import MassDocument, mass_lines, masses_document, numbered, others
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.quantities import ANOTHER_EXAM, estimate_quantities
@@ -64,10 +66,11 @@ def estimate_text(
     prior: BumpPrior | None = None,
     quantities: Mapping[str, Quantity] | None = None,
     masses: Sequence[MassDocument] | None = None,
+    place: ClockPosition | None = None,
 ) -> str:
     """Full report of one map: findings with intervals, sources of uncertainty, omissions.
 
-    `quantities` and `masses` (see `masses_document`) where they are at hand.
+    `quantities`, `masses` (see `masses_document`) and the lump's `place` about the nipple where they are at hand.
     """
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
@@ -82,6 +85,7 @@ def estimate_text(
     lines = [*_cautions(estimate), *table, ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
+    lines += [] if place is None else [place_line(place, probability)]
     lines += [
         *_findings(estimate, quantities, masses),
         *_scene(estimate, masses),

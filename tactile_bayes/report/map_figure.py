@@ -167,6 +167,16 @@ def _draw_cells(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientat
     return axes.imshow(across, origin="lower", extent=_extent(tactile_map, view), interpolation="nearest", **how)
 
 
+def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, title: str, **how: Any) -> None:
+    """Draw cells in the map's orientation, with its sides and a colour bar; NaN stays grey."""
+    view = orientation_of(tactile_map)
+    image = _draw_cells(axes, np.ma.masked_invalid(values), tactile_map, view, **how)
+    _colour_bar(axes, image, label)
+    _orient(axes, view, tactile_map)
+    _draw_edges(axes, view)
+    axes.set_title(title, loc="left", fontsize=11)
+
+
 def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, fit: FitContour | None) -> None:
     """Draw the heat map."""
     lowest, highest = _colour_range(tactile_map)
