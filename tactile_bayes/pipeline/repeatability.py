@@ -101,7 +101,9 @@ def exams_in(folder: Path) -> list[ExamFolder]:
     return found
 
 
-def learn_from_exams(exams: Sequence[ExamFolder], *, size_calibration: str | None = None) -> LearnedRepeatability:
+def learn_from_exams(
+    exams: Sequence[ExamFolder], *, size_calibration: str | None = None, fewest: int | None = None
+) -> LearnedRepeatability:
     """Learn the spread between exams of one mass from those that were repeated within a visit.
 
     Parameters
@@ -110,6 +112,8 @@ def learn_from_exams(exams: Sequence[ExamFolder], *, size_calibration: str | Non
         Estimated ones; those without a size and those of a scan that another exam has are left out.
     size_calibration
         Name or path of the calibration that they were sized by, where it is in no file that the estimates name.
+    fewest
+        Masses with repeated exams that it takes. Default: `size.learn.repeatability.FEWEST_MASSES`.
 
     Raises
     ------
@@ -121,14 +125,14 @@ def learn_from_exams(exams: Sequence[ExamFolder], *, size_calibration: str | Non
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.files.repeatability_json import repeatability_document
     from tactile_bayes.files.size_parts_json import number
-    from tactile_bayes.size.learn.repeatability import PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
+    from tactile_bayes.size.learn.repeatability import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
 
     groups, left_out = _repeats(exams)
     one_by_one = [repeat for group in groups for repeat in group]
     name, digest = _calibration_named(one_by_one)
     calibration = _calibration(name, digest, size_calibration) if one_by_one else None
     masses = [] if calibration is None else [_repeated(group, calibration) for group in groups]
-    learned = learn_repeatability(masses)
+    learned = learn_repeatability(masses, fewest=fewest or FEWEST_MASSES)
     assert calibration is not None
     found = replace(
         learned.repeatability,

@@ -2,8 +2,8 @@ r"""Spread between exams of one mass, learned from the repeated exams of several
 
 Exam j of mass i gives :math:`g_{ij} = \mu_i + E_{ij} + e_{ij}`, with :math:`E_{ij} \sim N(0, \tau^2)` between exams
 and :math:`e_{ij} \sim N(0, v_{ij})` the map's own error. Nothing is supposed of :math:`\mu_i`: the mass's size, and all
-that its body does to every map of it, cancel. The restricted likelihood of tau is the product over masses of that of one
-mass, `between_maps.restricted_log_likelihood`.
+that its body does to every map of it, cancel. The restricted likelihood of tau is the product over masses of that of
+one mass, `between_maps.restricted_log_likelihood`.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class LearnedSpread:
     repeatability: Repeatability
 
 
-def learn_repeatability(repeats: Sequence[RepeatedExams]) -> LearnedSpread:
+def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWEST_MASSES) -> LearnedSpread:
     """Learn the spread between exams of one mass.
 
     Parameters
@@ -76,17 +76,19 @@ def learn_repeatability(repeats: Sequence[RepeatedExams]) -> LearnedSpread:
     repeats
         One for each mass and visit with two exams or more; those of one mass are left out together when its exams are
         compared with the others'.
+    fewest
+        Masses with repeated exams that it takes.
 
     Raises
     ------
     BadDataError
-        When fewer than `FEWEST_MASSES` masses have repeated exams.
+        When fewer masses have repeated exams.
     """
     repeats = [one for one in repeats if len(one.centre) > 1]
     masses = sorted({one.mass for one in repeats})
-    if len(masses) < FEWEST_MASSES:
-        what = f"{len(masses)} {'mass has' if len(masses) == 1 else 'masses have'} repeated exams"
-        raise BadDataError(what, way_out=f"give at least {FEWEST_MASSES}: {_WHY}")
+    if len(masses) < fewest:
+        what = f"{len(masses)} {'mass has' if len(masses) == 1 else 'masses have'} repeated exams with sizes"
+        raise BadDataError(what, way_out=f"give at least {fewest}: {_WHY}")
     by_exams = np.stack([restricted_log_likelihood(one.centre, one.noise, GRID) for one in repeats])
     density = _density(by_exams.sum(axis=0))
     by_chance = []
