@@ -1,10 +1,11 @@
 """A campaign: from a table of exams to maps, estimates and pooled sizes, step by step, resumable.
 
 Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...) and
-``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), repeatability.json where
-it was learned, with exams/EXAM/sized.json, the sizes by it, and the journal, which holds for each step its key, the digests of its files and how long it took. The key is the step, the exam or mass, and a
-digest of the program's version, the settings and the content of the inputs. A step whose key is in the journal and
-whose files are what it made is not run again.
+``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), repeatability.json
+where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the journal, which holds for each step its
+key, the digests of its files and how long it took. The key is the step, the exam or mass, and a digest of the program's
+version, the settings and the content of the inputs. A step whose key is in the journal and whose files are what it made
+is not run again.
 """
 
 from __future__ import annotations
