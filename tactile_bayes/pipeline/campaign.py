@@ -24,7 +24,13 @@ from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged
-from tactile_bayes.pipeline.campaign_repeatability import FEWEST_MASSES, NOT_LEARNED, exam_folders, repeated_masses
+from tactile_bayes.pipeline.campaign_repeatability import (
+    FEWEST_MASSES,
+    NOT_LEARNED,
+    exam_folders,
+    repeated_masses,
+    too_few,
+)
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, REPEATABILITY, SHAPE, Result, Task, run_step
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import DEFAULT_NORMALISE
@@ -269,8 +275,9 @@ class Campaign:
             return
         masses = repeated_masses(sound if self._dry else estimated)
         if masses < FEWEST_MASSES:
-            self.not_learned = f"{masses} of {FEWEST_MASSES} masses that it takes have repeats" if masses else ""
+            self.not_learned = too_few(masses) if masses else ""
             return
+        self._total += 1
         complete = not self._dry or len(estimated) == len(sound)
         self._stage("repeatability", [self._repeatability_task(estimated)] if complete else [], unknown=not complete)
         result = self.found.of("repeatability", SITE)

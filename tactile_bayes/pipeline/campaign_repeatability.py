@@ -47,6 +47,11 @@ def repeated_masses(exams: Sequence[Exam]) -> int:
     return len({of_mass[name] for (_, name), n in count.items() if n > 1})
 
 
+def too_few(masses: int) -> str:
+    """Why nothing is learned from so few masses with repeats."""
+    return f"{masses} {'mass has' if masses == 1 else 'masses have'} repeated exams, and it takes {FEWEST_MASSES}"
+
+
 def exam_folders(exams: Sequence[Exam], folder: Path) -> list[ExamFolder]:
     """Exams as `learn_from_exams` takes them; `folder` holds one folder for each."""
     return [ExamFolder(one.name, one.of_mass, f"{one.patient} {one.mass}", folder / one.name) for one in exams]
@@ -57,7 +62,7 @@ def learn_step(task: Task) -> tuple[Result, Writes]:
     try:
         learned = learn_from_exams(task.repeats, fewest=FEWEST_MASSES)
     except BadDataError as error:
-        return {NOT_LEARNED: error.what}, {}
+        return {NOT_LEARNED: f"{error.what}; {error.way_out}"}, {}
     return {}, {REPEATABILITY: lambda path: learned.write(path, force=True)}
 
 
