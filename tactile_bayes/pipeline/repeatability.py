@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from tactile_bayes.size.repeatability import Repeatability
 
 COMMAND: Final = "calibrate repeatability"
+_ESTIMATE, _SHAPE = "estimate.json", "shape.npz"
+_AGAIN: Final = "run the campaign again"
 _LEARN: Final = "learn one from exams that were sized so: `calibrate repeatability`; or leave --repeatability out"
 
 
@@ -58,18 +60,33 @@ class LearnedRepeatability:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Repeat:
-    """A repeated exam with a size: its estimate, and the digest of the draws that pooling keeps."""
+    """A repeated exam with a size.
+
+    Parameters
+    ----------
+    calibration, calibration_sha256
+        That sized it, as its estimate names it.
+    scans
+        Digests of the scans that it came from; empty where its estimate does not say.
+    digest
+        Of the draws that pooling keeps.
+    size
+        The largest, with its interval.
+    spread
+        Between exams, that the size was estimated with.
+    """
 
     exam: ExamFolder
-    document: Mapping[str, Any]
+    calibration: str
+    calibration_sha256: str
+    scans: tuple[str, ...]
     digest: str
+    size: Mapping[str, float]
+    spread: float
 
     @property
     def shape_path(self) -> Path:
         return self.exam.folder / _SHAPE
-
-
-_ESTIMATE, _SHAPE = "estimate.json", "shape.npz"
 
 
 def exams_in(folder: Path) -> list[ExamFolder]:
@@ -91,12 +108,11 @@ def exams_in(folder: Path) -> list[ExamFolder]:
         try:
             patient, visit, mass, replicate = (row[name] for name in ("patient", "visit", "mass", "replicate"))
         except KeyError as missing:
-            way_out = "run the campaign again"
-            raise BadDataError(f"has no column {missing}", way_out=way_out, path=str(table)) from None
+            raise BadDataError(f"has no column {missing}", way_out=_AGAIN, path=str(table)) from None
         of_mass = f"{patient}.v{visit}.m{mass}"
         name = f"{of_mass}.r{replicate}"
         if Path(name).name != name:
-            raise BadDataError(f"names an exam {name!r}", way_out="run the campaign again", path=str(table))
+            raise BadDataError(f"names an exam {name!r}", way_out=_AGAIN, path=str(table))
         found.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / "exams" / name))
     return found
 
@@ -176,8 +192,7 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
             if repeat is None:
                 left_out.append(f"{exam.name}: it has no size")
                 continue
-            of_scan = _scans(repeat.document)
-            if of_scan and (other := scans.setdefault(of_scan, exam.name)) != exam.name:
+            if repeat.scans and (other := scans.setdefault(repeat.scans, exam.name)) != exam.name:
                 left_out.append(f"{exam.name}: of the same scan as {other}")
                 continue
             group.append(repeat)
@@ -187,41 +202,45 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
 
 
 def _read(exam: ExamFolder) -> _Repeat | None:
-    """An exam's estimate; None where it has no size."""
+    """What an exam's estimate says of it; None where it has no size."""
     from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.documents import load_json
-
-    document = load_json(exam.folder / _ESTIMATE, way_out="run the campaign again")
-    if not isinstance(document, dict) or document.get("schema") != "tactile-bayes/estimate/1":
-        path = str(exam.folder / _ESTIMATE)
-        raise BadDataError("is no estimate", way_out="run the campaign again", path=path)
-    if document.get("max_size_mm") is None:
-        return None
-    return _Repeat(exam, document, sha256(exam.folder / _SHAPE))
-
-
-def _scans(document: Mapping[str, Any]) -> tuple[str, ...]:
-    """Digests of the scans that an estimate came from; empty where it does not say."""
     from tactile_bayes.files.provenance import scans_of
+    from tactile_bayes.files.schema import check_document
 
-    return tuple(sorted(scan["sha256"] for scan in scans_of(document["provenance"]) if "sha256" in scan))
+    path = exam.folder / _ESTIMATE
+    document: Any = load_json(path, way_out=_AGAIN)
+    check_document(document, "estimate.schema.json", path=path)
+    if document["max_size_mm"] is None:
+        return None
+    provenance = document["provenance"]
+    try:
+        calibration = str(provenance["settings"]["size_calibration"]).removesuffix(" (shipped)")
+        digests = {one["role"]: one["sha256"] for one in provenance["inputs"]}
+    except (KeyError, TypeError):
+        raise BadDataError("does not say by which calibration", way_out=_AGAIN, path=str(path)) from None
+    return _Repeat(
+        exam,
+        calibration,
+        digests.get("size_calibration", ""),
+        tuple(sorted(scan["sha256"] for scan in scans_of(provenance) if "sha256" in scan)),
+        sha256(exam.folder / _SHAPE),
+        document["max_size_mm"],
+        document["diagnostics"].get("between_map_sd") or 0.0,
+    )
 
 
 def _calibration_named(repeats: Sequence[_Repeat]) -> tuple[str, str]:
     """Name and digest of the one calibration that sized all exams; empty without exams."""
-    found: dict[str, tuple[str, str]] = {}
+    found: dict[str, _Repeat] = {}
     for repeat in repeats:
-        provenance = repeat.document["provenance"]
-        digests = {one["role"]: one["sha256"] for one in provenance["inputs"]}
-        digest = digests.get("size_calibration", "")
-        found.setdefault(digest, (str(provenance["settings"]["size_calibration"]), repeat.exam.name))
+        found.setdefault(repeat.calibration_sha256, repeat)
     if len(found) > 1:
-        named = ", ".join(f"{exam} by {name}" for name, exam in list(found.values())[:2])
+        named = ", ".join(f"{one.exam.name} by {one.calibration}" for one in list(found.values())[:2])
         way_out = "their spreads are not comparable: run the campaign with one"
         raise BadDataError(f"the exams were sized by {len(found)} calibrations ({named})", way_out=way_out)
-    for digest, (name, _) in found.items():
-        return name.removesuffix(" (shipped)"), digest
-    return "", ""
+    first = next(iter(found.values()), None)
+    return ("", "") if first is None else (first.calibration, first.calibration_sha256)
 
 
 def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
@@ -268,7 +287,7 @@ def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
 
     before, after = [], []
     for repeat in repeats:
-        size, spread = repeat.document["max_size_mm"], repeat.document["diagnostics"].get("between_map_sd") or 0.0
+        size, spread = repeat.size, repeat.spread
         score = float(normal_quantile(np.array(0.5 + 0.5 * size["probability"])))
         variance = (math.log(size["high"] / size["low"]) / (2.0 * score)) ** 2
         before.append(variance)

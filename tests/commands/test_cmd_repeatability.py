@@ -183,4 +183,4 @@ def test_exams_by_several_calibrations_are_refused(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("solid (shipped)", "eq6").replace('"sha256": "', '"sha256": "0', 1))
     done = run_here("calibrate", "repeatability", "out", "-o", "site.json", cwd=tmp_path)
     assert done.returncode == 3
-    assert "the exams were sized by 2 calibrations (01.v1.m1.r1 by solid (shipped), 02.v1.m1.r2 by eq6)" in done.stderr
+    assert "the exams were sized by 2 calibrations (01.v1.m1.r1 by solid, 02.v1.m1.r2 by eq6)" in done.stderr

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+import tactile_bayes as tb
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.shape_npz import write_shape
 from tactile_bayes.files.shipped import size_calibration_path
@@ -23,6 +26,14 @@ def shape(log_width: float, amplitude: float = 0.3, *, sd: float, rng: np.random
     """Draws of a round bump whose log width has a normal posterior."""
     width, zero = log_width + sd * rng.standard_normal(DRAWS), np.zeros(DRAWS)
     return ShapeDraws(np.full(DRAWS, np.log(amplitude)), width, zero, zero)
+
+
+@cache
+def estimate_document() -> dict[str, Any]:
+    """A real estimate's JSON object, without its sizes by name."""
+    found = tb.estimate(tb.demo_map(), method="laplace").answer.document
+    assert found is not None
+    return found
 
 
 def write_repeats(
@@ -55,11 +66,9 @@ def write_exam(folder: Path, draws: ShapeDraws, calibration: Path, *, name: str,
     """What an estimate leaves in an exam's folder, as far as learning reads it."""
     folder.mkdir(parents=True)
     write_shape(folder / "shape.npz", draws)
-    size = {"low": 12.0, "high": 18.0, "probability": 0.95}
-    document = {
-        "schema": "tactile-bayes/estimate/1",
-        "max_size_mm": size if sized else None,
-        "diagnostics": {"between_map_sd": 0.05},
+    size = {"median": 14.5, "mean": 14.6, "sd": 1.5, "low": 12.0, "high": 18.0, "mc_error": 0.01}
+    document = estimate_document() | {
+        "max_size_mm": {**size, "probability": 0.95, "kind": "eti"} if sized else None,
         "provenance": {
             "settings": {"size_calibration": f"{calibration.stem} (shipped)"},
             "inputs": [{"role": "size_calibration", "sha256": sha256(calibration)}],
