@@ -156,8 +156,10 @@ def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     from tactile_bayes.files.repeatability_json import read_repeatability
 
     found = read_repeatability(path)
-    provenance = document["provenance"]
-    inputs = [one for one in provenance.get("inputs", []) if not one["role"].startswith("draws_")]
+    provenance = dict(document["provenance"])
+    if isinstance(inputs := provenance.get("inputs"), list):  # those of a long list that are no exam's draws
+        drawn = [isinstance(one, dict) and str(one.get("role")).startswith("draws_") for one in inputs]
+        provenance["inputs"] = [one for one, left_out in zip(inputs, drawn, strict=True) if not left_out]
     kept = ("between_map_sd", "log_sd", "median", "low", "high", "probability", "masses", "maps", "calibration")
     return {
         "schema": document["schema"],
@@ -168,7 +170,7 @@ def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
         "repeats": {one["name"]: f"{len(one['exams'])} exams" for one in document["repeats"]},
         "outlying": document["outlying"],
         "left_out": document["left_out"],
-        "provenance": {**provenance, "inputs": inputs},
+        "provenance": provenance,
     }
 
 
