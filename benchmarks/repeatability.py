@@ -6,8 +6,8 @@
 `spread`: sites at the level of ln d. Exam j of mass i gives mu_i + E_ij + e_ij; the maps' own SDs of e are log-normal
 about 3 % (log-SD 0.4), what a body hides has an SD of 7 %. The site's file is learned by the program's own code. Single
 maps are judged by the probability that their 95 % interval holds the truth, given the site's file, averaged over sites:
-of a new mass; of the masses that the file was learned from, by the file and by one without that mass. The same for
-three maps pooled. Beside them: intervals without a file, by the default's two priors (exams as alike as simulated ones;
+of a new mass, also by the whole posterior that the file sums up; of the masses that the file was learned from, by the
+file and by one without that mass. The same for three maps pooled. Beside them: intervals without a file, by the default's two priors (exams as alike as simulated ones;
 the paper's 15 %). Rows with masses that differ in their spread, with one mass that is three times as uneven, and, as
 the negative control, with maps whose own errors are taken for zero.
 
@@ -35,7 +35,7 @@ from scipy.special import ndtr, ndtri
 from benchmarks.interval_coverage import share
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.learn.repeatability import RepeatedExams, learn_repeatability
+from tactile_bayes.size.learn.repeatability import GRID, RepeatedExams, learn_repeatability
 
 SEED = 20261124
 MAP_SD, MAP_LOG_SD, BODY_SD = 0.03, 0.4, 0.07
@@ -139,6 +139,8 @@ def _site(row: Row, rng: np.random.Generator) -> dict[str, float]:
         "named": bool(found.outlying),
         "first": "0" in found.outlying,
     }
+    whole = half_width(GRID, learned.density, float(new.noise[0]))
+    held["one map of a new mass (the whole posterior for the file)"] = _holds(float(new.centre[0]), whole)
     for name, exam, by in (
         ("one map of a new mass (site's file)", new, prior),
         ("one map of a mass of the file (site's file)", exams[-1], prior),
@@ -146,7 +148,8 @@ def _site(row: Row, rng: np.random.Generator) -> dict[str, float]:
         ("one map (default, this exam)", new, SIMULATED),
         ("one map (default, if exams differ by 15 %)", new, PAPER),
     ):
-        half = half_width(by, float(exam.noise[0]))
+        noise = float(exam.noise[0])
+        half = half_width(by.grid, by.density(np.zeros(1), exam.noise[:1]), noise)
         held |= {name: _holds(float(exam.centre[0]), half), f"{name} half": half}
     held["three maps of a new mass (site's file)"] = _pooled_holds(prior, new)
     held["three maps of a mass of the file (site's file)"] = _pooled_holds(prior, exams[-1])
@@ -168,10 +171,9 @@ def _exams(row: Row, index: int, rng: np.random.Generator) -> RepeatedExams:
     return RepeatedExams(str(index), str(index), centre, noise)
 
 
-def half_width(between: BetweenMaps, noise: float) -> float:
-    """Half width in ln d of the 95 % interval of one map: tau by its prior, all else normal."""
-    weights = between.density(np.zeros(1), np.array([noise]))
-    sd = np.sqrt(BODY_SD**2 + noise + between.grid**2)
+def half_width(grid: FloatArray, weights: FloatArray, noise: float) -> float:
+    """Half width in ln d of the 95 % interval of one map: tau by its weights on a grid, all else normal."""
+    sd = np.sqrt(BODY_SD**2 + noise + grid**2)
     return float(brentq(lambda half: 2 * weights @ ndtr(-half / sd) - 0.05, 1e-3, 10.0))
 
 
