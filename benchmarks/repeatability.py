@@ -7,9 +7,10 @@
 about 3 % (log-SD 0.4), what a body hides has an SD of 7 %. The site's file is learned by the program's own code. Single
 maps are judged by the probability that their 95 % interval holds the truth, given the site's file, averaged over sites:
 of a new mass, also by the whole posterior that the file sums up; of the masses that the file was learned from, by the
-file and by one without that mass. The same for three maps pooled. Beside them: intervals without a file, by the default's two priors (exams as alike as simulated ones;
-the paper's 15 %). Rows with masses that differ in their spread, with one mass that is three times as uneven, and, as
-the negative control, with maps whose own errors are taken for zero.
+file and by one without that mass. The same for three maps pooled. Beside them: intervals without a file, by the
+default's two priors (exams as alike as simulated ones; the paper's 15 %). Rows with masses that differ in their spread,
+with one mass that is three and five times as uneven, and, as the negative control, with maps whose own errors are taken
+for zero.
 
 `scans`: the whole path. Masses are scanned three times by the solid model; in each exam the lump is a little larger or
 smaller than it is, by a factor with this log-SD. `campaign run` does the rest, once by its own repeatability and once
