@@ -204,11 +204,11 @@ def run_scans(folder: Path, masses: int, spread: float, workers: int) -> None:
         _write_scans(folder, masses, spread)
     truth = json.loads((folder / "truth.json").read_text())
     for name, more in (("own", ()), ("none", ("--repeatability", "none"))):
-        call = [sys.executable, "-m", "tactile_bayes", "campaign", "run", "exams.csv", "-o", name, *more]
+        call = [sys.executable, "-m", "tactile_bayes", "campaign", "run", "exams.csv", "-o", "out", *more]
         call += ["--method", "laplace", "--workers", str(workers)]
         done = subprocess.run(call, cwd=folder, capture_output=True, text=True, check=False)
         print(f"--repeatability {name}:\n{done.stdout}{done.stderr}", end="")
-        _count(folder / name / "trial.csv", truth)
+        _count(folder / "out" / "trial.csv", truth)
 
 
 def _write_scans(folder: Path, masses: int, spread: float) -> None:

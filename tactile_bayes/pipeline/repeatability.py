@@ -152,7 +152,7 @@ def learn_from_exams(
     assert calibration is not None
     found = replace(
         learned.repeatability,
-        calibration=name,
+        calibration=Path(name).name,  # a file's folder may say whose it is
         calibration_sha256=digest,
         normalise=calibration.recipe.normalise,
     )
@@ -186,15 +186,16 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
         if len(same) < 2:
             continue
         group: list[_Repeat] = []
-        scans: dict[tuple[str, ...], str] = {}
+        scans: dict[str, str] = {}
         for exam in same:
             repeat = _read(exam)
             if repeat is None:
                 left_out.append(f"{exam.name}: it has no size")
                 continue
-            if repeat.scans and (other := scans.setdefault(repeat.scans, exam.name)) != exam.name:
-                left_out.append(f"{exam.name}: of the same scan as {other}")
+            if shared := [scan for scan in repeat.scans if scan in scans]:
+                left_out.append(f"{exam.name}: of the same scan as {scans[shared[0]]}")
                 continue
+            scans |= dict.fromkeys(repeat.scans, exam.name)
             group.append(repeat)
         if len(group) > 1:
             groups.append(group)
