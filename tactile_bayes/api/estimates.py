@@ -281,6 +281,10 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
         given["calibration"] = str(calibration.expanduser())
     if isinstance(given.get("known"), Mapping):
         given["known"] = tuple((name, float(value)) for name, value in given["known"].items())
+    if isinstance(given.get("repeatability"), str | Path):
+        from tactile_bayes.files.repeatability_json import read_repeatability
+
+        given["repeatability"] = read_repeatability(path_of(given["repeatability"]))
     if given.get("checkpoint") is not None:
         given["checkpoint"] = path_of(given["checkpoint"])
     return Settings(**given)
@@ -304,7 +308,8 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
         Called with effective draws done and wanted.
     **settings
         As of `tactile_bayes.pipeline.settings.Settings`, by default as on the command line; `size_calibration` is a
-        name, a path or a calibration from `calibrate_size`, `known` a mapping such as ``{"seat": 1.2}``.
+        name, a path or a calibration from `calibrate_size`, `known` a mapping such as ``{"seat": 1.2}``,
+        `repeatability` a path or what `calibrate_repeatability` returns.
 
     Returns
     -------

@@ -55,7 +55,8 @@ class Sized:
     def max_size_another_exam_mm(self) -> Draws | None:
         """Largest diameter if another exam of the mass may come out as far apart as the paper's maps.
 
-        None without a size, or where the spread between exams was stated: `max_size_mm` has it then.
+        None without a size, or where the spread between exams was stated or learned at the site: `max_size_mm` has it
+        then.
         """
         size = None if self._size is None else self._size.another_exam
         if size is None:

@@ -102,6 +102,13 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
     "stiffness_ratio, fat_kpa, gland_ratio or thickness_mm.",
 )
+@click.option(
+    "--repeatability",
+    metavar="SITE.json",
+    type=_FILE,
+    help="Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then have one interval, "
+    "for any exam there. Default: two, for exams as alike as simulated ones and as the paper's.",
+)
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @click.option(
     "--workers",
@@ -134,6 +141,7 @@ def command(
     scene: str,
     settings_file: Path | None,
     known: tuple[tuple[str, float], ...],
+    repeatability: Path | None,
     pool: bool,
     workers: int,
     scheduler: str | None,
@@ -149,7 +157,7 @@ def command(
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """
-    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
 
     settings = settings_of(
         settings_file,
@@ -161,6 +169,7 @@ def command(
         accuracy_sd=accuracy_sd,
         known=known,
         scene=scene,
+        repeatability=repeatability_in(repeatability),
     )
     if settings.checkpoint is not None and len(maps) > 1:
         raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")

@@ -1,10 +1,11 @@
 """A campaign: from a table of exams to maps, estimates and pooled sizes, step by step, resumable.
 
 Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...) and
-``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), and the journal, which
-holds for each step its key, the digests of its files and how long it took. The key is the step, the exam or mass, and a
-digest of the program's version, the settings and the content of the inputs. A step whose key is in the journal and
-whose files are what it made is not run again.
+``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), repeatability.json
+where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the journal, which holds for each step its
+key, the digests of its files and how long it took. The key is the step, the exam or mass, and a digest of the program's
+version, the settings and the content of the inputs. A step whose key is in the journal and whose files are what it made
+is not run again.
 """
 
 from __future__ import annotations
@@ -21,15 +22,25 @@ from tactile_bayes import __version__
 from tactile_bayes.batch import CLUSTER_LOST, BatchStore, run_batch
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged
 from tactile_bayes.pipeline.campaign_match import NamedPlace, named_exams
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, run_step
+from tactile_bayes.pipeline.campaign_repeatability import (
+    FEWEST_MASSES,
+    NOT_LEARNED,
+    exam_folders,
+    repeated_masses,
+    too_few,
+)
+from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, REPEATABILITY, SHAPE, Result, Task, run_step
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import DEFAULT_NORMALISE
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
+
+    from tactile_bayes.size.repeatability import Repeatability
 
 Progress = Callable[[int, int], None]
 MATCH_MM: Final = 15.0
@@ -50,12 +61,16 @@ class CampaignSettings:
         Within this distance a mass is that which another exam of the breast names by its place.
     figures
         Whether the figures of `estimate` are drawn for each exam.
+    own_repeatability
+        Whether the spread between exams is learned from the campaign's own repeats, where enough masses have them and
+        the estimate's settings do not say it.
     """
 
     estimate: Settings = field(default_factory=Settings)
     normalise: str = DEFAULT_NORMALISE
     figures: bool = False
     match_mm: float = MATCH_MM
+    own_repeatability: bool = True
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
@@ -128,6 +143,10 @@ class Campaign:
         Results, faults and counts, filled by `run`.
     not_pooled
         Why no mass is pooled; empty where masses are.
+    repeatability
+        Learned from the repeats; None where it was not.
+    not_learned
+        Why it was not, where masses have repeats; empty otherwise.
     """
 
     def __init__(
@@ -144,13 +163,16 @@ class Campaign:
         self.exams, self.folder, self.settings = exams, folder, settings
         self.found = CampaignState(seconds=median_seconds({} if store is None else store.values))
         self.not_pooled = ""
+        self.repeatability: Repeatability | None = None
+        self.not_learned = ""
+        self._sizes_unknown = False
         self._store, self._executor, self._dry, self._progress = store, executor, dry, progress
         self._done, self._total = 0, len(exams) * (3 if settings.figures else 2)
         self._digests: dict[Path, str] = {}
         self._calibrations: dict[str, str] = {}
 
     def run(self) -> CampaignState:
-        """Run what is missing: maps, then estimates, figures, and pooled sizes.
+        """Run what is missing: maps, then estimates, figures, the repeatability and sizes by it, and pooled sizes.
 
         Raises
         ------
@@ -175,6 +197,7 @@ class Campaign:
         if self.settings.figures:
             tasks = [self._estimate_task(exam, "figures") for exam in estimated]
             self._stage("figures", tasks, unknown=waiting)
+        self._learn_repeatability(sound, estimated)
         self._pool(sound, estimated)
         return self.found
 
@@ -273,6 +296,9 @@ class Campaign:
         plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
         name = str(plain.pop("calibration") or default_for(normalise))
         file = plain.pop("settings_file")
+        repeatability = plain.pop("repeatability")
+        if repeatability is not None:
+            plain["repeatability"] = repeatability.sha256 or repr(repeatability)
         used = {"settings_sha256": None if file is None else _digest_of(file), "calibration": name}
         return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
 
@@ -283,6 +309,62 @@ class Campaign:
             path = size_calibration_path(name)
             self._calibrations[name] = "" if path is None else _digest_of(path)
         return self._calibrations[name]
+
+    def _learn_repeatability(self, sound: Sequence[Exam], estimated: Sequence[Exam]) -> None:
+        """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
+        given = self.settings.estimate
+        if not self.settings.own_repeatability or given.repeatability or given.between_map_sd is not None:
+            return
+        masses = repeated_masses(sound if self._dry else estimated)
+        if masses < FEWEST_MASSES:
+            self.not_learned = too_few(masses) if masses else ""
+            return
+        self._total += 1
+        complete = not self._dry or len(estimated) == len(sound)
+        self._stage("repeatability", [self._repeatability_task(estimated)] if complete else [], unknown=not complete)
+        result = self.found.of("repeatability", SITE)
+        self._sizes_unknown = result is None and self._dry
+        if result is None:
+            fault = self.found.faults.pop(SITE, None)
+            self.not_learned = "" if fault is None else fault.reason
+        elif NOT_LEARNED in result:
+            self.not_learned = result[NOT_LEARNED]
+        else:
+            self.repeatability = read_repeatability(self.folder / REPEATABILITY)
+        if self.repeatability is not None or self._sizes_unknown:
+            tasks = [task for exam in estimated if (task := self._size_task(exam)) is not None]
+            self._total += len(tasks)
+            self._stage("size", tasks, unknown=len(sound) if self._sizes_unknown else 0)
+
+    def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
+        files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
+        repeats = tuple(exam_folders(exams, self.folder / EXAMS))
+        return Task("repeatability", SITE, self.folder, digest_of([FEWEST_MASSES, files]), repeats=repeats)
+
+    def _size_task(self, exam: Exam) -> Task | None:
+        """Task of a size by the repeatability; None where the exam has no draws, or another calibration."""
+        made = self.found.of("map", exam.name)
+        assert made is not None
+        settings = self._by_repeatability(self.settings.of(exam), made["normalise"])
+        shape = self._file("estimate", exam, SHAPE)
+        if settings.repeatability is None or shape is None:
+            return None
+        files = [made["files"][MAP], self._file("estimate", exam, ESTIMATE), shape]
+        key = {"files": files, "figures": self.settings.figures, **self._settings_key(settings, made["normalise"])}
+        folder = self.folder / EXAMS / exam.name
+        figures = self.settings.figures
+        return Task("size", exam.name, folder, digest_of(key), settings=settings, figures=figures)
+
+    def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
+        """Settings with the learned repeatability, where it is for the calibration that they lead to."""
+        from tactile_bayes.files.shipped import default_for
+
+        found = self.repeatability
+        if found is None or self._calibration_digest(settings.calibration_name or default_for(normalise)) != (
+            found.calibration_sha256
+        ):
+            return settings
+        return replace(settings, repeatability=found)
 
     def _pool(self, sound: Sequence[Exam], estimated: Sequence[Exam]) -> None:
         """Pool every mass at every visit from the exams that were estimated, where some mass has several."""
@@ -297,6 +379,8 @@ class Campaign:
             return
         unknown = len({exam.of_mass for exam in sound} - set(groups)) if self._dry else 0
         self._total += len(groups)
+        if self._sizes_unknown:
+            groups, unknown = {}, unknown + len(groups)
         self._stage("pool", [self._pool_task(name, exams) for name, exams in groups.items()], unknown=unknown)
 
     def _why_not_pooled(self) -> str:
@@ -315,6 +399,7 @@ class Campaign:
         first = self.found.of("map", exams[0].name)
         assert first is not None
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
+        settings = self._by_repeatability(settings, first["normalise"])
         files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
         key = {"exams": files, **self._settings_key(settings, first["normalise"])}
         members = tuple((exam.name, self.folder / EXAMS / exam.name) for exam in exams)
@@ -365,6 +450,8 @@ class Campaign:
             self._progress(self._done + done, self._total)
 
 
+SITE: Final = "site"
+"""Name of the one step that is of no exam or mass."""
 _POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
 
 

@@ -18,7 +18,9 @@ from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
 JOURNAL: Final = "campaign.journal"
 EXAMS, MASSES = "exams", "masses"
 _HEADER: Final = {"campaign": 1}
-_OF_EXAMS: Final = tuple(name for step, names in FILES.items() if step != "pool" for name in names)
+_BESIDE: Final = ("repeatability",)
+"""Steps whose files lie beside the exams."""
+_OF_EXAMS: Final = tuple(name for step, names in FILES.items() if step not in ("pool", *_BESIDE) for name in names)
 
 
 @contextlib.contextmanager
@@ -84,7 +86,13 @@ def tidy(folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str,
     """
     made: dict[Path, set[str]] = {folder / EXAMS / exam.name: set() for exam in exams}
     made |= {folder / MASSES / exam.of_mass: set() for exam in exams}
+    for step in _BESIDE:
+        kept = {name for result in results[step].values() for name in result["files"]}
+        for name in set(FILES[step]) - kept:
+            (folder / name).unlink(missing_ok=True)
     for step, found in results.items():
+        if step in _BESIDE:
+            continue
         place = folder / (MASSES if step == "pool" else EXAMS)
         for name, result in found.items():
             made[place / name] |= set(result["files"])

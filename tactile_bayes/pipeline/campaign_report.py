@@ -11,7 +11,16 @@ from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_folder import EXAMS
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, MAP, MAP_FIGURE, SIZE_FIGURE, THUMBNAIL
+from tactile_bayes.pipeline.campaign_steps import (
+    ESTIMATE,
+    MAP,
+    MAP_FIGURE,
+    REPEATABILITY,
+    SIZE_FIGURE,
+    SIZED,
+    SIZED_FIGURE,
+    THUMBNAIL,
+)
 from tactile_bayes.pipeline.campaign_tables import DONE, FAILURES, TRIAL, Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass
 
@@ -20,9 +29,9 @@ if TYPE_CHECKING:
     from tactile_bayes.report.campaign_html import Card
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
-WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX)
+WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX, REPEATABILITY)
 """Files beside the exams."""
-_LINKS: Final = {"map.png": MAP_FIGURE, "size.png": SIZE_FIGURE, "estimate.json": ESTIMATE, "map.nc": MAP}
+_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +87,7 @@ def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | No
         for name in (REPORT, PAGE):
             (campaign.folder / name).unlink(missing_ok=True)
     links = {name: name for name in (DONE, FAILURES, TRIAL)} | ({"trial report": PAGE} if report else {})
+    links |= {REPEATABILITY: REPEATABILITY} if campaign.repeatability else {}
     page = _page(campaign, rows, counts, links)
     write_text(campaign.folder / INDEX, page, force=True)
     known = {(row.exam.patient, row.exam.mass) for row in rows}
@@ -161,7 +171,17 @@ def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int],
     cards = [_card(campaign, row) for row in rows]
     masses = len(campaign.found.results["pool"])
     lines = [f"{len(rows)} exams: {counts_words(*counts)}."] + ([f"{masses} masses pooled."] if masses else [])
+    lines += [repeatability_words(campaign)] if campaign.repeatability else []
     return campaign_html(cards, lines=lines, links=links, version=__version__)
+
+
+def repeatability_words(campaign: Campaign) -> str:
+    """What the repeats say of the site, and that the sizes are by it; why they do not where they might have."""
+    found = campaign.repeatability
+    if found is None:
+        return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
+    words = found.words()
+    return f"{words[0].upper()}{words[1:]}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
 
 
 def counts_words(sized: int, unsized: int, failed: int) -> str:
@@ -176,7 +196,7 @@ def _card(campaign: Campaign, row: Row) -> Card:
     exam, folder = row.exam, campaign.folder / EXAMS / row.exam.name
     made = {
         name
-        for step in ("map", "estimate", "figures")
+        for step in ("map", "estimate", "figures", "size")
         for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
         if row.document is not None
     }
@@ -191,5 +211,5 @@ def _card(campaign: Campaign, row: Row) -> Card:
         cautions=tuple(row.cautions),
         checks=tuple(row.checks),
         thumbnail=read_bytes(folder / THUMBNAIL, most=IMAGE_BYTES) if THUMBNAIL in made else None,
-        links={words: f"{EXAMS}/{exam.name}/{name}" for words, name in _LINKS.items() if name in made},
+        links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},
     )

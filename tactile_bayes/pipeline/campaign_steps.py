@@ -1,4 +1,4 @@
-"""Steps of a campaign: the map, the estimate and the figures of an exam, the pooled size of a mass.
+"""Steps of a campaign: map, estimate, figures and size of an exam, the site's repeatability, a mass's pooled size.
 
 A step runs in any process. It gets all that its result depends on, writes its files into one folder, and returns their
 digests, so that a later run can tell whether they are still what it made.
@@ -21,15 +21,19 @@ from tactile_bayes.records import dataclass
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.pipeline.one_map import Answer, Outcome
+    from tactile_bayes.pipeline.repeatability import ExamFolder
     from tactile_bayes.scan import Scan
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
 SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.png", "size.png"
 POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"
+REPEATABILITY, SIZED, SIZED_FIGURE = "repeatability.json", "sized.json", "sized.png"
 FILES: Final = {
     "map": (SCAN, MAP),
     "estimate": (ESTIMATE, POSTERIOR, SHAPE, THUMBNAIL),
     "figures": (MAP_FIGURE, SIZE_FIGURE),
+    "repeatability": (REPEATABILITY,),
+    "size": (SIZED, SIZED_FIGURE),
     "pool": (POOLED, POOLED_DRAWS),
 }
 """The files that each step may write."""
@@ -64,12 +68,16 @@ class Task:
     normalise
         map: as the option of `map`.
     settings
-        estimate, figures, pool: of the estimate.
+        estimate, figures, size, pool: of the estimate.
     mass, places, match_mm
         estimate, figures: where other exams of the breast have the mass, see `campaign_match`; no places where the
         exam is not matched.
     members
         pool: names and folders of the exams.
+    repeats
+        repeatability: the exams.
+    figures
+        size: whether to draw it.
     """
 
     step: str
@@ -85,6 +93,8 @@ class Task:
     places: tuple[NamedPlace, ...] = ()
     match_mm: float = 0.0
     members: tuple[tuple[str, Path], ...] = ()
+    repeats: tuple[ExamFolder, ...] = ()
+    figures: bool = False
 
     @property
     def key(self) -> str:
@@ -331,10 +341,24 @@ def _answer(folder: Path) -> Answer:
     )
 
 
+def _repeatability(task: Task) -> tuple[Result, Writes]:
+    from tactile_bayes.pipeline.campaign_repeatability import learn_step
+
+    return learn_step(task)
+
+
+def _size(task: Task) -> tuple[Result, Writes]:
+    from tactile_bayes.pipeline.campaign_repeatability import size_step
+
+    return size_step(task)
+
+
 RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
     "map": _map,
     "estimate": _estimate,
     "figures": _figures,
+    "repeatability": _repeatability,
+    "size": _size,
     "pool": _pool,
 }
 """What makes each step's files: what it found, and how to write each file."""

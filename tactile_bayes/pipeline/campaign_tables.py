@@ -13,7 +13,7 @@ from tactile_bayes.files.manifest_csv import Exam, table_text
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
 from tactile_bayes.pipeline.campaign_match import unnamed
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED
+from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED, SIZED
 from tactile_bayes.records import dataclass
 
 DONE, FAILURES, TRIAL = "exams_done.csv", "failures.csv", "trial.csv"
@@ -39,7 +39,7 @@ class Row:
     exam
         Of exams.csv.
     document
-        The estimate's JSON object; None where a step failed.
+        The estimate's JSON object, by the campaign's repeatability where it has one; None where a step failed.
     step, fault
         Which step failed and why; empty where none did.
     scans, notes, synthetic
@@ -121,7 +121,8 @@ def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": (*mapped.get("notes", ()), *matched)}
     if fault is not None and fault.step != "figures":
         return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
-    document = load_json(campaign.folder / EXAMS / exam.name / ESTIMATE)
+    by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
+    document = load_json(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE))
     assert isinstance(document, dict)
     return Row(exam, document, synthetic=mapped.get("synthetic"), outlying=outlying, **facts)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
+from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.records import dataclass
@@ -156,11 +157,12 @@ def estimate_one(
     options = _options(settings, calibration, tactile_map)
     if notice is not None and (line := many_cells(tactile_map, options.fit.radius_mm)) is not None:
         notice(line)
-    if calibration is not None:
-        calibration = calibration_for(tactile_map, calibration)
     files = {**(inputs or {}), **({"size_calibration": source} if source else {})}
     files |= {"settings": settings.settings_file} if settings.settings_file else {}
-    digests = hash_inputs(**files)
+    digests = hash_inputs(**files) | repeatability_digest(settings)
+    if calibration is not None:
+        check_repeatability(settings, calibration, digests)
+        calibration = calibration_for(tactile_map, calibration)
     if settings.checkpoint is not None:
         from tactile_bayes.files.checkpoint_npz import CheckpointFile
 
@@ -187,7 +189,8 @@ def estimate_one(
             by += f" ({site_words(used.site, math.log(sigma_mm))})"
         words = calibration_line(by, used, sigma_mm=sigma_mm)
         assert estimate.diagnostics is not None
-        diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words)
+        site = "" if settings.repeatability is None else settings.repeatability.words()
+        diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words, repeatability=site)
         estimate = replace(estimate, diagnostics=diagnostics)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     recorded = _recorded(settings, options, calibration=named)
@@ -211,6 +214,7 @@ def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str)
         "accuracy_mm": settings.accuracy_mm,
         "scene": settings.scene,
         "between_map_sd": settings.between_map_sd,
+        **repeatability_setting(settings),
         "known": dict(settings.known),
     }
 
@@ -325,7 +329,7 @@ def estimate_inputs(
 
 
 def size_priors(settings: Settings) -> SizePriors:
-    """Priors of a size; a spread between maps that is given holds for both of its intervals."""
+    """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
     from tactile_bayes.size.between_maps import BetweenMaps
     from tactile_bayes.size.pooling import SizePriors
 
@@ -334,10 +338,11 @@ def size_priors(settings: Settings) -> SizePriors:
             raise UsageError(
                 f"--known {name} is {value:g}; it must {'not be below' if name == 'seat' else 'be above'} 0"
             )
-    fixed = settings.between_map_sd
-    if fixed is None:
+    fixed, learned = settings.between_map_sd, settings.repeatability
+    if learned is None and fixed is None:
         return SizePriors(known=dict(settings.known))
-    return SizePriors(between_maps=BetweenMaps(fixed, 0.0), another_exam=None, known=dict(settings.known))
+    between = learned.between_maps if learned is not None else BetweenMaps(fixed or 0.0, 0.0)
+    return SizePriors(between_maps=between, another_exam=None, known=dict(settings.known))
 
 
 def answer_of(outcome: Outcome) -> Answer:

@@ -16,7 +16,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.masses_document import masses_document
 from tactile_bayes.report.quantities import ANOTHER_EXAM, WIDTHS, another_exam, estimate_quantities
 from tactile_bayes.report.scene_text import scene_document
-from tactile_bayes.size.posterior import SIZES
+from tactile_bayes.size.posterior import SIZES, SizePosterior
 
 SCHEMA = "tactile-bayes/estimate/1"
 
@@ -58,7 +58,7 @@ def estimate_document(
         "detected_probability": None if detection is None else _round(detection.probability),
         "variance_share": None if share is None else {k: _round(v) for k, v in share.items()},
         "scene": None if estimate.scene is None else scene_document(estimate.scene),
-        "prior_sensitivity": None if estimate.sensitivity is None else _rounded(estimate.sensitivity.as_dict()),
+        "prior_sensitivity": None if estimate.sensitivity is None else rounded(estimate.sensitivity.as_dict()),
         "diagnostics": _diagnostics(estimate),
         "candidates": [
             {"x_mm": _round(c.centre_mm[0]), "y_mm": _round(c.centre_mm[1]), "fault": c.fault}
@@ -79,9 +79,10 @@ def _round(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
+    """Plain data with its numbers rounded to nine significant digits."""
     if isinstance(value, dict):
-        return {name: _rounded(one) for name, one in value.items()}
+        return {name: rounded(one) for name, one in value.items()}
     return _round(value) if isinstance(value, float) else value
 
 
@@ -90,9 +91,15 @@ def _diagnostics(estimate: Estimate) -> dict[str, Any]:
     found: dict[str, Any] = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
     if estimate.detection is not None:
         found["log_bayes_factor"] = estimate.detection.log_bayes_factor
-    if estimate.size is not None:
-        found["invalid_draws"] = estimate.size.invalid
-        found |= estimate.size.figures
+    return _finite(found) | ({} if estimate.size is None else size_diagnostics(estimate.size))
+
+
+def size_diagnostics(size: SizePosterior) -> dict[str, Any]:
+    """What the diagnostics say of a size; a figure that is not finite is null."""
+    return _finite({"invalid_draws": size.invalid, **size.figures})
+
+
+def _finite(found: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: (_round(value) if math.isfinite(value) else None) if isinstance(value, float) else value
         for name, value in found.items()

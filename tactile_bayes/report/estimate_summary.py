@@ -138,6 +138,8 @@ def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:
     parts = [f"method {estimate.draws.method}, {ends}"]
     if estimate.diagnostics is not None and estimate.diagnostics.calibration:
         parts.insert(0, f"sizes by the {estimate.diagnostics.calibration}")
+    if estimate.diagnostics is not None and estimate.diagnostics.repeatability:
+        parts.append(estimate.diagnostics.repeatability)
     if measure := convergence_text(estimate.draws):
         parts.append(measure)
     if share := tracker_share(estimate):

@@ -24,6 +24,7 @@ from tactile_bayes.report.size_text import (
     exams_label,
     range_cautions,
     shape_text,
+    site_interval_text,
     table_head,
     table_row,
     two_intervals_text,
@@ -142,6 +143,8 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Se
         spread = exam_spread(estimate)
         lines += [] if spread is None else [two_intervals_text(estimate.size.figures.get("between_map_sd"), spread)]
         lines += width_lines(estimate.size.variance_share)
+        if found is not None and found.repeatability:
+            lines.append(site_interval_text(found.repeatability))
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
         if found is not None and found.size_calibration:
