@@ -21,7 +21,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes import batch, executors
-from tactile_bayes.batch import BatchInterrupted, fault_lines, open_store, run_batch
+from tactile_bayes.batch import BatchInterrupted, fault_lines, run_batch
+from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.executors import InlineExecutor, cluster_executor, local_executor, open_executor
 
@@ -390,7 +391,7 @@ def test_a_full_disk_stops_the_batch_in_one_line():
         pytest.skip("this system has no /dev/full")
     descriptor = os.open(full, os.O_RDWR)
     try:
-        store = batch.BatchStore(descriptor, full, encode=lambda v: v, decode=lambda v: v)
+        store = BatchStore(descriptor, full, encode=lambda v: v, decode=lambda v: v)
         with pytest.raises(UsageError, match="cannot be written"):
             run_batch(draw, range(3), key=str, store=store)
     finally:
@@ -404,7 +405,8 @@ def test_a_killed_batch_resumes_and_its_workers_end(tmp_path, child_environment)
             """
             import os, sys, time
             from pathlib import Path
-            from tactile_bayes.batch import open_store, run_batch
+            from tactile_bayes.batch import run_batch
+            from tactile_bayes.batch_store import BatchStore, open_store
             from tactile_bayes.executors import local_executor
 
             def slow(item):

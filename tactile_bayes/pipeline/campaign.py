@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes import __version__
-from tactile_bayes.batch import CLUSTER_LOST, BatchStore, run_batch
+from tactile_bayes.batch import CLUSTER_LOST, run_batch
+from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged

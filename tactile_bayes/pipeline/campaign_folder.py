@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.batch import BatchStore, open_store
+from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.manifest_csv import Exam
