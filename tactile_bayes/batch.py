@@ -31,6 +31,7 @@ _LISTED = 3
 DIED_TWICE = (
     "its process ended twice without an answer (killed, perhaps for lack of memory); run it again with fewer --workers"
 )
+DIED_OFTEN = "several workers of the cluster ended over it (killed, perhaps for lack of memory); give them more memory"
 CLUSTER_LOST = "the dask scheduler was lost before an answer came; start it again and run what is missing"
 
 
@@ -69,12 +70,14 @@ class BatchInterrupted(KeyboardInterrupt):
         How many items there were.
     store
         Where the results are kept for the next run; None where nothing keeps them.
+    before
+        Items done by earlier batches of the same run, for the message.
     """
 
-    def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None) -> None:
+    def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None, before: int = 0) -> None:
         self.outcomes = list(outcomes)
         kept = "" if store is None else f"; {store} keeps them, run again to go on"
-        super().__init__(f"{len(self.outcomes)} of {total} done{kept}")
+        super().__init__(f"{before + len(self.outcomes)} of {total} done{kept}")
 
 
 def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:
@@ -210,7 +213,7 @@ class _Run(Generic[Item, Result]):
             self._alone = bool(self._suspects)
             if self._alone:
                 self._submit(self._suspects.popleft())
-        ahead = _WINDOW if self._workers is None else self._workers.ahead
+        ahead: int = getattr(self._executor, "ahead", _WINDOW)
         while self._rest and not (self._alone or self._broken) and len(self._waiting) < ahead:
             self._submit(self._rest.popleft())
             if not self._finished.empty():
@@ -230,13 +233,27 @@ class _Run(Generic[Item, Result]):
         done = self._finished.get()
         work = self._waiting.pop(done)
         if self._workers is None or done.cancelled() or not isinstance(done.exception(), BrokenExecutor):
-            self._keep(_settle(work[0], done))
+            outcome = _settle(work[0], done)
+            self._keep(outcome)
+            if outcome.error == CLUSTER_LOST:
+                self._give_up()
             return
         self._broken = True
         if self._alone:
             self._keep(Outcome(work[0], error=DIED_TWICE))
         else:
             self._suspects.append(work)
+
+    def _give_up(self) -> None:
+        """End without the cluster: keep what has come, and hand out nothing more, for nobody would answer."""
+        for future, (name, _) in list(self._waiting.items()):
+            done = future.done()
+            future.cancel()
+            self._keep(_settle(name, future) if done else Outcome(name, error=CLUSTER_LOST))
+        for name, _ in self._rest:
+            self._keep(Outcome(name, error=CLUSTER_LOST))
+        self._waiting.clear()
+        self._rest.clear()
 
     def _abandon(self) -> None:
         """Cancel pending items, keep finished ones, and do not wait for running ones."""
@@ -265,5 +282,6 @@ def _settle(name: str, future: Future[tuple[Result | None, str]]) -> Outcome[Res
     except CancelledError:
         return Outcome(name, error=CLUSTER_LOST)
     except Exception as fault:
-        return Outcome(name, error=one_line(fault))
+        killed = type(fault).__name__ == "KilledWorker"  # dask's, after several workers ended over the item
+        return Outcome(name, error=DIED_OFTEN if killed else one_line(fault))
     return Outcome(name, value=value, error=error)

@@ -1,7 +1,8 @@
 """Results of a batch on disk, one line each: an interrupted batch resumes from what it has.
 
-The first line names the settings; each further line is one item's result: JSON and its CRC-32, so that no damaged result
-is taken for a sound one. Memory holds where each line is and not what it says, so a store may be larger than memory.
+The first line names the settings; each further line is one item's result: JSON and its CRC-32, so that no damaged
+result is taken for a sound one. Memory holds where each line is and not what it says, so a store may be larger than
+memory.
 """
 
 from __future__ import annotations
@@ -39,9 +40,6 @@ class StoredValues(Mapping[str, Any]):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._at)
-
-    def __reversed__(self) -> Iterator[str]:
-        return reversed(self._at)
 
     def __len__(self) -> int:
         return len(self._at)

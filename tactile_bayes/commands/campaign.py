@@ -123,10 +123,9 @@ def run(
     with (
         open_campaign(output, dry=dry_run) as store,
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
-        progress_bar("steps") as progress,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, progress=progress)
+        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=progress_bar)
         campaign.run()
         if not dry_run:
             left = tidy(place, table, campaign.found.results)

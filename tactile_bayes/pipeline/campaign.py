@@ -5,6 +5,9 @@ Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.n
 holds for each step its key, the digests of its files and how long it took. The key is the step, the exam or mass, and a
 digest of the program's version, the settings and the content of the inputs. A step whose key is in the journal and
 whose files are what it made is not run again.
+
+Exams go through the steps in blocks, in the order of the table, and the results stay in the journal: memory holds the
+table of exams, a few hundred bytes for each step, and one block.
 """
 
 from __future__ import annotations
@@ -12,17 +15,19 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from tactile_bayes import __version__
-from tactile_bayes.batch import CLUSTER_LOST, run_batch
+from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged
+from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, StepResults, median_seconds, unchanged
+from tactile_bayes.pipeline.campaign_inputs import READ, read_sources, same_bytes
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, run_step
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import DEFAULT_NORMALISE
@@ -32,6 +37,12 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 Progress = Callable[[int, int], None]
+Bar = Callable[[str], AbstractContextManager[Progress]]
+_Any = TypeVar("_Any")
+_BLOCK: Final = 64
+"""Exams that go through the steps together at least; workers wait for the slowest of a block."""
+_AHEAD_IN_BLOCK: Final = 16
+"""Blocks hold so many times what an executor takes ahead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +97,10 @@ class CampaignState:
         Median time that one of each step took so far.
     """
 
-    results: dict[str, dict[str, Result]] = field(default_factory=lambda: {step: {} for step in FILES})
+    results: dict[str, StepResults]
     faults: dict[str, Fault] = field(default_factory=dict)
-    kept: dict[str, int] = field(default_factory=dict)
-    todo: dict[str, int] = field(default_factory=dict)
+    kept: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    todo: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     seconds: dict[str, float] = field(default_factory=dict)
 
     def of(self, step: str, name: str) -> Result | None:
@@ -114,8 +125,8 @@ class Campaign:
         As `run_batch`'s.
     dry
         Plan only: nothing is run and nothing written.
-    progress
-        Called with steps of this run that are done, and those known to be needed.
+    bar
+        Gives, for what is counted ("files read", "steps"), a context with a callback for those done and those needed.
 
     Attributes
     ----------
@@ -134,18 +145,23 @@ class Campaign:
         store: BatchStore | None,
         executor: Executor | None = None,
         dry: bool = False,
-        progress: Progress | None = None,
+        bar: Bar | None = None,
     ) -> None:
         self.exams, self.folder, self.settings = exams, folder, settings
-        self.found = CampaignState(seconds=median_seconds({} if store is None else store.values))
+        values = {} if store is None else store.values
+        results = {step: StepResults(values) for step in FILES}
+        self.found = CampaignState(results, seconds=median_seconds(values))
         self.not_pooled = ""
-        self._store, self._executor, self._dry, self._progress = store, executor, dry, progress
-        self._done, self._total = 0, len(exams) * (3 if settings.figures else 2)
+        self._store, self._executor, self._dry = store, executor, dry
+        self._bar: Bar = _no_bar if bar is None else bar
+        self._tell: Progress = _untold
+        self._done, self._total = 0, 0
+        self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
         self._digests: dict[Path, str] = {}
         self._calibrations: dict[str, str] = {}
 
     def run(self) -> CampaignState:
-        """Run what is missing: maps, then estimates, figures, and pooled sizes.
+        """Run what is missing: maps, estimates and figures of exams, block by block, then pooled sizes.
 
         Raises
         ------
@@ -156,49 +172,41 @@ class Campaign:
         BatchInterrupted
             On Ctrl-C; what is done is kept.
         """
-        self._hash_sources()
-        self._refuse_same_files()
+        self._read_sources()
         sound = [exam for exam in self.exams if exam.name not in self.found.faults]
-        self._stage("map", [self._map_task(exam) for exam in sound])
-        mapped = [exam for exam in sound if self.found.of("map", exam.name)]
-        unmapped = 0 if not self._dry else len(sound) - len(mapped)
-        self._stage("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], unknown=unmapped)
-        estimated = [exam for exam in mapped if self.found.of("estimate", exam.name)]
-        waiting = 0 if not self._dry else len(sound) - len(estimated)
-        if self.settings.figures:
-            tasks = [self._estimate_task(exam, "figures") for exam in estimated]
-            self._stage("figures", tasks, unknown=waiting)
-        self._pool(sound, estimated)
+        self.not_pooled = self._why_not_pooled()
+        masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
+        self._total = len(sound) * (3 if self.settings.figures else 2) + masses
+        with self._bar("steps") as self._tell:
+            for block in _blocks(sound, self._block):
+                self._size(block)
+            if masses:
+                self._pool(sound)
         return self.found
 
-    def _hash_sources(self) -> None:
-        of_path: dict[Path, list[Exam]] = defaultdict(list)
+    def _read_sources(self) -> None:
+        """Digests of all files: two exams of one file are found before any is mapped."""
+        with self._bar("files read") as tell:
+            sources = read_sources(
+                self.exams, store=self._store, keep=not self._dry, executor=self._executor, progress=tell
+            )
+        self._digests = sources.digests
         for exam in self.exams:
-            of_path[exam.path].append(exam)
-        outcomes = run_batch(_digest_of, of_path, key=str, executor=self._executor)
-        for (path, exams), outcome in zip(of_path.items(), outcomes, strict=True):
-            if outcome.value is not None:
-                self._digests[path] = outcome.value
-                continue
-            for exam in exams:
-                self.found.faults[exam.name] = Fault("read", outcome.error.removeprefix(f"{path}: "))
+            if exam.path in sources.faults:
+                self.found.faults[exam.name] = Fault(READ, sources.faults[exam.path])
+        for name, reason in same_bytes(self.exams, self._digests).items():
+            self.found.faults[name] = Fault(READ, reason)
 
-    def _refuse_same_files(self) -> None:
-        """Exams of one file are faults, but for the masses of one scan, each with its place."""
-        same = defaultdict(list)
-        for exam in self.exams:
-            if exam.path in self._digests:
-                same[self._digests[exam.path]].append(exam)
-        for exams in same.values():
-            breasts = {(exam.patient, exam.visit, exam.side) for exam in exams}
-            places = {(exam.mass, exam.centre_mm) for exam in exams if exam.centre_mm is not None}
-            if len(exams) == 1 or (len(breasts) == 1 and len({mass for mass, _ in places}) == len(exams)):
-                continue
-            for exam in exams:
-                others = [other for other in exams if other is not exam]
-                named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
-                way_out = "give each exam its own file, or each mass of one scan its centre_x_mm and centre_y_mm"
-                self.found.faults[exam.name] = Fault("read", f"holds the same bytes as {named}; {way_out}")
+    def _size(self, exams: Sequence[Exam]) -> None:
+        """Maps, estimates and figures of some exams."""
+        self._stage("map", [self._map_task(exam) for exam in exams])
+        mapped = [exam for exam in exams if exam.name in self.found.results["map"]]
+        unmapped = len(exams) - len(mapped)
+        self._stage("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
+        if self.settings.figures:
+            estimated = [exam for exam in mapped if exam.name in self.found.results["estimate"]]
+            tasks = [self._estimate_task(exam, "figures") for exam in estimated]
+            self._stage("figures", tasks, without=len(exams) - len(estimated))
 
     def _map_task(self, exam: Exam) -> Task:
         digest = self._digests[exam.path]
@@ -232,7 +240,7 @@ class Campaign:
         plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
         name = str(plain.pop("calibration") or default_for(normalise))
         file = plain.pop("settings_file")
-        used = {"settings_sha256": None if file is None else _digest_of(file), "calibration": name}
+        used = {"settings_sha256": None if file is None else self._file_digest(file), "calibration": name}
         return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
 
     def _calibration_digest(self, name: str) -> str:
@@ -240,30 +248,36 @@ class Campaign:
 
         if name not in self._calibrations:
             path = size_calibration_path(name)
-            self._calibrations[name] = "" if path is None else _digest_of(path)
+            self._calibrations[name] = "" if path is None else self._file_digest(path)
         return self._calibrations[name]
 
-    def _pool(self, sound: Sequence[Exam], estimated: Sequence[Exam]) -> None:
-        """Pool every mass at every visit from the exams that were estimated, where some mass has several."""
+    def _file_digest(self, path: Path) -> str:
+        """Digest of a file that many exams use."""
+        from tactile_bayes.files.atomic import sha256
+
+        if path not in self._digests:
+            self._digests[path] = sha256(path)
+        return self._digests[path]
+
+    def _pool(self, sound: Sequence[Exam]) -> None:
+        """Pool every mass at every visit from the exams that were estimated."""
         groups: dict[str, list[Exam]] = defaultdict(list)
-        for exam in estimated:
-            groups[exam.of_mass].append(exam)
-        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
-            self.not_pooled = "no mass has several exams at one visit"
-            return
-        self.not_pooled = self._why_not_pooled()
-        if self.not_pooled:
-            return
-        unknown = len({exam.of_mass for exam in sound} - set(groups)) if self._dry else 0
-        self._total += len(groups)
-        self._stage("pool", [self._pool_task(name, exams) for name, exams in groups.items()], unknown=unknown)
+        for exam in sound:
+            if exam.name in self.found.results["estimate"]:
+                groups[exam.of_mass].append(exam)
+        unknown = len({exam.of_mass for exam in sound}) - len(groups)
+        for names in _blocks(list(groups), self._block):
+            self._stage("pool", [self._pool_task(name, groups[name]) for name in names])
+        self._stage("pool", [], without=unknown)
 
     def _why_not_pooled(self) -> str:
-        """Why the calibration cannot pool; empty where it can."""
+        """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
         from tactile_bayes.files.shipped import size_calibration_path
         from tactile_bayes.files.size_json import read_size_calibration
         from tactile_bayes.size.body_calibration import BodyCalibration
 
+        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
+            return "no mass has several exams at one visit"
         for name in {self.settings.of(exam).calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))
             if path is None or not isinstance(read_size_calibration(path), BodyCalibration):
@@ -284,47 +298,71 @@ class Campaign:
         result = self.found.of(step, exam.name)
         return None if result is None else result["files"].get(file)
 
-    def _stage(self, step: str, tasks: Sequence[Task], *, unknown: int = 0) -> None:
-        """Run one step for all that need it; `unknown` is how many more a plan has whose inputs are not there yet."""
+    def _stage(self, step: str, tasks: Sequence[Task], *, without: int = 0) -> None:
+        """Run one step for those that need it.
+
+        Parameters
+        ----------
+        without
+            How many more have no inputs: in a plan they will need the step, in a run they failed before it.
+        """
         kept = self._kept(tasks)
-        self.found.kept[step] = len(kept)
-        self.found.todo[step] = len(tasks) - len(kept) + unknown
-        for task in tasks:
-            if task.key in kept:
-                self.found.results[step][task.name] = kept[task.key]
-        missing = [task for task in tasks if task.key not in kept]
+        for task in kept:
+            self.found.results[step].add(task.name, task.key)
+        missing = [task for task in tasks if task.name not in self.found.results[step]]
+        self.found.kept[step] += len(kept)
+        self.found.todo[step] += len(missing) + (without if self._dry else 0)
+        self._total -= len(kept) + without
         if self._dry:
             return
-        self._total -= len(kept)
-        outcomes = run_batch(
-            run_step, missing, key=_key, executor=self._executor, store=self._store, progress=self._tell
-        )
-        self._done += len(missing)
-        for task, outcome in zip(missing, outcomes, strict=True):
+        for task, outcome in zip(missing, self._run(missing), strict=True):
             if outcome.value is not None:
-                self.found.results[step][task.name] = outcome.value
+                self.found.results[step].add(task.name, task.key)
             elif outcome.error == CLUSTER_LOST:
                 raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
                 self.found.faults[task.name] = Fault(step, outcome.error)
 
-    def _kept(self, tasks: Sequence[Task]) -> dict[str, Result]:
-        """Results of earlier runs whose files are still what they were; others are forgotten."""
-        if self._store is None:
-            return {}
-        values = self._store.values
-        for task in tasks:
-            if task.key in values and not unchanged(task.folder, values[task.key]["files"]):
-                del values[task.key]
-        return {task.key: values[task.key] for task in tasks if task.key in values}
+    def _run(self, tasks: Sequence[Task]) -> list[Outcome[Result]]:
+        before = self._done
 
-    def _tell(self, done: int, total: int) -> None:
-        del total
-        if self._progress is not None:
-            self._progress(self._done + done, self._total)
+        def tell(done: int, _total: int) -> None:
+            self._tell(before + done, self._total)
+
+        try:
+            outcomes = run_batch(run_step, tasks, key=_key, executor=self._executor, store=self._store, progress=tell)
+        except BatchInterrupted as stop:
+            path = None if self._store is None else self._store.path
+            raise BatchInterrupted(stop.outcomes, total=self._total, store=path, before=before) from None
+        self._done += len(tasks)
+        return outcomes
+
+    def _kept(self, tasks: Sequence[Task]) -> list[Task]:
+        """Tasks done by earlier runs whose files are still what they were; the results of others are forgotten."""
+        if self._store is None:
+            return []
+        values = self._store.values
+        known = [task for task in tasks if task.key in values]
+        for task in known:
+            if not unchanged(task.folder, values[task.key]):
+                values.forget(task.key)
+        return [task for task in known if task.key in values]
 
 
 _POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
+
+
+def _blocks(items: Sequence[_Any], size: int) -> Iterator[Sequence[_Any]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
+
+
+def _untold(_done: int, _total: int) -> None:
+    """Progress that nobody watches."""
+
+
+def _no_bar(_label: str) -> AbstractContextManager[Progress]:
+    return nullcontext(_untold)
 
 
 def digest_of(key: object) -> str:
@@ -335,9 +373,3 @@ def digest_of(key: object) -> str:
 
 def _key(task: Task) -> str:
     return task.key
-
-
-def _digest_of(path: Path) -> str:
-    from tactile_bayes.files.atomic import sha256
-
-    return sha256(path)

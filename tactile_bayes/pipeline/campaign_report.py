@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
 WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX)
 """Files beside the exams."""
+_MOST_INLINE: Final = 300
+"""With more exams the contact sheet names its thumbnails' files instead of holding them."""
+_MOST_CARDS: Final = 10_000
+"""More exams than a browser shows at ease."""
 _LINKS: Final = {"map.png": MAP_FIGURE, "size.png": SIZE_FIGURE, "estimate.json": ESTIMATE, "map.nc": MAP}
 
 
@@ -152,12 +156,25 @@ def _write_report(folder: Path, excision: Path, protocol: Path | None) -> tuple[
 
 
 def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int], links: Mapping[str, str]) -> str:
-    from tactile_bayes.report.campaign_html import campaign_html
+    from tactile_bayes.report.campaign_html import campaign_html, worst
 
-    cards = [_card(campaign, row) for row in rows]
+    cards = worst((_card(campaign, row) for row in rows), _MOST_CARDS)
+    if len(cards) <= _MOST_INLINE:
+        cards = [_self_contained(card, campaign.folder) for card in cards]
     masses = len(campaign.found.results["pool"])
     lines = [f"{len(rows)} exams: {counts_words(*counts)}."] + ([f"{masses} masses pooled."] if masses else [])
+    if len(cards) < len(rows):
+        lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
     return campaign_html(cards, lines=lines, links=links, version=__version__)
+
+
+def _self_contained(card: Card, folder: Path) -> Card:
+    """The card with its picture instead of the picture's name."""
+    from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
+
+    if not isinstance(card.thumbnail, str):
+        return card
+    return replace(card, thumbnail=read_bytes(folder / card.thumbnail, most=IMAGE_BYTES))
 
 
 def counts_words(sized: int, unsized: int, failed: int) -> str:
@@ -166,10 +183,9 @@ def counts_words(sized: int, unsized: int, failed: int) -> str:
 
 
 def _card(campaign: Campaign, row: Row) -> Card:
-    from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
     from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card
 
-    exam, folder = row.exam, campaign.folder / EXAMS / row.exam.name
+    exam = row.exam
     made = {
         name
         for step in ("map", "estimate", "figures")
@@ -186,6 +202,6 @@ def _card(campaign: Campaign, row: Row) -> Card:
         size=row.size,
         cautions=tuple(row.cautions),
         checks=tuple(row.checks),
-        thumbnail=read_bytes(folder / THUMBNAIL, most=IMAGE_BYTES) if THUMBNAIL in made else None,
+        thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
         links={words: f"{EXAMS}/{exam.name}/{name}" for words, name in _LINKS.items() if name in made},
     )

@@ -86,14 +86,14 @@ class Task:
 
 
 def run_step(task: Task) -> Result:
-    """Run a step; returns the digests of its files by name, the seconds it took and what else it found.
+    """Run a step; returns digests and stamps of its files by name, the seconds it took and what else it found.
 
     Raises
     ------
     TactileBayesError
         What is wrong with the exam, without a path.
     """
-    begun = time.perf_counter()
+    begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
         found, writes = RUN[task.step](task)
     except BadDataError as error:
@@ -107,17 +107,26 @@ def run_step(task: Task) -> Result:
                 (task.folder / name).unlink(missing_ok=True)
     except (UsageError, OSError) as error:
         return {UNWRITTEN: str(error)}
-    files = _digests(task.folder, [*writes])
-    return {"files": files, "seconds": round(time.perf_counter() - begun, 3), **found}
+    files, stamps = _digests(task.folder, [*writes])
+    spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.thread_time() - begun_cpu}
+    return {"files": files, "stamps": stamps, **{name: round(one, 3) for name, one in spent.items()}, **found}
 
 
 Writes = dict[str, Callable[[Path], object]]
 
 
-def _digests(folder: Path, names: list[str]) -> dict[str, str]:
+def stamp(path: Path) -> str:
+    """Size, times and inode of a file, which differ when it was written to or replaced."""
+    known = path.stat()
+    return f"{known.st_size} {known.st_mtime_ns} {known.st_ctime_ns} {known.st_ino}"
+
+
+def _digests(folder: Path, names: list[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Digests and stamps of files; each stamp is taken before the digest, so that a later change shows."""
     from tactile_bayes.files.atomic import sha256
 
-    return {name: sha256(folder / name) for name in names}
+    stamps = {name: stamp(folder / name) for name in names}
+    return {name: sha256(folder / name) for name in names}, stamps
 
 
 def _map(task: Task) -> tuple[Result, Writes]:

@@ -25,6 +25,12 @@ _DONE_COLUMNS: Final = (
     "centre_y_mm", "cautions", "checks", "synthetic",
 )  # fmt: skip
 _FAILURE_COLUMNS: Final = ("patient", "visit", "mass", "replicate", "file", "step", "reason")
+_OF_ESTIMATE: Final = (
+    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "other_rises",
+)  # fmt: skip
+_OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
+_OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
+"""What tables and pages show of a document: the rest of it is a hundred times as much."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,15 +115,25 @@ def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": tuple(mapped.get("notes", ()))}
     if fault is not None and fault.step != "figures":
         return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
-    document = load_json(campaign.folder / EXAMS / exam.name / ESTIMATE)
-    assert isinstance(document, dict)
+    document = estimate_facts(load_json(campaign.folder / EXAMS / exam.name / ESTIMATE))
     return Row(exam, document, synthetic=mapped.get("synthetic"), outlying=outlying, **facts)
 
 
+def estimate_facts(document: Any) -> dict[str, Any]:
+    """What tables and pages need of an estimate's JSON object."""
+    diagnostics = {name: document["diagnostics"].get(name, []) for name in _OF_DIAGNOSTICS}
+    return {name: document[name] for name in _OF_ESTIMATE} | {"diagnostics": diagnostics}
+
+
 def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
-    """JSON object of each pooled mass, by its name."""
-    found = {name: load_json(campaign.folder / MASSES / name / POOLED) for name in campaign.found.results["pool"]}
-    return {name: document for name, document in found.items() if isinstance(document, dict)}
+    """What tables need of the JSON object of each pooled mass, by its name."""
+    found = {}
+    for name in campaign.found.results["pool"]:
+        document = load_json(campaign.folder / MASSES / name / POOLED)
+        if isinstance(document, dict):
+            found[name] = {key: document[key] for key in _OF_POOLED}
+            found[name]["maps"] = [{key: one[key] for key in ("map", "outlying")} for one in document["maps"]]
+    return found
 
 
 def done_text(rows: Sequence[Row]) -> str:
