@@ -29,11 +29,13 @@ def command() -> None:
 
 
 @command.command("init")
-@click.argument("folder", metavar="FOLDER", type=_FILE)
+@click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
 @click.option("-o", "--output", required=True, metavar="EXAMS.csv", type=_FILE, help="Where to write the table.")
 @FORCE
-def init(folder: Path, output: Path, force: bool) -> None:
+def init(folder: Path | str, output: Path, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry.
+
+    FOLDER may be one in an object store, as s3://bucket/scans.
 
     Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
     are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
@@ -78,6 +80,9 @@ def init(folder: Path, output: Path, force: bool) -> None:
 @seed_option(1)
 @click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done and how long it takes, and do nothing.")
+@click.option(
+    "--copy-to", metavar="s3://BUCKET/FOLDER", help="Copy every file into this folder of an object store, step by step."
+)
 @WORKERS
 @scheduler_option("the exams")
 def run(
@@ -92,6 +97,7 @@ def run(
     seed: int,
     figures: bool,
     dry_run: bool,
+    copy_to: str | None,
     workers: int,
     scheduler: str | None,
 ) -> None:
@@ -108,12 +114,13 @@ def run(
     from tactile_bayes.commands.settings_file import settings_of
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.manifest_csv import read_manifest
+    from tactile_bayes.files.remote import check_address
     from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
     from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
-    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, write_outputs
+    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, copy_outputs, write_outputs
 
     settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed)
-    of_all = CampaignSettings(settings, normalise, figures)
+    of_all = CampaignSettings(settings, normalise, figures, "" if copy_to is None else check_address(copy_to))
     table = read_manifest(exams)
     _check_paths(table, output, of_all)
     refuse_same(
@@ -130,6 +137,8 @@ def run(
         if not dry_run:
             left = tidy(place, table, campaign.found.results)
             written = write_outputs(campaign, excision, protocol)
+            if of_all.copy_to:
+                copy_outputs(place, of_all.copy_to)
     if dry_run:
         _say_plan(campaign, workers)
     else:
@@ -147,7 +156,8 @@ def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings
     if settings.estimate.checkpoint is not None:
         raise UsageError("a checkpoint is for one map; leave it out of the settings file")
     folder = Path(os.path.realpath(output))
-    inside = next((exam.file for exam in table if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
+    local = [exam for exam in table if not exam.address]
+    inside = next((exam.file for exam in local if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
     if inside is not None:
         raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
     for name in {settings.of(exam).calibration for exam in table} - {None}:
@@ -162,8 +172,10 @@ def _say_plan(campaign: Campaign, workers: int) -> None:
         if todo and step not in found.seconds:
             unknown.append(step)
         seconds += todo * found.seconds.get(step, 0.0)
-    for name, fault in found.faults.items():
+    for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"{name}: {fault.step} failed: {fault.reason}")
+    if len(found.faults) > _MOST_NAMED:
+        click.echo(f"{len(found.faults) - _MOST_NAMED} more failed")
     if unknown:
         click.echo(f"How long is not known: no {', '.join(unknown)} was run here yet.")
     else:

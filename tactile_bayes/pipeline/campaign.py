@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import field, fields, replace
 from pathlib import Path
@@ -57,11 +57,14 @@ class CampaignSettings:
         As of `map`.
     figures
         Whether the figures of `estimate` are drawn for each exam.
+    copy_to
+        Address of a folder in an object store that gets a copy of every file; empty for none.
     """
 
     estimate: Settings = field(default_factory=Settings)
     normalise: str = DEFAULT_NORMALISE
     figures: bool = False
+    copy_to: str = ""
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
@@ -176,7 +179,8 @@ class Campaign:
         sound = [exam for exam in self.exams if exam.name not in self.found.faults]
         self.not_pooled = self._why_not_pooled()
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
-        self._total = len(sound) * (3 if self.settings.figures else 2) + masses
+        per_exam = 2 + self.settings.figures + bool(self.settings.copy_to)
+        self._total = len(sound) * per_exam + masses * (2 if self.settings.copy_to else 1)
         with self._bar("steps") as self._tell:
             for block in _blocks(sound, self._block):
                 self._size(block)
@@ -207,6 +211,25 @@ class Campaign:
             estimated = [exam for exam in mapped if exam.name in self.found.results["estimate"]]
             tasks = [self._estimate_task(exam, "figures") for exam in estimated]
             self._stage("figures", tasks, without=len(exams) - len(estimated))
+        self._copy(EXAMS, [exam.name for exam in exams])
+
+    def _copy(self, kind: str, names: Sequence[str]) -> None:
+        """Copy the files of exams or masses into the object store."""
+        if not self.settings.copy_to:
+            return
+        steps = ("pool",) if kind == MASSES else ("map", "estimate", "figures")
+        tasks = []
+        for name in names:
+            made = [result["files"] for step in steps if (result := self.found.of(step, name)) is not None]
+            files = {file: digest for one in made for file, digest in one.items()}
+            if files:
+                tasks.append(self._copy_task(kind, name, files))
+        self._stage("copy", tasks, without=len(names) - len(tasks))
+
+    def _copy_task(self, kind: str, name: str, files: Mapping[str, str]) -> Task:
+        to = f"{self.settings.copy_to}/{kind}/{name}"
+        copies = {file: f"{to}/{file}" for file in files}
+        return Task("copy", name, self.folder / kind / name, digest_of({"to": to, "files": files}), copies=copies)
 
     def _map_task(self, exam: Exam) -> Task:
         digest = self._digests[exam.path]
@@ -220,6 +243,7 @@ class Campaign:
             digest=digest_of(key),
             source=exam.path,
             source_sha256=digest,
+            address=exam.address,
             expected=expected,
             normalise=self.settings.normalise,
         )
@@ -268,6 +292,7 @@ class Campaign:
         unknown = len({exam.of_mass for exam in sound}) - len(groups)
         for names in _blocks(list(groups), self._block):
             self._stage("pool", [self._pool_task(name, groups[name]) for name in names])
+            self._copy(MASSES, names)
         self._stage("pool", [], without=unknown)
 
     def _why_not_pooled(self) -> str:

@@ -17,9 +17,10 @@ from typing import Any, Final
 
 from tactile_bayes.batch import CLUSTER_LOST, run_batch
 from tactile_bayes.batch_store import BatchStore
-from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.remote import sha256_of, version_of
 from tactile_bayes.pipeline.campaign_steps import stamp
 from tactile_bayes.records import dataclass
 
@@ -49,6 +50,7 @@ class Sources:
 class _Source:
     path: Path
     key: str
+    address: str = ""
 
 
 def read_sources(
@@ -71,7 +73,7 @@ def read_sources(
     TactileBayesError
         When the cluster was lost.
     """
-    settled, fresh = _sorted_out({exam.path: exam.file for exam in exams})
+    settled, fresh = _sorted_out({exam.path: exam for exam in exams})
     values: Mapping[str, Any] = {} if store is None else store.values
     found = Sources({one.path: values[one.key]["sha256"] for one in settled if one.key in values}, {})
     for sources, kept in ((settled, store if keep else None), (fresh, None)):
@@ -83,25 +85,33 @@ def read_sources(
             elif outcome.error == CLUSTER_LOST:
                 raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
-                found.faults[one.path] = outcome.error.removeprefix(f"{one.path}: ")
+                found.faults[one.path] = outcome.error.removeprefix(f"{one.address or one.path}: ")
     return found
 
 
-def _sorted_out(files: Mapping[Path, str]) -> tuple[list[_Source], list[_Source]]:
+def _sorted_out(exams: Mapping[Path, Exam]) -> tuple[list[_Source], list[_Source]]:
     """Files whose times can be trusted, and those changed a moment ago; each with its key."""
     settled: list[_Source] = []
     fresh: list[_Source] = []
     now = time.time()
-    for path, name in files.items():
+    for path, exam in exams.items():
         try:
-            said, known = stamp(path), path.stat()
-        except OSError:
-            fresh.append(_Source(path, name))
+            said, changed = _version(exam)
+        except (OSError, BadDataError):
+            fresh.append(_Source(path, exam.file, exam.address))
             continue
         said = hashlib.sha256(said.encode()).hexdigest()[:32]
-        changed = max(known.st_mtime, known.st_ctime)
-        (settled if changed < now - _SETTLED_S else fresh).append(_Source(path, f"{READ} {name} {said}"))
+        trusted = settled if changed < now - _SETTLED_S else fresh
+        trusted.append(_Source(path, f"{READ} {exam.file} {said}", exam.address))
     return settled, fresh
+
+
+def _version(exam: Exam) -> tuple[str, float]:
+    """What tells a file's content from a later one, and when it last changed; a store's tag needs no time."""
+    if exam.address:
+        return version_of(exam.address), 0.0
+    known = exam.path.stat()
+    return stamp(exam.path), max(known.st_mtime, known.st_ctime)
 
 
 def _key(source: _Source) -> str:
@@ -110,7 +120,8 @@ def _key(source: _Source) -> str:
 
 def _read(source: _Source) -> dict[str, Any]:
     begun = time.perf_counter()
-    return {"sha256": sha256(source.path), "seconds": round(time.perf_counter() - begun, 6)}
+    digest = sha256_of(source.address) if source.address else sha256(source.path)
+    return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
 
 
 def same_bytes(exams: Iterable[Exam], digests: Mapping[Path, str]) -> dict[str, str]:

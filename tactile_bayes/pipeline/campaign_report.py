@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.campaign import Campaign
-from tactile_bayes.pipeline.campaign_folder import EXAMS
+from tactile_bayes.pipeline.campaign_folder import EXAMS, JOURNAL
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, MAP, MAP_FIGURE, SIZE_FIGURE, THUMBNAIL
 from tactile_bayes.pipeline.campaign_tables import DONE, FAILURES, TRIAL, Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass
@@ -85,6 +85,21 @@ def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | No
     left_out = sorted(known - masses) if masses is not None else []
     names = tuple(f"{patient} {mass}" for patient, mass in left_out)
     return Written(*counts, len(campaign.found.results["pool"]), names, report, fault)
+
+
+def copy_outputs(folder: Path, address: str) -> None:
+    """Copy what lies beside the exams into the object store, and last the journal: with it the copy is whole.
+
+    Raises
+    ------
+    UsageError
+        When the store does not take it; what is done is kept.
+    """
+    from tactile_bayes.files.remote import put
+
+    for name in (*WRITTEN, JOURNAL):
+        if (folder / name).exists():
+            put(folder / name, f"{address}/{name}")
 
 
 def check_inputs(excision: Path | None, protocol: Path | None) -> None:

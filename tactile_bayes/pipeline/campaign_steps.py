@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,6 +30,7 @@ FILES: Final = {
     "estimate": (ESTIMATE, POSTERIOR, SHAPE, THUMBNAIL),
     "figures": (MAP_FIGURE, SIZE_FIGURE),
     "pool": (POOLED, POOLED_DRAWS),
+    "copy": (),
 }
 """The files that each step may write."""
 UNWRITTEN: Final = "unwritten"
@@ -56,8 +57,8 @@ class Task:
         Of the exam or mass.
     digest
         Of all that the step's files depend on.
-    source, source_sha256
-        map: the exam's file.
+    source, source_sha256, address
+        map: the exam's file; its address where it is in an object store.
     expected
         map: what the table says of the exam, by its columns.
     normalise
@@ -66,6 +67,8 @@ class Task:
         estimate, figures, pool: of the estimate.
     members
         pool: names and folders of the exams.
+    copies
+        copy: addresses in an object store, by the names of the files.
     """
 
     step: str
@@ -78,6 +81,8 @@ class Task:
     normalise: str = ""
     settings: Settings | None = None
     members: tuple[tuple[str, Path], ...] = ()
+    address: str = ""
+    copies: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
@@ -98,6 +103,8 @@ def run_step(task: Task) -> Result:
         found, writes = RUN[task.step](task)
     except BadDataError as error:
         raise BadDataError(error.what, way_out=error.way_out) from None
+    if UNWRITTEN in found:
+        return found
     try:
         task.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         for name, write in writes.items():
@@ -134,6 +141,8 @@ def _map(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.kinds import kind_of
 
+    if task.address:
+        return _fetched_map(task)
     if sha256(task.source) != task.source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
     kind = _KINDS.get(kind_of(task.source), "")
@@ -142,6 +151,14 @@ def _map(task: Task) -> tuple[Result, Writes]:
     if kind == "npz":
         return _imported_map(task)
     return _scanned_map(task)
+
+
+def _fetched_map(task: Task) -> tuple[Result, Writes]:
+    """Fetch the exam's file from its object store for as long as the map is made."""
+    from tactile_bayes.files.remote import fetched
+
+    with fetched(task.address) as path:
+        return _map(replace(task, source=path, address=""))
 
 
 def _scanned_map(task: Task) -> tuple[Result, Writes]:
@@ -303,6 +320,18 @@ def _pool(task: Task) -> tuple[Result, Writes]:
     return {}, writes
 
 
+def _copy(task: Task) -> tuple[Result, Writes]:
+    """Copy files into an object store."""
+    from tactile_bayes.files.remote import put
+
+    try:
+        for name, address in task.copies.items():
+            put(task.folder / name, address)
+    except UsageError as error:
+        return {UNWRITTEN: str(error)}, {}
+    return {}, {}
+
+
 def _answer(folder: Path) -> Answer:
     """An exam's answer for pooling, from its folder."""
     from tactile_bayes.files.documents import load_json
@@ -329,5 +358,6 @@ RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
     "estimate": _estimate,
     "figures": _figures,
     "pool": _pool,
+    "copy": _copy,
 }
 """What makes each step's files: what it found, and how to write each file."""
