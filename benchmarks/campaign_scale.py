@@ -4,12 +4,12 @@
     python -m benchmarks.campaign_scale run DIR -o out [--undisturbed]
     python -m benchmarks.campaign_scale report DIR -o out [--compare OTHER]
 
-`run` starts a scheduler and two workers, writes the table of exams and runs the campaign with `--method laplace`. At 20 %
-of the exams it kills a worker's process, which its nanny replaces; at 35 % a worker and its nanny, and starts another; at
-50 % the scheduler. Then the client must end with one line; scheduler, workers and the same client command are started
-again. Memory of each process is sampled every 5 s into `memory.csv`, what was done when goes to `events.txt`. `report`
-prints CPU times of an exam, memory, and whether a step was done twice, and compares the trial's rows with those of
-another run, which may have had fewer exams.
+`run` starts a scheduler and two workers, writes the table of exams and runs the campaign with `--method laplace`. At
+10 % of the exams it kills a worker's process, which its nanny replaces; at 18 % a worker and its nanny, and starts
+another; at 25 % the scheduler. Then the client must end with one line; scheduler, workers and the same client command
+are started again. Memory of each process is sampled every 5 s into `memory.csv`, what was done when goes to
+`events.txt`. `report` prints CPU times of an exam, memory, and whether a step was done twice, and compares the trial's
+rows with those of another run, which may have had fewer exams.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def run(folder: Path, out: str, *, undisturbed: bool) -> None:
     cluster = Cluster(notes, watch)
     cluster.start()
     try:
-        for accident in (None,) if undisturbed else (0.5, None):
+        for accident in (None,) if undisturbed else (0.25, None):
             _until_the_end(folder, out, watch, cluster, exams=exams, scheduler_dies_at=accident)
     finally:
         cluster.stop()
@@ -186,11 +186,8 @@ def _accidents(watch: Watch, cluster: Cluster, scheduler: float) -> list[tuple[f
         cluster.kill("scheduler")
         watch.tell("scheduler killed")
 
-    shares = (0.2, 0.35, 0.37, 0.5)
-    return [
-        (share * scheduler / 0.5, what)
-        for share, what in zip(shares, (worker_dies, nanny_dies, another, scheduler_dies), strict=True)
-    ]
+    return [(0.4 * scheduler, worker_dies), (0.7 * scheduler, nanny_dies), (0.74 * scheduler, another),
+            (scheduler, scheduler_dies)]  # fmt: skip
 
 
 def client(folder: Path, notes: Path, *words: str) -> subprocess.Popen[bytes]:
