@@ -4,8 +4,8 @@
 
 makes 12 exams of 6 patients in DIR, runs them once undisturbed, and then again and again with one worker or two. Each
 run is killed when it and its workers have used a random CPU time, and started again in the same folder until one ends
-by itself. Then the folder must hold the undisturbed run's bytes, the journal no step twice, and no temporary file may be
-left; after each kill the workers must end. The exit code is 1 where any of it fails.
+by itself. Then the folder must hold the undisturbed run's bytes, the journal no step twice, and no temporary file may
+be left; after each kill the workers must end. The exit code is 1 where any of it fails.
 """
 
 from __future__ import annotations

@@ -135,7 +135,7 @@ def run(
         campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=progress_bar)
         campaign.run()
         if not dry_run:
-            left = tidy(place, table, campaign.found.results)
+            left = tidy(place, table, campaign.found.results, unread=campaign.unread)
             written = write_outputs(campaign, excision, protocol)
             if of_all.copy_to:
                 copy_outputs(place, of_all.copy_to)

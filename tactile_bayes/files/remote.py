@@ -48,7 +48,9 @@ def version_of(address: str) -> str:
     Raises
     ------
     BadDataError
-        When it cannot be asked or there is none.
+        When there is none, or nobody with these credentials may read it.
+    UsageError
+        When the store does not answer or the package for it is missing.
     """
     try:
         known = _store(address).info(address)
@@ -119,15 +121,18 @@ def _store(address: str) -> Any:
         return fsspec.filesystem(scheme, use_listings_cache=False)
     except ImportError:
         raise UsageError(
-            f"{scheme}:// needs a package that is not installed; for s3:// pip install 'tactile-bayes[cloud]', for others "
-            "the package that fsspec names"
+            f"{scheme}:// needs a package that is not installed; for s3:// pip install 'tactile-bayes[cloud]', for "
+            "others the package that fsspec names"
         ) from None
 
 
 def _unreadable(address: str, error: Exception) -> Exception:
+    """A file's own fault where there is none or nobody may read it; otherwise the store's, which spares the exam."""
     if isinstance(error, UsageError):
         return error
-    return BadDataError(f"cannot be read ({_why(error)})", way_out="check address and credentials", path=address)
+    if isinstance(error, (FileNotFoundError, PermissionError, IsADirectoryError)):
+        return BadDataError(f"cannot be read ({_why(error)})", way_out="check address and credentials", path=address)
+    return UsageError(f"{address} cannot be read ({_why(error)}); check network and credentials, then run again")
 
 
 def _why(error: Exception) -> str:

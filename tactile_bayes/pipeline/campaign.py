@@ -137,6 +137,8 @@ class Campaign:
         Results, faults and counts, filled by `run`.
     not_pooled
         Why no mass is pooled; empty where masses are.
+    unread
+        Names of the exams whose file could not be read.
     """
 
     def __init__(
@@ -155,6 +157,7 @@ class Campaign:
         results = {step: StepResults(values) for step in FILES}
         self.found = CampaignState(results, seconds=median_seconds(values))
         self.not_pooled = ""
+        self.unread: set[str] = set()
         self._store, self._executor, self._dry = store, executor, dry
         self._bar: Bar = _no_bar if bar is None else bar
         self._tell: Progress = _untold
@@ -198,6 +201,7 @@ class Campaign:
         for exam in self.exams:
             if exam.path in sources.faults:
                 self.found.faults[exam.name] = Fault(READ, sources.faults[exam.path])
+                self.unread.add(exam.name)
         for name, reason in same_bytes(self.exams, self._digests).items():
             self.found.faults[name] = Fault(READ, reason)
 

@@ -105,7 +105,9 @@ class StepResults(Mapping[str, Result]):
         return len(self._keys)
 
 
-def tidy(folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str, Result]]) -> list[str]:
+def tidy(
+    folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str, Result]], *, unread: Collection[str] = ()
+) -> list[str]:
     """Remove files of earlier runs that this one would not make, and name the folders of exams no longer listed.
 
     Parameters
@@ -114,8 +116,11 @@ def tidy(folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str,
         Of the campaign.
     results
         By step, then by the name of the exam or mass.
+    unread
+        Exams whose file could not be read: a disk that is away costs nothing that is done.
     """
     left = []
+    spared = {*unread, *(exam.of_mass for exam in exams if exam.name in unread)}
     for kind, names, steps in (
         (EXAMS, {exam.name for exam in exams}, tuple(step for step in results if step != "pool")),
         (MASSES, {exam.of_mass for exam in exams}, ("pool",)),
@@ -123,6 +128,7 @@ def tidy(folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str,
         for name in sorted(_names_in(folder / kind)):
             if name not in names:
                 left.append(f"{kind}/{name}")
+            if name not in names or name in spared:
                 continue
             made = {file for step in steps if name in results[step] for file in results[step][name]["files"]}
             _clear(folder / kind / name, known={file for step in steps for file in FILES[step]}, made=made)
