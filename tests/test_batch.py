@@ -192,6 +192,34 @@ def test_items_of_one_fault_share_a_line():
     assert lines == ["0, 1, 2 and 2 more: lost", "x: odd"]
 
 
+def test_after_the_loss_of_a_cluster_nothing_more_is_handed_out(tmp_path):
+    class Lost(Executor):
+        """Answers twice, then is lost."""
+
+        ahead = 4
+
+        def __init__(self):
+            self.handed = []
+
+        def submit(self, function, /, *arguments):
+            future = Future()
+            self.handed.append(arguments[-1])
+            if len(self.handed) > 2:
+                future.cancel()
+                future.set_running_or_notify_cancel()
+            else:
+                future.set_result(function(*arguments))
+            return future
+
+    executor = Lost()
+    with open_store(tmp_path / "store", settings={}) as store:
+        outcomes = run_batch(draw, range(50), key=str, executor=executor, store=store)
+        assert set(store.values) == {"0", "1"}
+    assert len(executor.handed) < 10
+    assert [outcome.ok for outcome in outcomes] == [True] * 2 + [False] * 48
+    assert {outcome.error for outcome in outcomes[2:]} == {batch.CLUSTER_LOST}
+
+
 def test_negative_workers_are_refused():
     with pytest.raises(UsageError, match="workers is -1"):
         local_executor(-1)
@@ -300,6 +328,23 @@ def test_any_value_comes_back_from_the_store(tmp_path_factory, values):
         run_batch(values.__getitem__, values, key=lambda name: name, store=store)
     with open_store(path, settings={}) as store:
         assert store.values == values
+
+
+def test_a_store_holds_places_of_lines_and_reads_what_they_say(tmp_path):
+    path, long = tmp_path / "store", "x" * 20_000  # longer than one read
+    with open_store(path, settings={}) as store:
+        run_batch({"a": long, "b": 1}.__getitem__, ["a", "b"], key=str, store=store)
+        store.values.forget("a")
+        assert (list(store.values), store.values.get("a")) == (["b"], None)
+        store.add("a", "again")
+        assert store.values["a"] == "again"
+    data = path.read_bytes()
+    assert data.count(b'"key": "a"') == 2
+    with open_store(path, settings={}) as store:
+        assert (store.values["a"], store.values["b"]) == ("again", 1)  # the latest line of a name counts
+        path.write_bytes(data.replace(b'"value": 1', b'"value": 7'))
+        with pytest.raises(ValueError, match="checksum"):
+            store.values["b"]
 
 
 def test_failed_items_are_tried_again(tmp_path):
