@@ -176,7 +176,8 @@ def _source(thumbnail: bytes | str) -> str:
 
 def _size(card: Card) -> str:
     if card.size is None:
-        return f'<p class="why">{html.escape(f"{card.status}: {card.reason}")}</p>'
+        why = card.reason if card.status == FAILED else f"{card.status}: {card.reason}"  # a failure's reason says so
+        return f'<p class="why">{html.escape(why)}</p>'
     q = card.size
     interval = f"{100 * q['probability']:g} %: {q['low']:.1f} to {q['high']:.1f} mm"
     return f'<p><span class="size">{q["median"]:.1f} mm</span> ({html.escape(interval)})</p>'
