@@ -126,8 +126,8 @@ class Cluster:
                 process.wait()
 
 
-def run(folder: Path, out: str, *, undisturbed: bool) -> None:
-    """Run the campaign, with or without the accidents."""
+def run(folder: Path, out: str, *, scheduler_dies_at: float | None) -> None:
+    """Run the campaign, with the accidents on the way to this share of the exams; None for none."""
     notes = folder / f"{out}.notes"
     notes.mkdir(exist_ok=True)
     watch = Watch(notes, folder / out / JOURNAL)
@@ -138,7 +138,7 @@ def run(folder: Path, out: str, *, undisturbed: bool) -> None:
     cluster = Cluster(notes, watch)
     cluster.start()
     try:
-        for accident in (None,) if undisturbed else (0.25, None):
+        for accident in (None,) if scheduler_dies_at is None else (scheduler_dies_at, None):
             _until_the_end(folder, out, watch, cluster, exams=exams, scheduler_dies_at=accident)
     finally:
         cluster.stop()
@@ -250,9 +250,10 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--output", default="out")
     parser.add_argument("--undisturbed", action="store_true")
+    parser.add_argument("--scheduler-dies-at", type=float, default=0.25, help="share of the exams")
     parser.add_argument("--compare", type=Path)
     args = parser.parse_args()
     if args.what == "run":
-        run(args.folder, args.output, undisturbed=args.undisturbed)
+        run(args.folder, args.output, scheduler_dies_at=None if args.undisturbed else args.scheduler_dies_at)
     else:
         report(args.folder, args.output, args.compare)
