@@ -7,26 +7,21 @@ whatever order and by however many processes they are made.
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
-import stat
-import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from tactile_bayes.errors import BadDataError, UsageError, one_line
+from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.errors import BadDataError, one_line
 from tactile_bayes.executors import InlineExecutor, LocalWorkers
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-STORE_SCHEMA = "tactile-bayes.batch/2"
 # Items handed to the executor ahead of their results; bounds the memory that waiting items take.
 _WINDOW = 1024
 # Items named in a line on a fault they share.
@@ -36,6 +31,7 @@ _LISTED = 3
 DIED_TWICE = (
     "its process ended twice without an answer (killed, perhaps for lack of memory); run it again with fewer --workers"
 )
+DIED_OFTEN = "several workers of the cluster ended over it (killed, perhaps for lack of memory); give them more memory"
 CLUSTER_LOST = "the dask scheduler was lost before an answer came; start it again and run what is missing"
 
 
@@ -74,12 +70,14 @@ class BatchInterrupted(KeyboardInterrupt):
         How many items there were.
     store
         Where the results are kept for the next run; None where nothing keeps them.
+    before
+        Items done by earlier batches of the same run, for the message.
     """
 
-    def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None) -> None:
+    def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None, before: int = 0) -> None:
         self.outcomes = list(outcomes)
         kept = "" if store is None else f"; {store} keeps them, run again to go on"
-        super().__init__(f"{len(self.outcomes)} of {total} done{kept}")
+        super().__init__(f"{before + len(self.outcomes)} of {total} done{kept}")
 
 
 def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:
@@ -215,7 +213,7 @@ class _Run(Generic[Item, Result]):
             self._alone = bool(self._suspects)
             if self._alone:
                 self._submit(self._suspects.popleft())
-        ahead = _WINDOW if self._workers is None else self._workers.ahead
+        ahead: int = getattr(self._executor, "ahead", _WINDOW)
         while self._rest and not (self._alone or self._broken) and len(self._waiting) < ahead:
             self._submit(self._rest.popleft())
             if not self._finished.empty():
@@ -235,13 +233,27 @@ class _Run(Generic[Item, Result]):
         done = self._finished.get()
         work = self._waiting.pop(done)
         if self._workers is None or done.cancelled() or not isinstance(done.exception(), BrokenExecutor):
-            self._keep(_settle(work[0], done))
+            outcome = _settle(work[0], done)
+            self._keep(outcome)
+            if outcome.error == CLUSTER_LOST:
+                self._give_up()
             return
         self._broken = True
         if self._alone:
             self._keep(Outcome(work[0], error=DIED_TWICE))
         else:
             self._suspects.append(work)
+
+    def _give_up(self) -> None:
+        """End without the cluster: keep what has come, and hand out nothing more, for nobody would answer."""
+        for future, (name, _) in list(self._waiting.items()):
+            done = future.done()
+            future.cancel()
+            self._keep(_settle(name, future) if done else Outcome(name, error=CLUSTER_LOST))
+        for name, _ in self._rest:
+            self._keep(Outcome(name, error=CLUSTER_LOST))
+        self._waiting.clear()
+        self._rest.clear()
 
     def _abandon(self) -> None:
         """Cancel pending items, keep finished ones, and do not wait for running ones."""
@@ -270,173 +282,6 @@ def _settle(name: str, future: Future[tuple[Result | None, str]]) -> Outcome[Res
     except CancelledError:
         return Outcome(name, error=CLUSTER_LOST)
     except Exception as fault:
-        return Outcome(name, error=one_line(fault))
+        killed = type(fault).__name__ == "KilledWorker"  # dask's, after several workers ended over the item
+        return Outcome(name, error=DIED_OFTEN if killed else one_line(fault))
     return Outcome(name, value=value, error=error)
-
-
-class BatchStore:
-    """Results on disk, one line each, so that an interrupted batch resumes from what it has.
-
-    Open it with `open_store`. The first line names the settings; each further line is one item's result. A line is
-    JSON and its CRC-32, so that no damaged result is taken for a sound one. A line half written when the program was
-    killed is dropped.
-
-    Parameters
-    ----------
-    descriptor
-        Of the open, locked file.
-    path
-        For messages.
-    encode, decode
-        To and from what JSON can hold.
-    """
-
-    def __init__(
-        self,
-        descriptor: int,
-        path: Path,
-        *,
-        encode: Callable[[Any], Any],
-        decode: Callable[[Any], Any],
-    ) -> None:
-        self._descriptor = descriptor
-        self.path = path
-        self._encode = encode
-        self._decode = decode
-        self.values: dict[str, Any] = {}
-
-    def add(self, name: str, value: object) -> Any:
-        """Append one result and return it as it will be read back."""
-        line = json.dumps({"key": name, "value": self._encode(value)}, ensure_ascii=False)
-        self._append(_sealed(line))
-        self.values[name] = self._decode(json.loads(line)["value"])
-        return self.values[name]
-
-    def load(self, header: Mapping[str, Any]) -> None:
-        """Read the results of an earlier run, or write the header of a new store; for the errors see `open_store`."""
-        text = _read_all(self._descriptor)
-        whole = text[: text.rfind(b"\n") + 1]
-        first = _sealed(json.dumps(header, sort_keys=True, ensure_ascii=False))
-        if not whole and first.encode().startswith(text):
-            os.ftruncate(self._descriptor, 0)
-            self._append(first)
-            return
-        lines = whole.decode("utf-8", errors="replace").split("\n")[:-1]
-        _check_header(lines[0] if lines else "", header, path=self.path)
-        for number, line in enumerate(lines[1:], start=2):
-            name, value = _parse_line(line, number=number, path=self.path)
-            self.values[name] = self._decode(value)
-        os.ftruncate(self._descriptor, len(whole))
-
-    def _append(self, line: str) -> None:
-        rest = memoryview(line.encode() + b"\n")
-        try:
-            while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
-        except OSError as error:
-            raise UsageError(
-                f"{self.path} cannot be written ({error.strerror}); what it holds is kept: free space and run again"
-            ) from None
-
-
-@contextlib.contextmanager
-def open_store(
-    path: Path,
-    *,
-    settings: Mapping[str, Any],
-    encode: Callable[[Any], Any] = lambda value: value,
-    decode: Callable[[Any], Any] = lambda value: value,
-) -> Iterator[BatchStore]:
-    """Open or create a store, readable by its owner only and locked against a second run.
-
-    Parameters
-    ----------
-    settings
-        All that the results depend on besides the items' keys (options, seed, digests of inputs), as plain data.
-    encode, decode
-        How a result becomes plain data, and back. JSON keeps floats exactly; tuples come back as lists.
-
-    Raises
-    ------
-    UsageError
-        When the store was made with other settings, is in use or cannot be opened.
-    BadDataError
-        When the file is something else, or a line in its middle is damaged.
-    """
-    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC
-    try:
-        descriptor = os.open(path, flags, 0o600)
-    except OSError as error:
-        raise UsageError(f"{path} cannot be opened ({error.strerror}); choose another place") from None
-    try:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise UsageError(f"{path} is no regular file; choose another name")
-        _lock(descriptor, path)
-        store = BatchStore(descriptor, path, encode=encode, decode=decode)
-        store.load({"schema": STORE_SCHEMA, "settings": json.loads(json.dumps(settings))})
-        yield store
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _lock(descriptor: int, path: Path) -> None:
-    import fcntl
-
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise UsageError(f"{path} is in use by another run; wait for it or choose another name") from None
-
-
-def _read_all(descriptor: int) -> bytes:
-    os.lseek(descriptor, 0, os.SEEK_SET)
-    with open(descriptor, "rb", closefd=False) as file:
-        return file.read()
-
-
-def _sealed(text: str) -> str:
-    """Format a line of a store: the text and its checksum."""
-    return f"{text} {zlib.crc32(text.encode()):08x}"
-
-
-def _unsealed(line: str) -> Any:
-    """Read the text of a store's line; `ValueError` where it is damaged."""
-    text = line.rpartition(" ")[0]
-    if _sealed(text) != line:
-        raise ValueError("its checksum does not match")
-    return json.loads(text)
-
-
-def _check_header(line: str, wanted: Mapping[str, Any], *, path: Path) -> None:
-    try:
-        found, _ = json.JSONDecoder().raw_decode(line)  # that of another schema may have another checksum, or none
-        schema, settings = found["schema"], dict(found["settings"])
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise BadDataError("not a store of batch results", way_out="choose another name", path=str(path)) from None
-    if schema != wanted["schema"]:
-        raise BadDataError(
-            f"is a store of schema {schema}, this program writes {wanted['schema']}",
-            way_out="finish it with the version that began it, or choose another name",
-            path=str(path),
-        )
-    if _sealed(line.rpartition(" ")[0]) != line:
-        raise BadDataError("line 1 is damaged", way_out="choose another name", path=str(path))
-    new = dict(wanted["settings"])
-    differ = sorted(name for name in settings.keys() | new.keys() if settings.get(name) != new.get(name))
-    if differ:
-        name = differ[0]
-        raise UsageError(
-            f"{path} holds results of other settings ({', '.join(differ)}: {name} was {settings.get(name)!r}, "
-            f"is {new.get(name)!r}); choose another name, or remove it to begin again"
-        )
-
-
-def _parse_line(line: str, *, number: int, path: Path) -> tuple[str, Any]:
-    try:
-        record = _unsealed(line)
-        return str(record["key"]), record["value"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise BadDataError(
-            f"line {number} is damaged", way_out="remove that line: its item will be run again", path=str(path)
-        ) from None

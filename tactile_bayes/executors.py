@@ -93,6 +93,31 @@ def prepare_worker(leash: Connection | None = None) -> None:
         threading.Thread(target=end_with_parent, daemon=True).start()
 
 
+class ClusterWorkers(Executor):
+    """Workers of a dask cluster.
+
+    Parameters
+    ----------
+    cluster
+        From ``Client.get_executor``.
+    threads
+        How many items the cluster runs at a time.
+    """
+
+    def __init__(self, cluster: Executor, threads: int) -> None:
+        self._cluster = cluster
+        self.ahead = max(64, 4 * threads)
+        """Number of items to submit ahead: no worker waits, and the scheduler holds few at any time."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """The future of ``fn(*args, **kwargs)`` on one of the workers."""
+        return self._cluster.submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the items end, or cancel them."""
+        self._cluster.shutdown(wait=wait and not cancel_futures)
+
+
 class InlineExecutor(Executor):
     """Runs each item in this process when it is submitted."""
 
@@ -151,7 +176,8 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
                 "give the address it prints"
             ) from None
         _check_workers(client, address)
-        yield stack.enter_context(client.get_executor(pure=False))
+        workers = stack.enter_context(client.get_executor(pure=False))
+        yield ClusterWorkers(workers, sum(client.nthreads().values()))
 
 
 def _silence(library: str) -> None:

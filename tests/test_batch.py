@@ -21,7 +21,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes import batch, executors
-from tactile_bayes.batch import BatchInterrupted, fault_lines, open_store, run_batch
+from tactile_bayes.batch import BatchInterrupted, fault_lines, run_batch
+from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.executors import InlineExecutor, cluster_executor, local_executor, open_executor
 
@@ -191,6 +192,34 @@ def test_items_of_one_fault_share_a_line():
     assert lines == ["0, 1, 2 and 2 more: lost", "x: odd"]
 
 
+def test_after_the_loss_of_a_cluster_nothing_more_is_handed_out(tmp_path):
+    class Lost(Executor):
+        """Answers twice, then is lost."""
+
+        ahead = 4
+
+        def __init__(self):
+            self.handed = []
+
+        def submit(self, function, /, *arguments):
+            future = Future()
+            self.handed.append(arguments[-1])
+            if len(self.handed) > 2:
+                future.cancel()
+                future.set_running_or_notify_cancel()
+            else:
+                future.set_result(function(*arguments))
+            return future
+
+    executor = Lost()
+    with open_store(tmp_path / "store", settings={}) as store:
+        outcomes = run_batch(draw, range(50), key=str, executor=executor, store=store)
+        assert set(store.values) == {"0", "1"}
+    assert len(executor.handed) < 10
+    assert [outcome.ok for outcome in outcomes] == [True] * 2 + [False] * 48
+    assert {outcome.error for outcome in outcomes[2:]} == {batch.CLUSTER_LOST}
+
+
 def test_negative_workers_are_refused():
     with pytest.raises(UsageError, match="workers is -1"):
         local_executor(-1)
@@ -301,6 +330,23 @@ def test_any_value_comes_back_from_the_store(tmp_path_factory, values):
         assert store.values == values
 
 
+def test_a_store_holds_places_of_lines_and_reads_what_they_say(tmp_path):
+    path, long = tmp_path / "store", "x" * 20_000  # longer than one read
+    with open_store(path, settings={}) as store:
+        run_batch({"a": long, "b": 1}.__getitem__, ["a", "b"], key=str, store=store)
+        store.values.forget("a")
+        assert (list(store.values), store.values.get("a")) == (["b"], None)
+        store.add("a", "again")
+        assert store.values["a"] == "again"
+    data = path.read_bytes()
+    assert data.count(b'"key": "a"') == 2
+    with open_store(path, settings={}) as store:
+        assert (store.values["a"], store.values["b"]) == ("again", 1)  # the latest line of a name counts
+        path.write_bytes(data.replace(b'"value": 1', b'"value": 7'))
+        with pytest.raises(ValueError, match="checksum"):
+            store.values["b"]
+
+
 def test_failed_items_are_tried_again(tmp_path):
     with open_store(tmp_path / "store", settings={}) as store:
         run_batch(refuse_odd, range(4), key=str, store=store)
@@ -390,7 +436,7 @@ def test_a_full_disk_stops_the_batch_in_one_line():
         pytest.skip("this system has no /dev/full")
     descriptor = os.open(full, os.O_RDWR)
     try:
-        store = batch.BatchStore(descriptor, full, encode=lambda v: v, decode=lambda v: v)
+        store = BatchStore(descriptor, full, encode=lambda v: v, decode=lambda v: v)
         with pytest.raises(UsageError, match="cannot be written"):
             run_batch(draw, range(3), key=str, store=store)
     finally:
@@ -404,7 +450,8 @@ def test_a_killed_batch_resumes_and_its_workers_end(tmp_path, child_environment)
             """
             import os, sys, time
             from pathlib import Path
-            from tactile_bayes.batch import open_store, run_batch
+            from tactile_bayes.batch import run_batch
+            from tactile_bayes.batch_store import BatchStore, open_store
             from tactile_bayes.executors import local_executor
 
             def slow(item):

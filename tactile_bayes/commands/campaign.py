@@ -16,8 +16,9 @@ from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARC
 
 if TYPE_CHECKING:
     from tactile_bayes.files.manifest_csv import Exam
-    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
+    from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_report import Written
+    from tactile_bayes.pipeline.campaign_state import CampaignSettings
 
 _FILE = FilePath()
 _MOST_NAMED = 5
@@ -29,11 +30,13 @@ def command() -> None:
 
 
 @command.command("init")
-@click.argument("folder", metavar="FOLDER", type=_FILE)
+@click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
 @click.option("-o", "--output", required=True, metavar="EXAMS.csv", type=_FILE, help="Where to write the table.")
 @FORCE
-def init(folder: Path, output: Path, force: bool) -> None:
+def init(folder: Path | str, output: Path, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry.
+
+    FOLDER may be one in an object store, as s3://bucket/scans.
 
     Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
     are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
@@ -92,6 +95,9 @@ def init(folder: Path, output: Path, force: bool) -> None:
 @seed_option(1)
 @click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done and how long it takes, and do nothing.")
+@click.option(
+    "--copy-to", metavar="s3://BUCKET/FOLDER", help="Copy every file into this folder of an object store, step by step."
+)
 @WORKERS
 @scheduler_option("the exams")
 def run(
@@ -108,15 +114,15 @@ def run(
     seed: int,
     figures: bool,
     dry_run: bool,
+    copy_to: str | None,
     workers: int,
     scheduler: str | None,
 ) -> None:
     """Map, estimate and pool the exams of a table, and report the trial.
 
     DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
-    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. Where 5 masses have
-    several exams at one visit, the spread between exams is learned from them and every size is by it. An exam's fault
-    is its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
+    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. An exam's fault is
+    its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
     what depends on a file or setting that changed, and what failed.
 
     Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
@@ -125,35 +131,44 @@ def run(
     from tactile_bayes.commands.settings_file import repeatability_in, settings_of
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.manifest_csv import read_manifest
+    from tactile_bayes.files.remote import check_address
     from tactile_bayes.files.shipped import NONE
-    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
+    from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
-    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, write_outputs
+    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, copy_outputs, write_outputs
+    from tactile_bayes.pipeline.campaign_state import CampaignSettings
 
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
     also_read(given)
     settings = settings_of(
         settings_file, calibration=size_calibration, method=method, seed=seed, repeatability=repeatability_in(given)
     )
-    of_all = CampaignSettings(settings, normalise, figures, match_mm, own_repeatability=repeatability is None)
+    of_all = CampaignSettings(
+        settings,
+        normalise,
+        figures,
+        match_mm=match_mm,
+        own_repeatability=repeatability is None,
+        copy_to="" if copy_to is None else check_address(copy_to),
+    )
     table = read_manifest(exams)
     _check_paths(table, output, of_all)
     refuse_same(
-        [output / name for name in WRITTEN],
-        [path for path in (exams, excision, protocol, settings_file, given) if path],
+        [output / name for name in WRITTEN], [path for path in (exams, excision, protocol, settings_file) if path]
     )
     check_inputs(excision, protocol)
     with (
         open_campaign(output, dry=dry_run) as store,
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
-        progress_bar("steps") as progress,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, progress=progress)
+        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=progress_bar)
         campaign.run()
         if not dry_run:
-            left = tidy(place, table, campaign.found.results)
+            left = tidy(place, table, campaign.found.results, unread=campaign.unread)
             written = write_outputs(campaign, excision, protocol)
+            if of_all.copy_to:
+                copy_outputs(place, of_all.copy_to)
     if dry_run:
         _say_plan(campaign, workers)
     else:
@@ -171,7 +186,8 @@ def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings
     if settings.estimate.checkpoint is not None:
         raise UsageError("a checkpoint is for one map; leave it out of the settings file")
     folder = Path(os.path.realpath(output))
-    inside = next((exam.file for exam in table if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
+    local = [exam for exam in table if not exam.address]
+    inside = next((exam.file for exam in local if Path(os.path.realpath(exam.path)).is_relative_to(folder)), None)
     if inside is not None:
         raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
     for name in {settings.of(exam).calibration for exam in table} - {None}:
@@ -186,8 +202,10 @@ def _say_plan(campaign: Campaign, workers: int) -> None:
         if todo and step not in found.seconds:
             unknown.append(step)
         seconds += todo * found.seconds.get(step, 0.0)
-    for name, fault in found.faults.items():
+    for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"{name}: {fault.step} failed: {fault.reason}")
+    if len(found.faults) > _MOST_NAMED:
+        click.echo(f"{len(found.faults) - _MOST_NAMED} more failed")
     if unknown:
         click.echo(f"How long is not known: no {', '.join(unknown)} was run here yet.")
     else:

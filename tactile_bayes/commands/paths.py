@@ -22,10 +22,16 @@ class FilePath(click.Path):
     """Path that is checked against the other paths of the call before the command runs.
 
     Symbolic and hard links to one file are that file.
+
+    Parameters
+    ----------
+    addresses
+        Whether the address of an object store may stand instead; it stays a text.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, addresses: bool = False) -> None:
         super().__init__(path_type=Path)
+        self._addresses = addresses
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Record and return the path.
@@ -35,6 +41,8 @@ class FilePath(click.Path):
         UsageError
             When it is written and another argument of the command reads or writes it.
         """
+        if self._addresses and "://" in str(value):
+            return str(value)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if ctx is not None and param is not None:
             written = param.name in WRITTEN

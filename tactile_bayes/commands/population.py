@@ -87,7 +87,8 @@ def command(
     from dataclasses import asdict
     from functools import partial
 
-    from tactile_bayes.batch import fault_lines, open_store, run_batch
+    from tactile_bayes.batch import fault_lines, run_batch
+    from tactile_bayes.batch_store import open_store
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.executors import open_executor

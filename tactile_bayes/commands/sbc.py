@@ -16,7 +16,8 @@ from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 
 if TYPE_CHECKING:
-    from tactile_bayes.batch import BatchStore, Outcome
+    from tactile_bayes.batch import Outcome
+    from tactile_bayes.batch_store import BatchStore
     from tactile_bayes.size.log_quadratic import LogQuadratic
     from tactile_bayes.studies.sbc import MapRanks
 
@@ -173,7 +174,7 @@ def _kept(output: Path) -> Path:
 @contextmanager
 def _open_kept(output: Path | None, settings: dict[str, Any]) -> Iterator[BatchStore | None]:
     """Open the store of results beside the output; None without an output."""
-    from tactile_bayes.batch import open_store
+    from tactile_bayes.batch_store import open_store
 
     if output is None:
         yield None

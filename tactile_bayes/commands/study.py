@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from concurrent.futures import Executor
 
-    from tactile_bayes.batch import BatchStore, Outcome
+    from tactile_bayes.batch import Outcome
+    from tactile_bayes.batch_store import BatchStore
     from tactile_bayes.forward.plane.line import TactileLine
     from tactile_bayes.forward.plane.study import Geometry, LineFit, StudyRow, StudySettings
     from tactile_bayes.forward.solid.study import SolidSettings
@@ -258,7 +259,7 @@ def run_study(
     """
     from contextlib import nullcontext
 
-    from tactile_bayes.batch import open_store
+    from tactile_bayes.batch_store import open_store
 
     for geometry in geometries:
         settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)

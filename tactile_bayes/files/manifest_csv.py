@@ -10,7 +10,9 @@ from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.remote import check_address, is_address
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.shipped import NONE, SHIPPED
 from tactile_bayes.files.tables import Table, read_table
@@ -29,7 +31,7 @@ class Exam:
     Parameters
     ----------
     file, path
-        As the table has it, and where it is, absolute.
+        As the table has it, and where it is, absolute; of a file in an object store the path is no more than a name.
     patient, visit, mass, replicate
         Codes that name the exam.
     side, reader
@@ -56,6 +58,11 @@ class Exam:
     known: tuple[tuple[str, float], ...] = ()
     calibration: str | None = None
     line: int = field(default=0)
+
+    @property
+    def address(self) -> str:
+        """Address of a file in an object store; empty for one of this computer."""
+        return self.file if is_address(self.file) else ""
 
     @property
     def of_mass(self) -> str:
@@ -103,13 +110,22 @@ def _exam(table: Table, row: int) -> Exam:
     if calibration is not None and calibration not in (*SHIPPED, NONE):
         calibration = str(_inside(table, row, "calibration", calibration))
     return Exam(
-        path=Path(os.path.abspath(_inside(table, row, "file", cells["file"]))),  # noqa: PTH100 (links stay links)
+        path=_path(table, row, cells["file"]),
         centre_mm=None if x is None else (x, y),
         known=tuple((name, cells[f"known_{name}"]) for name in KNOWN if cells[f"known_{name}"] is not None),
         calibration=calibration,
         line=table.line_numbers[row],
         **{name: cells[name] for name in _WRITTEN},
     )
+
+
+def _path(table: Table, row: int, name: str) -> Path:
+    if not is_address(name):
+        return Path(os.path.abspath(_inside(table, row, "file", name)))  # noqa: PTH100 (links stay links)
+    try:
+        return Path(check_address(name))
+    except UsageError as error:
+        raise table.error(row, "file", str(error), way_out="correct the address") from None
 
 
 def _inside(table: Table, row: int, column: str, name: str) -> Path:

@@ -6,6 +6,10 @@ where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the jo
 key, the digests of its files and how long it took. The key is the step, the exam or mass, and a digest of the program's
 version, the settings and the content of the inputs. A step whose key is in the journal and whose files are what it made
 is not run again.
+
+Exams go through the steps in blocks, in the order of the table but for those whose mass another exam names by place:
+they come last. The results stay in the journal: memory holds the table of exams, a few hundred bytes for each step, and
+one block.
 """
 
 from __future__ import annotations
@@ -13,18 +17,21 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import field, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from tactile_bayes import __version__
-from tactile_bayes.batch import CLUSTER_LOST, BatchStore, run_batch
+from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
+from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.repeatability_json import read_repeatability
-from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged
-from tactile_bayes.pipeline.campaign_match import NamedPlace, named_exams
+from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, StepResults, median_seconds, unchanged
+from tactile_bayes.pipeline.campaign_inputs import READ, read_sources, same_bytes
+from tactile_bayes.pipeline.campaign_match import NamedPlace, named_exams, placed_exams
 from tactile_bayes.pipeline.campaign_repeatability import (
     FEWEST_MASSES,
     NOT_LEARNED,
@@ -32,10 +39,9 @@ from tactile_bayes.pipeline.campaign_repeatability import (
     repeated_masses,
     too_few,
 )
+from tactile_bayes.pipeline.campaign_state import CampaignSettings, CampaignState, Fault
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, REPEATABILITY, SHAPE, Result, Task, run_step
 from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.presets import DEFAULT_NORMALISE
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -43,78 +49,12 @@ if TYPE_CHECKING:
     from tactile_bayes.size.repeatability import Repeatability
 
 Progress = Callable[[int, int], None]
-MATCH_MM: Final = 15.0
-"""Default distance for matching a mass by its place: half of what lies between two masses that are told apart."""
-
-
-@dataclass(frozen=True, slots=True)
-class CampaignSettings:
-    """Settings of all exams.
-
-    Parameters
-    ----------
-    estimate
-        As of `estimate`; a row of the table may replace place, known values and calibration.
-    normalise
-        As of `map`.
-    match_mm
-        Within this distance a mass is that which another exam of the breast names by its place.
-    figures
-        Whether the figures of `estimate` are drawn for each exam.
-    own_repeatability
-        Whether the spread between exams is learned from the campaign's own repeats, where enough masses have them and
-        the estimate's settings do not say it.
-    """
-
-    estimate: Settings = field(default_factory=Settings)
-    normalise: str = DEFAULT_NORMALISE
-    figures: bool = False
-    match_mm: float = MATCH_MM
-    own_repeatability: bool = True
-
-    def of(self, exam: Exam) -> Settings:
-        """Settings of one exam's estimate."""
-        given: dict[str, Any] = {
-            "centre_mm": exam.centre_mm,
-            "calibration": exam.calibration,
-            "known": exam.known or None,
-        }
-        return replace(self.estimate, **{name: value for name, value in given.items() if value is not None})
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """Why a step of an exam or a mass gave nothing."""
-
-    step: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CampaignState:
-    """How far a campaign is: results by step and name, faults by name, counts and times of steps.
-
-    Parameters
-    ----------
-    results
-        By step, then by the name of the exam or mass.
-    faults
-        By the name of the exam or mass.
-    kept, todo
-        Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do.
-    seconds
-        Median time that one of each step took so far.
-    """
-
-    results: dict[str, dict[str, Result]] = field(default_factory=lambda: {step: {} for step in FILES})
-    faults: dict[str, Fault] = field(default_factory=dict)
-    kept: dict[str, int] = field(default_factory=dict)
-    todo: dict[str, int] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def of(self, step: str, name: str) -> Result | None:
-        """Result of a step of an exam or mass; None where there is none."""
-        return self.results[step].get(name)
+Bar = Callable[[str], AbstractContextManager[Progress]]
+_Any = TypeVar("_Any")
+_BLOCK: Final = 64
+"""Exams that go through the steps together at least; workers wait for the slowest of a block."""
+_AHEAD_IN_BLOCK: Final = 16
+"""Blocks hold so many times what an executor takes ahead."""
 
 
 class Campaign:
@@ -134,8 +74,8 @@ class Campaign:
         As `run_batch`'s.
     dry
         Plan only: nothing is run and nothing written.
-    progress
-        Called with steps of this run that are done, and those known to be needed.
+    bar
+        Gives, for what is counted ("files read", "steps"), a context with a callback for those done and those needed.
 
     Attributes
     ----------
@@ -147,6 +87,8 @@ class Campaign:
         Learned from the repeats; None where it was not.
     not_learned
         Why it was not, where masses have repeats; empty otherwise.
+    unread
+        Names of the exams whose file could not be read.
     """
 
     def __init__(
@@ -158,21 +100,27 @@ class Campaign:
         store: BatchStore | None,
         executor: Executor | None = None,
         dry: bool = False,
-        progress: Progress | None = None,
+        bar: Bar | None = None,
     ) -> None:
         self.exams, self.folder, self.settings = exams, folder, settings
-        self.found = CampaignState(seconds=median_seconds({} if store is None else store.values))
+        values = {} if store is None else store.values
+        results = {step: StepResults(values) for step in FILES}
+        self.found = CampaignState(results, seconds=median_seconds(values))
         self.not_pooled = ""
         self.repeatability: Repeatability | None = None
         self.not_learned = ""
-        self._sizes_unknown = False
-        self._store, self._executor, self._dry, self._progress = store, executor, dry, progress
-        self._done, self._total = 0, len(exams) * (3 if settings.figures else 2)
+        self.unread: set[str] = set()
+        self._store, self._executor, self._dry = store, executor, dry
+        self._bar: Bar = _no_bar if bar is None else bar
+        self._tell: Progress = _untold
+        self._done, self._total = 0, 0
+        self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
         self._digests: dict[Path, str] = {}
         self._calibrations: dict[str, str] = {}
+        self._breasts = placed_exams(exams)
 
     def run(self) -> CampaignState:
-        """Run what is missing: maps, then estimates, figures, the repeatability and sizes by it, and pooled sizes.
+        """Run what is missing: maps, estimates and figures block by block, then sizes by the repeats, and pooled ones.
 
         Raises
         ------
@@ -183,52 +131,62 @@ class Campaign:
         BatchInterrupted
             On Ctrl-C; what is done is kept.
         """
-        self._hash_sources()
-        self._refuse_same_files()
+        self._read_sources()
         sound = [exam for exam in self.exams if exam.name not in self.found.faults]
-        self._stage("map", [self._map_task(exam) for exam in sound])
-        mapped = [exam for exam in sound if self.found.of("map", exam.name)]
-        if not self._dry:
-            mapped = self._placed(mapped)
-        unmapped = 0 if not self._dry else len(sound) - len(mapped)
-        self._stage("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], unknown=unmapped)
-        estimated = [exam for exam in mapped if self.found.of("estimate", exam.name)]
-        waiting = 0 if not self._dry else len(sound) - len(estimated)
-        if self.settings.figures:
-            tasks = [self._estimate_task(exam, "figures") for exam in estimated]
-            self._stage("figures", tasks, unknown=waiting)
-        self._learn_repeatability(sound, estimated)
-        self._pool(sound, estimated)
+        self.not_pooled = self._why_not_pooled()
+        masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
+        per_exam = 2 + self.settings.figures + bool(self.settings.copy_to)
+        self._total = len(sound) * per_exam + masses * (2 if self.settings.copy_to else 1)
+        with self._bar("steps") as self._tell:
+            for block in _blocks(sorted(sound, key=lambda exam: bool(self._named(exam))), self._block):
+                self._estimate(block)
+            sizes_unknown = self._learn_repeatability(sound)
+            if masses:
+                self._pool(sound, sizes_unknown=sizes_unknown)
         return self.found
 
-    def _hash_sources(self) -> None:
-        of_path: dict[Path, list[Exam]] = defaultdict(list)
+    def _read_sources(self) -> None:
+        """Digests of all files: two exams of one file are found before any is mapped."""
+        with self._bar("files read") as tell:
+            sources = read_sources(
+                self.exams, store=self._store, keep=not self._dry, executor=self._executor, progress=tell
+            )
+        self._digests = sources.digests
         for exam in self.exams:
-            of_path[exam.path].append(exam)
-        outcomes = run_batch(_digest_of, of_path, key=str, executor=self._executor)
-        for (path, exams), outcome in zip(of_path.items(), outcomes, strict=True):
-            if outcome.value is not None:
-                self._digests[path] = outcome.value
-                continue
-            for exam in exams:
-                self.found.faults[exam.name] = Fault("read", outcome.error.removeprefix(f"{path}: "))
+            if exam.path in sources.faults:
+                self.found.faults[exam.name] = Fault(READ, sources.faults[exam.path])
+                self.unread.add(exam.name)
+        for name, reason in same_bytes(self.exams, self._digests).items():
+            self.found.faults[name] = Fault(READ, reason)
 
-    def _refuse_same_files(self) -> None:
-        """Exams of one file are faults, but for the masses of one scan, each with its place."""
-        same = defaultdict(list)
-        for exam in self.exams:
-            if exam.path in self._digests:
-                same[self._digests[exam.path]].append(exam)
-        for exams in same.values():
-            breasts = {(exam.patient, exam.visit, exam.side) for exam in exams}
-            placed = {one.mass for one in exams if one.centre_mm is not None or named_exams(one, self.exams)}
-            if len(exams) == 1 or (len(breasts) == 1 and len(placed) == len(exams)):
-                continue
-            for exam in exams:
-                others = [other for other in exams if other is not exam]
-                named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
-                way_out = "give each exam its own file, or each mass of a breast its centre_x_mm and centre_y_mm"
-                self.found.faults[exam.name] = Fault("read", f"holds the same bytes as {named}; {way_out}")
+    def _estimate(self, exams: Sequence[Exam]) -> None:
+        """Maps, estimates and figures of some exams."""
+        self._stage("map", [self._map_task(exam) for exam in exams])
+        mapped = self._placed([exam for exam in exams if exam.name in self.found.results["map"]])
+        unmapped = len(exams) - len(mapped)
+        self._stage("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
+        if self.settings.figures:
+            estimated = [exam for exam in mapped if exam.name in self.found.results["estimate"]]
+            tasks = [self._estimate_task(exam, "figures") for exam in estimated]
+            self._stage("figures", tasks, without=len(exams) - len(estimated))
+        self._copy(EXAMS, [exam.name for exam in exams], steps=("map", "estimate", "figures"))
+
+    def _copy(self, kind: str, names: Sequence[str], *, steps: Sequence[str]) -> None:
+        """Copy the files of exams or masses that some steps made into the object store."""
+        if not self.settings.copy_to:
+            return
+        tasks = []
+        for name in names:
+            made = [result["files"] for step in steps if (result := self.found.of(step, name)) is not None]
+            files = {file: digest for one in made for file, digest in one.items()}
+            if files:
+                tasks.append(self._copy_task(kind, name, files))
+        self._stage("copy", tasks, without=len(names) - len(tasks))
+
+    def _copy_task(self, kind: str, name: str, files: Mapping[str, str]) -> Task:
+        to = f"{self.settings.copy_to}/{kind}/{name}"
+        copies = {file: f"{to}/{file}" for file in files}
+        return Task("copy", name, self.folder / kind / name, digest_of({"to": to, "files": files}), copies=copies)
 
     def _map_task(self, exam: Exam) -> Task:
         digest = self._digests[exam.path]
@@ -242,6 +200,7 @@ class Campaign:
             digest=digest_of(key),
             source=exam.path,
             source_sha256=digest,
+            address=exam.address,
             expected=expected,
             normalise=self.settings.normalise,
         )
@@ -267,18 +226,24 @@ class Campaign:
             match_mm=self.settings.match_mm,
         )
 
+    def _named(self, exam: Exam) -> list[Exam]:
+        """Exams that name the masses of the breast by place, where this one names none; see `named_exams`."""
+        return named_exams(exam, self._breasts.get((exam.patient, exam.side), ()))
+
     def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
         """The exams without those whose mass is named by a place on a map that could not be made."""
-        lost = [exam for exam in mapped if named_exams(exam, self.exams) and not self._places(exam)]
-        for exam in lost:
-            named = ", ".join(one.name for one in named_exams(exam, self.exams) if one.mass == exam.mass)
-            reason = f"the place of its mass is on the map of {named}, which was not made"
-            self.found.faults[exam.name] = Fault("estimate", reason)
-        return [exam for exam in mapped if exam not in lost]
+        lost = {exam.name for exam in mapped if not self._dry and self._named(exam) and not self._places(exam)}
+        for exam in mapped:
+            if exam.name in lost:
+                named = ", ".join(one.name for one in self._named(exam) if one.mass == exam.mass)
+                reason = f"the place of its mass is on the map of {named}, which was not made"
+                self.found.faults[exam.name] = Fault("estimate", reason)
+        return [exam for exam in mapped if exam.name not in lost]
 
     def _places(self, exam: Exam) -> tuple[NamedPlace, ...]:
         """Places of the breast's masses that other exams name, where this one names none."""
-        mapped = [one for one in self.exams if self.found.of("map", one.name)]
+        breast = self._breasts.get((exam.patient, exam.side), ())
+        mapped = [one for one in breast if one.name in self.found.results["map"]]
         return tuple(
             NamedPlace(one.mass, one.name, self.folder / EXAMS / one.name / MAP, one.centre_mm)
             for one in named_exams(exam, mapped)
@@ -299,7 +264,7 @@ class Campaign:
         repeatability = plain.pop("repeatability")
         if repeatability is not None:
             plain["repeatability"] = repeatability.sha256 or repr(repeatability)
-        used = {"settings_sha256": None if file is None else _digest_of(file), "calibration": name}
+        used = {"settings_sha256": None if file is None else self._file_digest(file), "calibration": name}
         return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
 
     def _calibration_digest(self, name: str) -> str:
@@ -307,23 +272,36 @@ class Campaign:
 
         if name not in self._calibrations:
             path = size_calibration_path(name)
-            self._calibrations[name] = "" if path is None else _digest_of(path)
+            self._calibrations[name] = "" if path is None else self._file_digest(path)
         return self._calibrations[name]
 
-    def _learn_repeatability(self, sound: Sequence[Exam], estimated: Sequence[Exam]) -> None:
-        """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
+    def _file_digest(self, path: Path) -> str:
+        """Digest of a file that many exams use."""
+        from tactile_bayes.files.atomic import sha256
+
+        if path not in self._digests:
+            self._digests[path] = sha256(path)
+        return self._digests[path]
+
+    def _learn_repeatability(self, sound: Sequence[Exam]) -> bool:
+        """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left.
+
+        Returns
+        -------
+        Whether a plan cannot know the sizes, because what they depend on is not there yet.
+        """
         given = self.settings.estimate
         if not self.settings.own_repeatability or given.repeatability or given.between_map_sd is not None:
-            return
+            return False
+        estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
         masses = repeated_masses(sound if self._dry else estimated)
         if masses < FEWEST_MASSES:
             self.not_learned = too_few(masses) if masses else ""
-            return
+            return False
         self._total += 1
-        complete = not self._dry or len(estimated) == len(sound)
-        self._stage("repeatability", [self._repeatability_task(estimated)] if complete else [], unknown=not complete)
+        whole = not self._dry or len(estimated) == len(sound)
+        self._stage("repeatability", [self._repeatability_task(estimated)] if whole else [], without=int(not whole))
         result = self.found.of("repeatability", SITE)
-        self._sizes_unknown = result is None and self._dry
         if result is None:
             fault = self.found.faults.pop(SITE, None)
             self.not_learned = "" if fault is None else fault.reason
@@ -331,15 +309,25 @@ class Campaign:
             self.not_learned = result[NOT_LEARNED]
         else:
             self.repeatability = read_repeatability(self.folder / REPEATABILITY)
-        if self.repeatability is not None or self._sizes_unknown:
-            tasks = [task for exam in estimated if (task := self._size_task(exam)) is not None]
-            self._total += len(tasks)
-            self._stage("size", tasks, unknown=len(sound) if self._sizes_unknown else 0)
+            self._size_by_it(estimated)
+        unknown = result is None and self._dry
+        if unknown:
+            self._total += len(sound)
+            self._stage("size", [], without=len(sound))
+        return unknown
 
     def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
         files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
         repeats = tuple(exam_folders(exams, self.folder / EXAMS))
         return Task("repeatability", SITE, self.folder, digest_of([FEWEST_MASSES, files]), repeats=repeats)
+
+    def _size_by_it(self, estimated: Sequence[Exam]) -> None:
+        """Size exams by the repeatability, block by block."""
+        for block in _blocks(estimated, self._block):
+            tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
+            self._total += len(tasks) * (2 if self.settings.copy_to else 1)
+            self._stage("size", tasks)
+            self._copy(EXAMS, [task.name for task in tasks], steps=("size",))
 
     def _size_task(self, exam: Exam) -> Task | None:
         """Task of a size by the repeatability; None where the exam has no draws, or another calibration."""
@@ -366,29 +354,26 @@ class Campaign:
             return settings
         return replace(settings, repeatability=found)
 
-    def _pool(self, sound: Sequence[Exam], estimated: Sequence[Exam]) -> None:
-        """Pool every mass at every visit from the exams that were estimated, where some mass has several."""
+    def _pool(self, sound: Sequence[Exam], *, sizes_unknown: bool) -> None:
+        """Pool every mass at every visit from the exams that were estimated."""
         groups: dict[str, list[Exam]] = defaultdict(list)
-        for exam in estimated:
-            groups[exam.of_mass].append(exam)
-        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
-            self.not_pooled = "no mass has several exams at one visit"
-            return
-        self.not_pooled = self._why_not_pooled()
-        if self.not_pooled:
-            return
-        unknown = len({exam.of_mass for exam in sound} - set(groups)) if self._dry else 0
-        self._total += len(groups)
-        if self._sizes_unknown:
-            groups, unknown = {}, unknown + len(groups)
-        self._stage("pool", [self._pool_task(name, exams) for name, exams in groups.items()], unknown=unknown)
+        for exam in sound:
+            if exam.name in self.found.results["estimate"] and not sizes_unknown:
+                groups[exam.of_mass].append(exam)
+        unknown = len({exam.of_mass for exam in sound}) - len(groups)
+        for names in _blocks(list(groups), self._block):
+            self._stage("pool", [self._pool_task(name, groups[name]) for name in names])
+            self._copy(MASSES, names, steps=("pool",))
+        self._stage("pool", [], without=unknown)
 
     def _why_not_pooled(self) -> str:
-        """Why the calibration cannot pool; empty where it can."""
+        """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
         from tactile_bayes.files.shipped import size_calibration_path
         from tactile_bayes.files.size_json import read_size_calibration
         from tactile_bayes.size.body_calibration import BodyCalibration
 
+        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
+            return "no mass has several exams at one visit"
         for name in {self.settings.of(exam).calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))
             if path is None or not isinstance(read_size_calibration(path), BodyCalibration):
@@ -410,49 +395,74 @@ class Campaign:
         result = self.found.of(step, exam.name)
         return None if result is None else result["files"].get(file)
 
-    def _stage(self, step: str, tasks: Sequence[Task], *, unknown: int = 0) -> None:
-        """Run one step for all that need it; `unknown` is how many more a plan has whose inputs are not there yet."""
+    def _stage(self, step: str, tasks: Sequence[Task], *, without: int = 0) -> None:
+        """Run one step for those that need it.
+
+        Parameters
+        ----------
+        without
+            How many more have no inputs: in a plan they will need the step, in a run they failed before it.
+        """
         kept = self._kept(tasks)
-        self.found.kept[step] = len(kept)
-        self.found.todo[step] = len(tasks) - len(kept) + unknown
-        for task in tasks:
-            if task.key in kept:
-                self.found.results[step][task.name] = kept[task.key]
-        missing = [task for task in tasks if task.key not in kept]
+        for task in kept:
+            self.found.results[step].add(task.name, task.key)
+        done = {task.key for task in kept}
+        missing = [task for task in tasks if task.key not in done]
+        self.found.kept[step] += len(kept)
+        self.found.todo[step] += len(missing) + (without if self._dry else 0)
+        self._total -= len(kept) + without
         if self._dry:
             return
-        self._total -= len(kept)
-        outcomes = run_batch(
-            run_step, missing, key=_key, executor=self._executor, store=self._store, progress=self._tell
-        )
-        self._done += len(missing)
-        for task, outcome in zip(missing, outcomes, strict=True):
+        for task, outcome in zip(missing, self._run(missing), strict=True):
             if outcome.value is not None:
-                self.found.results[step][task.name] = outcome.value
+                self.found.results[step].add(task.name, task.key)
             elif outcome.error == CLUSTER_LOST:
                 raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
                 self.found.faults[task.name] = Fault(step, outcome.error)
 
-    def _kept(self, tasks: Sequence[Task]) -> dict[str, Result]:
-        """Results of earlier runs whose files are still what they were; others are forgotten."""
-        if self._store is None:
-            return {}
-        values = self._store.values
-        for task in tasks:
-            if task.key in values and not unchanged(task.folder, values[task.key]["files"]):
-                del values[task.key]
-        return {task.key: values[task.key] for task in tasks if task.key in values}
+    def _run(self, tasks: Sequence[Task]) -> list[Outcome[Result]]:
+        before = self._done
 
-    def _tell(self, done: int, total: int) -> None:
-        del total
-        if self._progress is not None:
-            self._progress(self._done + done, self._total)
+        def tell(done: int, _total: int) -> None:
+            self._tell(before + done, self._total)
+
+        try:
+            outcomes = run_batch(run_step, tasks, key=_key, executor=self._executor, store=self._store, progress=tell)
+        except BatchInterrupted as stop:
+            path = None if self._store is None else self._store.path
+            raise BatchInterrupted(stop.outcomes, total=self._total, store=path, before=before) from None
+        self._done += len(tasks)
+        return outcomes
+
+    def _kept(self, tasks: Sequence[Task]) -> list[Task]:
+        """Tasks done by earlier runs whose files are still what they were; the results of others are forgotten."""
+        if self._store is None:
+            return []
+        values = self._store.values
+        known = [task for task in tasks if task.key in values]
+        for task in known:
+            if not unchanged(task.folder, values[task.key]):
+                values.forget(task.key)
+        return [task for task in known if task.key in values]
 
 
 SITE: Final = "site"
 """Name of the one step that is of no exam or mass."""
 _POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
+
+
+def _blocks(items: Sequence[_Any], size: int) -> Iterator[Sequence[_Any]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
+
+
+def _untold(_done: int, _total: int) -> None:
+    """Progress that nobody watches."""
+
+
+def _no_bar(_label: str) -> AbstractContextManager[Progress]:
+    return nullcontext(_untold)
 
 
 def digest_of(key: object) -> str:
@@ -463,9 +473,3 @@ def digest_of(key: object) -> str:
 
 def _key(task: Task) -> str:
     return task.key
-
-
-def _digest_of(path: Path) -> str:
-    from tactile_bayes.files.atomic import sha256
-
-    return sha256(path)

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import statistics
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from tactile_bayes.batch import BatchStore, open_store
+from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
+from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result, stamp
 
 JOURNAL: Final = "campaign.journal"
 EXAMS, MASSES = "exams", "masses"
 _HEADER: Final = {"campaign": 1}
 _BESIDE: Final = ("repeatability",)
 """Steps whose files lie beside the exams."""
-_OF_EXAMS: Final = tuple(name for step, names in FILES.items() if step not in ("pool", *_BESIDE) for name in names)
+_LATEST: Final = 1000
+"""So many results of a step tell how long it takes."""
 
 
 @contextlib.contextmanager
@@ -58,23 +60,56 @@ def _taken(result: Result) -> Result:
     return result
 
 
-def unchanged(folder: Path, files: Mapping[str, str]) -> bool:
-    """Whether the files of a step, by name with their digests, are still what it wrote."""
+def unchanged(folder: Path, result: Result) -> bool:
+    """Whether the files of a step are still what it wrote: by their stamps, and where these differ by their digests."""
+    stamps = result.get("stamps", {})
+    return all(_same(folder / name, digest, stamps.get(name)) for name, digest in result["files"].items())
+
+
+def _same(path: Path, digest: str, stamped: str | None) -> bool:
     try:
-        return all(sha256(folder / name) == digest for name, digest in files.items())
-    except TactileBayesError:
+        return stamp(path) == stamped or sha256(path) == digest
+    except (OSError, TactileBayesError):
         return False
 
 
-def median_seconds(values: Mapping[str, Any]) -> dict[str, float]:
-    """Median seconds of each step, from results of any run."""
-    taken = defaultdict(list)
-    for key, value in values.items():
-        taken[key.split(" ")[0]].append(value["seconds"])
+def median_seconds(values: Mapping[str, Result]) -> dict[str, float]:
+    """Median seconds of each step, by its latest results of any run."""
+    taken: dict[str, list[float]] = defaultdict(list)
+    for key in reversed([*values]):
+        times = taken[key.split(" ")[0]]
+        if len(times) < _LATEST:
+            times.append(values[key]["seconds"])
     return {step: statistics.median(times) for step, times in taken.items()}
 
 
-def tidy(folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str, Result]]) -> list[str]:
+class StepResults(Mapping[str, Result]):
+    """Results of one step by the names of the exams or masses, read from the journal when they are asked for."""
+
+    def __init__(self, values: Mapping[str, Result]) -> None:
+        self._values = values
+        self._keys: dict[str, str] = {}
+
+    def add(self, name: str, key: str) -> None:
+        """Note under which key the journal holds a result."""
+        self._keys[name] = key
+
+    def __getitem__(self, name: str) -> Result:
+        return self._values[self._keys[name]]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._keys
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._keys)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+
+def tidy(
+    folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str, Result]], *, unread: Collection[str] = ()
+) -> list[str]:
     """Remove files of earlier runs that this one would not make, and name the folders of exams no longer listed.
 
     Parameters
@@ -83,28 +118,45 @@ def tidy(folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str,
         Of the campaign.
     results
         By step, then by the name of the exam or mass.
+    unread
+        Exams whose file could not be read: a disk that is away costs nothing that is done.
     """
-    made: dict[Path, set[str]] = {folder / EXAMS / exam.name: set() for exam in exams}
-    made |= {folder / MASSES / exam.of_mass: set() for exam in exams}
     for step in _BESIDE:
         kept = {name for result in results[step].values() for name in result["files"]}
         for name in set(FILES[step]) - kept:
             (folder / name).unlink(missing_ok=True)
-    for step, found in results.items():
-        if step in _BESIDE:
-            continue
-        place = folder / (MASSES if step == "pool" else EXAMS)
-        for name, result in found.items():
-            made[place / name] |= set(result["files"])
-    for place, kept in made.items():
-        for name in FILES["pool"] if place.parent.name == MASSES else _OF_EXAMS:
-            if name not in kept:
-                (place / name).unlink(missing_ok=True)
+    left = []
+    spared = {*unread, *(exam.of_mass for exam in exams if exam.name in unread)}
+    for kind, names, steps in (
+        (EXAMS, {exam.name for exam in exams}, tuple(step for step in results if step not in ("pool", *_BESIDE))),
+        (MASSES, {exam.of_mass for exam in exams}, ("pool",)),
+    ):
+        for name in sorted(_names_in(folder / kind)):
+            if name not in names:
+                left.append(f"{kind}/{name}")
+            if name not in names or name in spared:
+                continue
+            made = {file for step in steps if name in results[step] for file in results[step][name]["files"]}
+            _clear(folder / kind / name, known={file for step in steps for file in FILES[step]}, made=made)
+        _remove_if_empty(folder / kind)
+    return left
+
+
+def _names_in(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)  # noqa: PTH208 (names only: the directory may be large)
+    except OSError:
+        return []
+
+
+def _clear(place: Path, *, known: Collection[str], made: Collection[str]) -> None:
+    """Remove the files of a folder that a step makes and this run did not, and the folder when none is left."""
+    names = _names_in(place)
+    for name in names:
+        if name in known and name not in made:
+            (place / name).unlink(missing_ok=True)
+    if not made:
         _remove_if_empty(place)
-    for name in (EXAMS, MASSES):
-        _remove_if_empty(folder / name)
-    there = [one for name in (EXAMS, MASSES) for one in sorted((folder / name).glob("*"))]
-    return [f"{one.parent.name}/{one.name}" for one in there if one not in made]
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -10,10 +10,12 @@ from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.manifest_csv import natural
+from tactile_bayes.files.remote import check_address, fetched, files_below
 from tactile_bayes.pipeline.campaign_folder import JOURNAL
 from tactile_bayes.records import dataclass
 
 _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}
+_ENDINGS: Final = (".mcap", ".npz")
 _DEFAULTS: Final = {"patient": "", "visit": "1", "mass": "1", "side": ""}
 """Cells of a scan that does not say; patient and side are left blank, for somebody to fill in."""
 
@@ -26,11 +28,13 @@ class Found:
     skipped: list[str] = field(default_factory=list)
 
 
-def find_exams(folder: Path, table: Path) -> Found:
+def find_exams(folder: Path | str, table: Path) -> Found:
     """Look through a folder and those below it for scans (.mcap) and arrays of scans (.npz).
 
     Parameters
     ----------
+    folder
+        Of this computer, or the address of one in an object store.
     table
         Where the table will be: paths are written from its folder.
 
@@ -39,16 +43,10 @@ def find_exams(folder: Path, table: Path) -> Found:
     UsageError
         When the folder is none, or the table would lie outside it and not above it.
     """
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is not a directory; give the folder of the scans")
-    base = Path(os.path.realpath(table.parent))
-    if not Path(os.path.realpath(folder)).is_relative_to(base):
-        raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; write the table beside the scans")
     found = Found()
-    for path in _files(folder):
-        name = os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)
+    for where, name in _local(folder, table) if isinstance(folder, Path) else _stored(folder):
         try:
-            facts = _facts(path, name)
+            facts = _facts(where, name)
         except BadDataError as error:
             found.skipped.append(f"{name}: {error.what}")
         else:
@@ -56,6 +54,23 @@ def find_exams(folder: Path, table: Path) -> Found:
     found.rows.sort(key=lambda row: (natural(row["patient"]), natural(row["visit"]), row["mass"], row["file"]))
     _number(found.rows)
     return found
+
+
+def _local(folder: Path, table: Path) -> Iterator[tuple[Path, str]]:
+    """Files of a folder that may be scans, each with its name from the table's folder."""
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a directory; give the folder of the scans")
+    base = Path(os.path.realpath(table.parent))
+    if not Path(os.path.realpath(folder)).is_relative_to(base):
+        raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; write the table beside the scans")
+    for path in _files(folder):
+        yield path, os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)
+
+
+def _stored(address: str) -> Iterator[tuple[str, str]]:
+    """Files in an object store that may be scans, each named by its address."""
+    for one in files_below(check_address(address), *_ENDINGS):
+        yield one, one
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -66,16 +81,19 @@ def _files(folder: Path) -> Iterator[Path]:
             continue
         folders.sort()
         for name in sorted(names):
-            if name.lower().endswith((".mcap", ".npz")):
+            if name.lower().endswith(_ENDINGS):
                 yield Path(place) / name
 
 
-def _facts(path: Path, name: str) -> dict[str, str]:
+def _facts(path: Path | str, name: str) -> dict[str, str]:
     """What a file says of its exam, by the columns of the table."""
     if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
         raise BadDataError("the table takes no such file name: rename it")
-    if path.suffix.lower() == ".npz":
+    if name.lower().endswith(".npz"):
         return {}
+    if isinstance(path, str):
+        with fetched(path) as copy:
+            return _facts(copy, name)
     from tactile_bayes.files.scan_mcap import scan_records
 
     session = scan_records(path, keep=()).metadata.get("session", {})

@@ -49,6 +49,15 @@ class NamedPlace:
     centre_mm: tuple[float, float]
 
 
+def placed_exams(exams: Sequence[Exam]) -> dict[tuple[str, str | None], list[Exam]]:
+    """Exams that name their mass by place, by patient and side."""
+    found: dict[tuple[str, str | None], list[Exam]] = {}
+    for exam in exams:
+        if exam.centre_mm is not None:
+            found.setdefault((exam.patient, exam.side), []).append(exam)
+    return found
+
+
 def named_exams(exam: Exam, exams: Sequence[Exam]) -> list[Exam]:
     """For an exam without a place the exams that name one: for each mass of the breast one, of its visit if possible.
 

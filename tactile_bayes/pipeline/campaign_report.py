@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.campaign import Campaign
-from tactile_bayes.pipeline.campaign_folder import EXAMS
+from tactile_bayes.pipeline.campaign_folder import EXAMS, JOURNAL
 from tactile_bayes.pipeline.campaign_steps import (
     ESTIMATE,
     MAP,
@@ -31,7 +31,18 @@ if TYPE_CHECKING:
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
 WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX, REPEATABILITY)
 """Files beside the exams."""
-_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
+_MOST_INLINE: Final = 300
+"""With more exams the contact sheet names its thumbnails' files instead of holding them."""
+_MOST_CARDS: Final = 10_000
+"""More exams than a browser shows at ease."""
+_LINKS: Final = {
+    "map.png": MAP_FIGURE,
+    "size.png": SIZE_FIGURE,
+    "sized.png": SIZED_FIGURE,
+    "estimate.json": ESTIMATE,
+    "sized.json": SIZED,
+    "map.nc": MAP,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +106,21 @@ def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | No
     names = tuple(f"{patient} {mass}" for patient, mass in left_out)
     unnamed = tuple(row.exam.name for row in rows if row.unnamed)
     return Written(*counts, len(campaign.found.results["pool"]), names, report, fault, unnamed)
+
+
+def copy_outputs(folder: Path, address: str) -> None:
+    """Copy what lies beside the exams into the object store, and last the journal: with it the copy is whole.
+
+    Raises
+    ------
+    UsageError
+        When the store does not take it; what is done is kept.
+    """
+    from tactile_bayes.files.remote import put
+
+    for name in (*WRITTEN, JOURNAL):
+        if (folder / name).exists():
+            put(folder / name, f"{address}/{name}")
 
 
 def check_inputs(excision: Path | None, protocol: Path | None) -> None:
@@ -166,12 +192,16 @@ def _write_report(folder: Path, excision: Path, protocol: Path | None) -> tuple[
 
 
 def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int], links: Mapping[str, str]) -> str:
-    from tactile_bayes.report.campaign_html import campaign_html
+    from tactile_bayes.report.campaign_html import campaign_html, worst
 
-    cards = [_card(campaign, row) for row in rows]
+    cards = worst((_card(campaign, row) for row in rows), _MOST_CARDS)
+    if len(cards) <= _MOST_INLINE:
+        cards = [_self_contained(card, campaign.folder) for card in cards]
     masses = len(campaign.found.results["pool"])
     lines = [f"{len(rows)} exams: {counts_words(*counts)}."] + ([f"{masses} masses pooled."] if masses else [])
     lines += [repeatability_words(campaign)] if campaign.repeatability else []
+    if len(cards) < len(rows):
+        lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
     return campaign_html(cards, lines=lines, links=links, version=__version__)
 
 
@@ -184,16 +214,24 @@ def repeatability_words(campaign: Campaign) -> str:
     return f"{words[0].upper()}{words[1:]}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
 
 
+def _self_contained(card: Card, folder: Path) -> Card:
+    """The card with its picture instead of the picture's name."""
+    from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
+
+    if not isinstance(card.thumbnail, str):
+        return card
+    return replace(card, thumbnail=read_bytes(folder / card.thumbnail, most=IMAGE_BYTES))
+
+
 def counts_words(sized: int, unsized: int, failed: int) -> str:
     """How the exams ended, in words."""
     return f"{sized} sized, {unsized} without a size, {failed} failed"
 
 
 def _card(campaign: Campaign, row: Row) -> Card:
-    from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
     from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card
 
-    exam, folder = row.exam, campaign.folder / EXAMS / row.exam.name
+    exam = row.exam
     made = {
         name
         for step in ("map", "estimate", "figures", "size")
@@ -210,6 +248,6 @@ def _card(campaign: Campaign, row: Row) -> Card:
         size=row.size,
         cautions=tuple(row.cautions),
         checks=tuple(row.checks),
-        thumbnail=read_bytes(folder / THUMBNAIL, most=IMAGE_BYTES) if THUMBNAIL in made else None,
-        links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},
+        thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
+        links={words: f"{EXAMS}/{exam.name}/{name}" for words, name in _LINKS.items() if name in made},
     )

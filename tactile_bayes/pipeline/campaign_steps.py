@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -35,6 +35,7 @@ FILES: Final = {
     "repeatability": (REPEATABILITY,),
     "size": (SIZED, SIZED_FIGURE),
     "pool": (POOLED, POOLED_DRAWS),
+    "copy": (),
 }
 """The files that each step may write."""
 UNWRITTEN: Final = "unwritten"
@@ -61,8 +62,8 @@ class Task:
         Of the exam or mass.
     digest
         Of all that the step's files depend on.
-    source, source_sha256
-        map: the exam's file.
+    source, source_sha256, address
+        map: the exam's file; its address where it is in an object store.
     expected
         map: what the table says of the exam, by its columns.
     normalise
@@ -78,6 +79,8 @@ class Task:
         repeatability: the exams.
     figures
         size: whether to draw it.
+    copies
+        copy: addresses in an object store, by the names of the files.
     """
 
     step: str
@@ -95,6 +98,8 @@ class Task:
     members: tuple[tuple[str, Path], ...] = ()
     repeats: tuple[ExamFolder, ...] = ()
     figures: bool = False
+    address: str = ""
+    copies: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
@@ -103,18 +108,20 @@ class Task:
 
 
 def run_step(task: Task) -> Result:
-    """Run a step; returns the digests of its files by name, the seconds it took and what else it found.
+    """Run a step; returns digests and stamps of its files by name, the seconds it took and what else it found.
 
     Raises
     ------
     TactileBayesError
         What is wrong with the exam, without a path.
     """
-    begun = time.perf_counter()
+    begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
         found, writes = RUN[task.step](task)
     except BadDataError as error:
         raise BadDataError(error.what, way_out=error.way_out) from None
+    if UNWRITTEN in found:
+        return found
     try:
         task.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         for name, write in writes.items():
@@ -124,17 +131,26 @@ def run_step(task: Task) -> Result:
                 (task.folder / name).unlink(missing_ok=True)
     except (UsageError, OSError) as error:
         return {UNWRITTEN: str(error)}
-    files = _digests(task.folder, [*writes])
-    return {"files": files, "seconds": round(time.perf_counter() - begun, 3), **found}
+    files, stamps = _digests(task.folder, [*writes])
+    spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.thread_time() - begun_cpu}
+    return {"files": files, "stamps": stamps, **{name: round(one, 3) for name, one in spent.items()}, **found}
 
 
 Writes = dict[str, Callable[[Path], object]]
 
 
-def _digests(folder: Path, names: list[str]) -> dict[str, str]:
+def stamp(path: Path) -> str:
+    """Size, times and inode of a file, which differ when it was written to or replaced."""
+    known = path.stat()
+    return f"{known.st_size} {known.st_mtime_ns} {known.st_ctime_ns} {known.st_ino}"
+
+
+def _digests(folder: Path, names: list[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Digests and stamps of files; each stamp is taken before the digest, so that a later change shows."""
     from tactile_bayes.files.atomic import sha256
 
-    return {name: sha256(folder / name) for name in names}
+    stamps = {name: stamp(folder / name) for name in names}
+    return {name: sha256(folder / name) for name in names}, stamps
 
 
 def _map(task: Task) -> tuple[Result, Writes]:
@@ -142,6 +158,8 @@ def _map(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.kinds import kind_of
 
+    if task.address:
+        return _fetched_map(task)
     if sha256(task.source) != task.source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
     kind = _KINDS.get(kind_of(task.source), "")
@@ -150,6 +168,14 @@ def _map(task: Task) -> tuple[Result, Writes]:
     if kind == "npz":
         return _imported_map(task)
     return _scanned_map(task)
+
+
+def _fetched_map(task: Task) -> tuple[Result, Writes]:
+    """Fetch the exam's file from its object store for as long as the map is made."""
+    from tactile_bayes.files.remote import fetched
+
+    with fetched(task.address) as path:
+        return _map(replace(task, source=path, address=""))
 
 
 def _scanned_map(task: Task) -> tuple[Result, Writes]:
@@ -320,6 +346,18 @@ def _pool(task: Task) -> tuple[Result, Writes]:
     return {}, writes
 
 
+def _copy(task: Task) -> tuple[Result, Writes]:
+    """Copy files into an object store."""
+    from tactile_bayes.files.remote import put
+
+    try:
+        for name, address in task.copies.items():
+            put(task.folder / name, address)
+    except UsageError as error:
+        return {UNWRITTEN: str(error)}, {}
+    return {}, {}
+
+
 def _answer(folder: Path) -> Answer:
     """An exam's answer for pooling, from its folder."""
     from tactile_bayes.files.documents import load_json
@@ -360,5 +398,6 @@ RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
     "repeatability": _repeatability,
     "size": _size,
     "pool": _pool,
+    "copy": _copy,
 }
 """What makes each step's files: what it found, and how to write each file."""

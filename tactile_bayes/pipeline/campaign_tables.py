@@ -28,6 +28,13 @@ _DONE_COLUMNS: Final = (
     "centre_y_mm", "cautions", "checks", "synthetic",
 )  # fmt: skip
 _FAILURE_COLUMNS: Final = ("patient", "visit", "mass", "replicate", "file", "step", "reason")
+_OF_ESTIMATE: Final = (
+    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability",
+)  # fmt: skip
+_OF_MASS: Final = ("reported", "centre_mm")
+_OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
+_OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
+"""What tables and pages show of a document: the rest of it is a hundred times as much."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,15 +129,26 @@ def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
     if fault is not None and fault.step != "figures":
         return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
     by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
-    document = load_json(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE))
-    assert isinstance(document, dict)
+    document = estimate_facts(load_json(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE)))
     return Row(exam, document, synthetic=mapped.get("synthetic"), outlying=outlying, **facts)
 
 
+def estimate_facts(document: Any) -> dict[str, Any]:
+    """What tables and pages need of an estimate's JSON object."""
+    diagnostics = {name: document["diagnostics"].get(name, []) for name in _OF_DIAGNOSTICS}
+    masses = [{name: mass[name] for name in _OF_MASS} for mass in document["masses"]]
+    return {name: document[name] for name in _OF_ESTIMATE} | {"masses": masses, "diagnostics": diagnostics}
+
+
 def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
-    """JSON object of each pooled mass, by its name."""
-    found = {name: load_json(campaign.folder / MASSES / name / POOLED) for name in campaign.found.results["pool"]}
-    return {name: document for name, document in found.items() if isinstance(document, dict)}
+    """What tables need of the JSON object of each pooled mass, by its name."""
+    found = {}
+    for name in campaign.found.results["pool"]:
+        document = load_json(campaign.folder / MASSES / name / POOLED)
+        if isinstance(document, dict):
+            found[name] = {key: document[key] for key in _OF_POOLED}
+            found[name]["maps"] = [{key: one[key] for key in ("map", "outlying")} for one in document["maps"]]
+    return found
 
 
 def done_text(rows: Sequence[Row]) -> str:

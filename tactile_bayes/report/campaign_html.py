@@ -4,35 +4,45 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import heapq
 import html
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
 from typing import Final
+from urllib.parse import quote
 
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.records import dataclass
 
 FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
 _STYLE = """
-body{font:15px/1.45 system-ui,sans-serif;color:#1b1b1b;margin:1.5rem auto;padding:0 1.2rem;max-width:90rem}
+:root{color-scheme:light dark;--ink:#1b1b1b;--paper:#fff;--soft:#5a5a5a;--line:#d5d5d5;--mark:#fff3d6;--doubt:#8f3d0c}
+@media(prefers-color-scheme:dark){:root{--ink:#e6e6e6;--paper:#181a1b;--soft:#a8a8a8;--line:#444;--mark:#40331a;
+--doubt:#f0a878}a{color:#8ab4f8}}
+body{font:15px/1.45 system-ui,sans-serif;color:var(--ink);background:var(--paper);margin:1.5rem auto;padding:0 1.2rem;
+max-width:90rem}
 h1{font-size:1.5rem;margin:0 0 .2rem}h2{font-size:1rem;margin:0;overflow-wrap:anywhere}p{margin:.25rem 0}
-.mark{background:#fff3d6;padding:.35rem .7rem;border-left:4px solid #c8641e}.note{color:#5a5a5a;font-size:.84rem}
-form{display:flex;flex-wrap:wrap;gap:.4rem 1.2rem;margin:.8rem 0;align-items:center}input[type=search]{width:16rem}
-main{display:grid;grid-template-columns:repeat(auto-fill,minmax(19rem,1fr));gap:.8rem}
-article{border:1px solid #d5d5d5;border-top:4px solid #4a7d4f;padding:.6rem .7rem;break-inside:avoid}
-article.failed{border-top-color:#a22}article.without{border-top-color:#c8641e}article[hidden]{display:none}
+.mark{background:var(--mark);padding:.35rem .7rem;border-left:4px solid #c8641e}
+.note{color:var(--soft);font-size:.84rem;overflow-wrap:anywhere}
+form{display:flex;flex-wrap:wrap;gap:.4rem 1.2rem;margin:.8rem 0;align-items:center}form[hidden]{display:none}
+input[type=search]{width:16rem;max-width:100%}
+main{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(19rem,100%),1fr));gap:.8rem}
+article{border:1px solid var(--line);border-top:4px solid #4a7d4f;padding:.6rem .7rem;break-inside:avoid;
+content-visibility:auto;contain-intrinsic-size:auto 20rem}
+article.failed{border-top-color:#c33}article.without{border-top-color:#c8641e}article[hidden]{display:none}
 img{display:block;margin:.35rem 0;max-width:100%;image-rendering:pixelated}ul{margin:.25rem 0;padding-left:1.1rem}
-li,.why{font-size:.86rem;overflow-wrap:anywhere}.caution{color:#8f3d0c}.size{font-size:1.12rem;font-weight:600}
+li,.why{font-size:.86rem;overflow-wrap:anywhere}.caution{color:var(--doubt)}.size{font-size:1.12rem;font-weight:600}
 """
 _SCRIPT = """
 const form = document.querySelector("form"), cards = [...document.querySelectorAll("article")];
 const shown = document.getElementById("shown");
+let texts = null;
 function filter() {
   const words = form.words.value.toLowerCase().split(/\\s+/).filter(Boolean);
+  texts ??= cards.map(card => card.textContent.toLowerCase());
   let count = 0;
-  for (const card of cards) {
-    const text = card.textContent.toLowerCase();
-    card.hidden = !(words.every(word => text.includes(word)) &&
+  for (const [i, card] of cards.entries()) {
+    card.hidden = !(words.every(word => texts[i].includes(word)) &&
       (!form.status.value || card.dataset.status === form.status.value) &&
       (!form.flagged.checked || card.dataset.flagged === "yes"));
     count += !card.hidden;
@@ -42,7 +52,7 @@ function filter() {
 form.hidden = false;
 form.addEventListener("input", filter);
 form.addEventListener("submit", event => event.preventDefault());
-filter();
+shown.textContent = cards.length + " of " + cards.length + " shown";
 """
 _CLASSES: Final = {FAILED: "failed", UNSIZED: "without", SIZED: "sized"}
 
@@ -64,7 +74,7 @@ class Card:
     cautions, checks
         What puts the size in doubt, and what is to be looked at.
     thumbnail
-        PNG of the map; None without one.
+        PNG of the map, or the name of its file from the page's folder; None without one.
     links
         Files in the exam's folder, by the words of their links.
     """
@@ -76,7 +86,7 @@ class Card:
     size: Mapping[str, float] | None = None
     cautions: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
-    thumbnail: bytes | None = None
+    thumbnail: bytes | str | None = None
     links: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -87,13 +97,18 @@ class Card:
         return order, -(10 * len(self.cautions) + len(self.checks)), -wide
 
 
+def worst(cards: Iterable[Card], most: int) -> list[Card]:
+    """Up to `most` cards, those to be looked at first before the others."""
+    return heapq.nsmallest(most, cards, key=lambda card: (card.badness, card.name))
+
+
 def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping[str, str], version: str) -> str:
-    """Full page; every text is escaped, nothing is loaded, and the only script is the page's own filter.
+    """Full page; every text is escaped, nothing is loaded but thumbnails beside it, and the only script is its filter.
 
     Parameters
     ----------
     cards
-        Shown worst first.
+        In the order in which they are shown.
     lines
         Summary, in sentences.
     links
@@ -102,7 +117,8 @@ def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping
         Of the program.
     """
     script_hash = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
-    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{script_hash}'"
+    images = "'self' file:" if any(isinstance(card.thumbnail, str) for card in cards) else "data:"
+    policy = f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'; script-src 'sha256-{script_hash}'"
     title = "Exams of a campaign"
     parts = [
         "<!doctype html>",
@@ -115,7 +131,7 @@ def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping
         f"<p>{_links(links)}</p>",
         *_filters(cards),
         "<main>",
-        *(part for card in sorted(cards, key=lambda one: (one.badness, one.name)) for part in _card(card)),
+        *(part for card in cards for part in _card(card)),
         "</main>",
         '<p class="note">Ring: the ellipse of the estimated size. Colours of each map span its own values. '
         f"tactile-bayes {html.escape(version)}.</p>",
@@ -142,8 +158,7 @@ def _card(card: Card) -> Iterator[str]:
     yield f"<h2>{html.escape(card.name)}</h2>"
     yield f'<p class="note">{html.escape(", ".join(card.facts))}</p>'
     if card.thumbnail is not None:
-        data = base64.b64encode(card.thumbnail).decode("ascii")
-        yield f'<img alt="Map of {html.escape(card.name)}" src="data:image/png;base64,{data}">'
+        yield f'<img loading="lazy" alt="Map of {html.escape(card.name)}" src="{_source(card.thumbnail)}">'
     yield _size(card)
     flags = [("caution", one) for one in card.cautions] + [("check", one) for one in card.checks]
     if flags:
@@ -153,9 +168,16 @@ def _card(card: Card) -> Iterator[str]:
     yield "</article>"
 
 
+def _source(thumbnail: bytes | str) -> str:
+    if isinstance(thumbnail, str):
+        return html.escape(quote(thumbnail))
+    return f"data:image/png;base64,{base64.b64encode(thumbnail).decode('ascii')}"
+
+
 def _size(card: Card) -> str:
     if card.size is None:
-        return f'<p class="why">{html.escape(f"{card.status}: {card.reason}")}</p>'
+        why = card.reason if card.status == FAILED else f"{card.status}: {card.reason}"  # a failure's reason says so
+        return f'<p class="why">{html.escape(why)}</p>'
     q = card.size
     interval = f"{100 * q['probability']:g} %: {q['low']:.1f} to {q['high']:.1f} mm"
     return f'<p><span class="size">{q["median"]:.1f} mm</span> ({html.escape(interval)})</p>'

@@ -14,7 +14,7 @@ import hostile
 import numpy as np
 import pytest
 
-from tactile_bayes.batch import open_store
+from tactile_bayes.batch_store import open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.arrays_npz import read_arrays
 from tactile_bayes.files.checkpoint_npz import CheckpointFile

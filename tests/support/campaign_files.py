@@ -81,9 +81,10 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def steps(folder: Path) -> list[str]:
-    """Steps in the journal, ``map 07.v1.m1.r1``, in the order in which they were done."""
+    """Steps in the journal, ``map 07.v1.m1.r1``, in the order in which they were done; digests of inputs left out."""
     lines = (folder / JOURNAL).read_text().splitlines()[1:]
-    return [" ".join(line.split('"')[3].split(" ")[:2]) for line in lines]
+    done = [" ".join(line.split('"')[3].split(" ")[:2]) for line in lines]
+    return [one for one in done if not one.startswith("read ")]
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

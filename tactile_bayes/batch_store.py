@@ -1,0 +1,247 @@
+"""Results of a batch on disk, one line each: an interrupted batch resumes from what it has.
+
+The first line names the settings; each further line is one item's result: JSON and its CRC-32, so that no damaged
+result is taken for a sound one. Memory holds where each line is and not what it says, so a store may be larger than
+memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import stat
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.errors import BadDataError, UsageError
+
+STORE_SCHEMA: Final = "tactile-bayes.batch/2"
+_FLUSHED_EVERY_S: Final = 5.0
+"""Lines reach the disk at least this often: what a loss of power may cost."""
+_READ_BYTES: Final = 4096
+
+
+class StoredValues(Mapping[str, Any]):
+    """Results by the names of their items, each read from the store's file when it is asked for."""
+
+    def __init__(self, descriptor: int, decode: Callable[[Any], Any]) -> None:
+        self._descriptor, self._decode = descriptor, decode
+        self._at: dict[str, int] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        return self._decode(_unsealed(_line_at(self._descriptor, self._at[name]))["value"])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._at
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._at)
+
+    def __len__(self) -> int:
+        return len(self._at)
+
+    def place(self, name: str, offset: int) -> None:
+        """Note where the line of a result begins; the latest line of a name counts."""
+        self._at[name] = offset
+
+    def forget(self, name: str) -> None:
+        """Take a result for missing in this run; its line stays in the file."""
+        del self._at[name]
+
+
+class BatchStore:
+    """Results on disk; open it with `open_store`. A line half written when the program was killed is dropped.
+
+    Parameters
+    ----------
+    descriptor
+        Of the open, locked file.
+    path
+        For messages.
+    encode, decode
+        To and from what JSON can hold.
+
+    Attributes
+    ----------
+    values
+        Results by the names of their items.
+    """
+
+    def __init__(
+        self,
+        descriptor: int,
+        path: Path,
+        *,
+        encode: Callable[[Any], Any],
+        decode: Callable[[Any], Any],
+    ) -> None:
+        self._descriptor = descriptor
+        self.path = path
+        self._encode = encode
+        self._decode = decode
+        self._end = 0
+        self._flush_at = time.monotonic() + _FLUSHED_EVERY_S
+        self.values = StoredValues(descriptor, decode)
+
+    def add(self, name: str, value: object) -> Any:
+        """Append one result and return it as it will be read back."""
+        line = json.dumps({"key": name, "value": self._encode(value)}, ensure_ascii=False)
+        began = self._end
+        self._append(_sealed(line))
+        self.values.place(name, began)
+        return self._decode(json.loads(line)["value"])
+
+    def load(self, header: Mapping[str, Any]) -> None:
+        """Find the results of an earlier run, or write the header of a new store; for the errors see `open_store`."""
+        with open(self._descriptor, "rb", closefd=False) as file:
+            first = file.readline()
+            if not self._begun(first, header):
+                return
+            self._end = len(first)
+            for number, line in enumerate(file, start=2):
+                if not line.endswith(b"\n"):
+                    break
+                name = _name_in(line[:-1].decode("utf-8", errors="replace"), number=number, path=self.path)
+                self.values.place(name, self._end)
+                self._end += len(line)
+        os.ftruncate(self._descriptor, self._end)
+
+    def _begun(self, line: bytes, header: Mapping[str, Any]) -> bool:
+        """Whether the file's first line is this header; a missing one, or the beginning of one, is written."""
+        wanted = _sealed(json.dumps(header, sort_keys=True, ensure_ascii=False))
+        if not line.endswith(b"\n") and wanted.encode().startswith(line):
+            os.ftruncate(self._descriptor, 0)
+            self._append(wanted)
+            return False
+        whole = line[:-1].decode("utf-8", errors="replace") if line.endswith(b"\n") else ""
+        _check_header(whole, header, path=self.path)
+        return True
+
+    def _append(self, line: str) -> None:
+        data = line.encode() + b"\n"
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+            if time.monotonic() >= self._flush_at:
+                os.fdatasync(self._descriptor)
+                self._flush_at = time.monotonic() + _FLUSHED_EVERY_S
+        except OSError as error:
+            raise UsageError(
+                f"{self.path} cannot be written ({error.strerror}); what it holds is kept: free space and run again"
+            ) from None
+        self._end += len(data)
+
+
+@contextlib.contextmanager
+def open_store(
+    path: Path,
+    *,
+    settings: Mapping[str, Any],
+    encode: Callable[[Any], Any] = lambda value: value,
+    decode: Callable[[Any], Any] = lambda value: value,
+) -> Iterator[BatchStore]:
+    """Open or create a store, readable by its owner only and locked against a second run.
+
+    Parameters
+    ----------
+    settings
+        All that the results depend on besides the items' keys (options, seed, digests of inputs), as plain data.
+    encode, decode
+        How a result becomes plain data, and back. JSON keeps floats exactly; tuples come back as lists.
+
+    Raises
+    ------
+    UsageError
+        When the store was made with other settings, is in use or cannot be opened.
+    BadDataError
+        When the file is something else, or a line in its middle is damaged.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, 0o600)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be opened ({error.strerror}); choose another place") from None
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise UsageError(f"{path} is no regular file; choose another name")
+        _lock(descriptor, path)
+        store = BatchStore(descriptor, path, encode=encode, decode=decode)
+        store.load({"schema": STORE_SCHEMA, "settings": json.loads(json.dumps(settings))})
+        yield store
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, path: Path) -> None:
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"{path} is in use by another run; wait for it or choose another name") from None
+
+
+def _line_at(descriptor: int, offset: int) -> str:
+    """Text of the line that begins at a place of a file, without its end."""
+    found = b""
+    while not (end := found.find(b"\n") + 1):
+        more = os.pread(descriptor, _READ_BYTES, offset + len(found))
+        if not more:
+            raise ValueError("the line has no end")
+        found += more
+    return found[: end - 1].decode()
+
+
+def _sealed(text: str) -> str:
+    """Format a line of a store: the text and its checksum."""
+    return f"{text} {zlib.crc32(text.encode()):08x}"
+
+
+def _unsealed(line: str) -> Any:
+    """Read the text of a store's line; `ValueError` where it is damaged."""
+    text = line.rpartition(" ")[0]
+    if _sealed(text) != line:
+        raise ValueError("its checksum does not match")
+    return json.loads(text)
+
+
+def _check_header(line: str, wanted: Mapping[str, Any], *, path: Path) -> None:
+    try:
+        found, _ = json.JSONDecoder().raw_decode(line)  # that of another schema may have another checksum, or none
+        schema, settings = found["schema"], dict(found["settings"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise BadDataError("not a store of batch results", way_out="choose another name", path=str(path)) from None
+    if schema != wanted["schema"]:
+        raise BadDataError(
+            f"is a store of schema {schema}, this program writes {wanted['schema']}",
+            way_out="finish it with the version that began it, or choose another name",
+            path=str(path),
+        )
+    if _sealed(line.rpartition(" ")[0]) != line:
+        raise BadDataError("line 1 is damaged", way_out="choose another name", path=str(path))
+    new = dict(wanted["settings"])
+    differ = sorted(name for name in settings.keys() | new.keys() if settings.get(name) != new.get(name))
+    if differ:
+        name = differ[0]
+        raise UsageError(
+            f"{path} holds results of other settings ({', '.join(differ)}: {name} was {settings.get(name)!r}, "
+            f"is {new.get(name)!r}); choose another name, or remove it to begin again"
+        )
+
+
+def _name_in(line: str, *, number: int, path: Path) -> str:
+    """Name of the item whose result a line holds."""
+    try:
+        record = _unsealed(line)
+        name, _ = record["key"], record["value"]
+        return str(name)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise BadDataError(
+            f"line {number} is damaged", way_out="remove that line: its item will be run again", path=str(path)
+        ) from None

@@ -1,0 +1,150 @@
+"""The files of a campaign's exams: their digests, and which of them are the same bytes.
+
+A digest is read once: the journal keeps it under the file's name, size, times and inode. The time of the last change of
+the inode cannot be set by a program, so a file that was written to or replaced is read again. Files changed within the
+last seconds are always read, for their times may not yet tell two writes apart.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.batch import CLUSTER_LOST, run_batch
+from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.errors import BadDataError, TactileBayesError
+from tactile_bayes.files.atomic import sha256
+from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.remote import sha256_of, version_of
+from tactile_bayes.pipeline.campaign_match import named_exams, placed_exams
+from tactile_bayes.pipeline.campaign_steps import stamp
+from tactile_bayes.records import dataclass
+
+READ: Final = "read"
+"""Step of the journal that holds a file's digest."""
+_SETTLED_S: Final = 10.0
+"""A file that was last changed so long ago has times that tell this content from a later one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """What the files of the exams are.
+
+    Parameters
+    ----------
+    digests
+        SHA-256 by path.
+    faults
+        Why a file cannot be read, by path.
+    """
+
+    digests: dict[Path, str]
+    faults: dict[Path, str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    path: Path
+    key: str
+    address: str = ""
+
+
+def read_sources(
+    exams: Sequence[Exam],
+    *,
+    store: BatchStore | None,
+    keep: bool = True,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Sources:
+    """Digest of every exam's file, from the journal where the file is as it was then.
+
+    Parameters
+    ----------
+    keep
+        Whether new digests go into the journal.
+
+    Raises
+    ------
+    TactileBayesError
+        When the cluster was lost.
+    """
+    settled, fresh = _sorted_out({exam.path: exam for exam in exams})
+    values: Mapping[str, Any] = {} if store is None else store.values
+    found = Sources({one.path: values[one.key]["sha256"] for one in settled if one.key in values}, {})
+    for sources, kept in ((settled, store if keep else None), (fresh, None)):
+        waiting = [one for one in sources if one.path not in found.digests]
+        outcomes = run_batch(_read, waiting, key=_key, executor=executor, store=kept, progress=progress)
+        for one, outcome in zip(waiting, outcomes, strict=True):
+            if outcome.value is not None:
+                found.digests[one.path] = outcome.value["sha256"]
+            elif outcome.error == CLUSTER_LOST:
+                raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
+            else:
+                found.faults[one.path] = outcome.error.removeprefix(f"{one.address or one.path}: ")
+    return found
+
+
+def _sorted_out(exams: Mapping[Path, Exam]) -> tuple[list[_Source], list[_Source]]:
+    """Files whose times can be trusted, and those changed a moment ago; each with its key."""
+    settled: list[_Source] = []
+    fresh: list[_Source] = []
+    now = time.time()
+    for path, exam in exams.items():
+        try:
+            said, changed = _version(exam)
+        except (OSError, BadDataError):
+            fresh.append(_Source(path, exam.file, exam.address))
+            continue
+        said = hashlib.sha256(said.encode()).hexdigest()[:32]
+        trusted = settled if changed < now - _SETTLED_S else fresh
+        trusted.append(_Source(path, f"{READ} {exam.file} {said}", exam.address))
+    return settled, fresh
+
+
+def _version(exam: Exam) -> tuple[str, float]:
+    """What tells a file's content from a later one, and when it last changed; a store's tag needs no time."""
+    if exam.address:
+        return version_of(exam.address), 0.0
+    known = exam.path.stat()
+    return stamp(exam.path), max(known.st_mtime, known.st_ctime)
+
+
+def _key(source: _Source) -> str:
+    return source.key
+
+
+def _read(source: _Source) -> dict[str, Any]:
+    begun = time.perf_counter()
+    digest = sha256_of(source.address) if source.address else sha256(source.path)
+    return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
+
+
+def same_bytes(exams: Sequence[Exam], digests: Mapping[Path, str]) -> dict[str, str]:
+    """Reasons against exams of one file, by the exam's name; masses of one scan, each with its place, are sound."""
+    breasts_of = placed_exams(exams)
+    same: dict[str, list[Exam]] = defaultdict(list)
+    for exam in exams:
+        if exam.path in digests:
+            same[digests[exam.path]].append(exam)
+    faults = {}
+    for alike in same.values():
+        breasts = {(exam.patient, exam.visit, exam.side) for exam in alike}
+        placed = {
+            exam.mass
+            for exam in alike
+            if exam.centre_mm is not None or named_exams(exam, breasts_of.get((exam.patient, exam.side), ()))
+        }
+        if len(alike) == 1 or (len(breasts) == 1 and len(placed) == len(alike)):
+            continue
+        for exam in alike:
+            others = [other for other in alike if other is not exam]
+            named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
+            way_out = "give each exam its own file, or each mass of a breast its centre_x_mm and centre_y_mm"
+            faults[exam.name] = f"holds the same bytes as {named}; {way_out}"
+    return faults
