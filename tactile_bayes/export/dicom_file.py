@@ -89,7 +89,7 @@ def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None
     Parameters
     ----------
     facts
-        Of an image's exam, for the breast and its side.
+        Of an image's exam, for the breast and its side; neither is written of a phantom.
     """
     identity = study.identity
     dataset.SpecificCharacterSet = UTF_8
@@ -114,8 +114,9 @@ def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None
     dataset.DeviceSerialNumber = NO_SERIAL_NUMBER
     dataset.SoftwareVersions = __version__
     if facts is not None:
-        dataset.BodyPartExamined = "BREAST"
         dataset.Laterality = laterality(facts)
+        if dataset.Laterality:
+            dataset.BodyPartExamined = "BREAST"
 
 
 def coded(code: Code) -> Any:

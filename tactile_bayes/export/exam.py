@@ -244,8 +244,13 @@ def _another_exam(another: Mapping[str, Any] | None) -> str:
     size = another["max_size_mm"] if another else None
     if another is None or size is None:
         return ""
-    ends = "{probability:.0%} interval {low:.1f} to {high:.1f} mm".format(**size)
-    return f"If exams differ by {100 * another['between_map_sd']:.0f} %: largest size {size['median']:.1f} mm, {ends}"
+    return f"If exams differ by {100 * another['between_map_sd']:.0f} %: largest size {size_words(size)}"
+
+
+def size_words(size: Mapping[str, Any]) -> str:
+    """A size with its interval, for people."""
+    ends = f"{size['low']:.1f} to {size['high']:.1f} mm"
+    return f"{size['median']:.1f} mm, {100 * size['probability']:g} % credible interval {ends}"
 
 
 def _cautions(document: Mapping[str, Any]) -> Iterable[str]:

@@ -7,9 +7,10 @@ from html import escape
 from typing import Any, Final
 
 from tactile_bayes import __version__
+from tactile_bayes.errors import BadDataError, one_line
 from tactile_bayes.export import codes
 from tactile_bayes.export.codes import FHIR_SYSTEMS, Code
-from tactile_bayes.export.exam import EstimateFile, Finding
+from tactile_bayes.export.exam import EstimateFile, Finding, size_words
 from tactile_bayes.export.extras import required
 from tactile_bayes.export.identity import Identity
 from tactile_bayes.export.uids import content_uuid
@@ -31,12 +32,18 @@ def bundle_json(estimate: EstimateFile, identity: Identity) -> str:
 
     Raises
     ------
+    BadDataError
+        When a text or number is one that FHIR cannot hold.
     UsageError
         When the extra is not installed.
     """
     bundle = bundle_of(estimate, identity)
     # R4B has all resources used here as R4 has them; the package's R4 ended with its version 6
-    required("fhir.resources.R4B.bundle").Bundle.model_validate(bundle)
+    models = required("fhir.resources.R4B.bundle")
+    try:
+        models.Bundle.model_validate(bundle)
+    except ValueError as error:
+        raise BadDataError(f"cannot be written as FHIR: {one_line(error)}", path=str(estimate.path)) from None
     return dump_json(bundle)
 
 
@@ -81,8 +88,8 @@ class _Exam:
         if given.patient_id:
             issuer = {"assigner": {"display": given.issuer}} if given.issuer else {}
             found["identifier"] = [{"value": given.patient_id} | issuer]
-        if given.patient_name:
-            found["name"] = [_human_name(given.patient_name)]
+        if name := _human_name(given.patient_name):
+            found["name"] = [name]
         if given.sex:
             found["gender"] = _GENDERS[given.sex]
         if given.birth_date:
@@ -165,9 +172,8 @@ def _lines(estimate: EstimateFile) -> Iterator[str]:
         if one.largest is None or one.smallest is None:
             yield f"{mass}{one.outcome.meaning}. Reason: {one.reason or one.code}."
             continue
-        ends = "{probability:.0%} credible interval {low:.1f} to {high:.1f} mm"
-        yield f"{mass}Largest size {one.largest['median']:.1f} mm, {ends.format(**one.largest)}."
-        yield f"{mass}Smallest size {one.smallest['median']:.1f} mm, {ends.format(**one.smallest)}."
+        yield f"{mass}Largest size {size_words(one.largest)}."
+        yield f"{mass}Smallest size {size_words(one.smallest)}."
         if one.another_exam:
             yield f"{mass}{one.another_exam}."
     yield from (f"CAUTION: {text}." for text in estimate.cautions)
@@ -219,8 +225,9 @@ def _accession(number: str) -> dict[str, Any]:
 
 
 def _human_name(name: str) -> dict[str, Any]:
-    """A name of DICOM, FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, as FHIR has it; of its first group."""
-    family, given, middle, prefix, suffix = (*name.split("=")[0].split("^"), "", "", "", "", "")[:5]
+    """A name of DICOM, FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, as FHIR has it; of its first group that is filled."""
+    group = next((one for one in name.split("=") if one.strip("^ ")), "")
+    family, given, middle, prefix, suffix = (*group.split("^"), "", "", "", "", "")[:5]
     found: dict[str, Any] = {"family": family} if family else {}
     for key, words in (("given", (given, middle)), ("prefix", (prefix,)), ("suffix", (suffix,))):
         if any(words):

@@ -72,6 +72,7 @@ def test_patient_and_order_are_as_given(sized: dict[str, Any]) -> None:
     assert [one["reference"] for one in report["result"]] == [f"urn:uuid:{one['id']}" for one in observed]
     assert {one["subject"]["reference"] for one in (*observed, report)} == {f"urn:uuid:{patient['id']}"}
     assert "Research use only" in report["conclusion"]
+    assert "95 % credible interval" in report["conclusion"]
 
 
 def test_nobody_is_invented(exam: Path, tmp_path: Path) -> None:
@@ -83,6 +84,23 @@ def test_nobody_is_invented(exam: Path, tmp_path: Path) -> None:
     assert "effective" not in text
     told = bundle(exam, tmp_path / "c.json", "map.json", "--patient-id-from-scan")
     assert resources(told, "Patient")[0]["identifier"] == [{"value": "S01"}]
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [
+        ("^", None),
+        ("=山田^太郎", {"family": "山田", "given": ["太郎"]}),
+        ("Doe^J^M^Dr^II", None),
+        ("^Jane", {"given": ["Jane"]}),
+    ],
+)
+def test_names_of_dicom(name: str, wanted: dict[str, Any] | None, exam: Path, tmp_path: Path) -> None:
+    words = ("map.json", "--patient-id", "1", "--patient-name", name)
+    (patient,) = resources(bundle(exam, tmp_path / "b.json", *words), "Patient")
+    if name.startswith("Doe"):
+        wanted = {"family": "Doe", "given": ["J", "M"], "prefix": ["Dr"], "suffix": ["II"]}
+    assert patient.get("name") == (None if wanted is None else [wanted])
 
 
 def test_no_lump_is_an_absent_value_with_the_reason(exam: Path, tmp_path: Path) -> None:
