@@ -6,8 +6,8 @@
 
 Both steps go on where they were interrupted. The exams are those of `masses_scenes`: 100 with two lumps 20 to 40 mm
 apart, 200 with one. Every exam goes through `build_map` and `estimate` with their defaults. A listed mass is a lump's
-if it lies within 10 mm of its true place (and 2/5 of the lumps' distance); any other is false. `--kind drawn` estimates 150
-more maps of one lump, which need no simulation: a round bump under correlated errors, as in `scene_rates`.
+if it lies within 10 mm of its true place (and 2/5 of the lumps' distance); any other is false. `--kind drawn` estimates
+150 more maps of one lump, which need no simulation: a round bump under correlated errors, as in `scene_rates`.
 """
 
 from __future__ import annotations
