@@ -6,7 +6,8 @@
 
 Both steps go on where they were interrupted. The exams are those of `masses_scenes`: 100 with two lumps 20 to 40 mm
 apart, 200 with one. Every exam goes through `build_map` and `estimate` with their defaults. A listed mass is a lump's
-if it lies within 10 mm of its true place (and 2/5 of the lumps' distance); any other is false.
+if it lies within 10 mm of its true place (and 2/5 of the lumps' distance); any other is false. `--kind drawn` estimates
+150 more maps of one lump, which need no simulation: a round bump under correlated errors, as in `scene_rates`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks.masses_scenes import KINDS, Exam, exams, make
+from benchmarks.masses_scenes import KINDS, SEED, Exam, exams, make
+from benchmarks.scene_rates import ROWS, draw_map
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.build import build_map
@@ -30,6 +32,7 @@ from tactile_bayes.pipeline.one_map import answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
 
 RESULTS = "masses.jsonl"
+DRAWN = 150
 NEAR_MM, NEAR_SHARE = 10.0, 0.4
 Row = dict[str, Any]
 BINS: dict[str, tuple[Callable[[Row], float], tuple[float, ...]]] = {
@@ -41,20 +44,33 @@ BINS: dict[str, tuple[Callable[[Row], float], tuple[float, ...]]] = {
 
 def listed(exam: Exam, tactile_map: TactileMap) -> Row:
     """The masses of an exam's map beside its true lumps, places in mm on the map."""
-    document = answer_of(estimate_one(tactile_map, Settings())).document
-    assert document is not None
-    keys = ("reported", "centre_mm", "detected_probability", "max_size_mm", "reason", "reason_code")
+    found = _answered(tactile_map)
     return {
         "name": exam.name,
         "kind": exam.kind,
-        "status": document["status"],
-        "reason": document["reason"],
+        **found,
         "lumps": [
             {"d_mm": lump.d_mm, "depth_mm": lump.depth_mm, "stiffness_ratio": lump.stiffness_ratio, "centre_mm": place}
             for lump, place in zip(exam.scene.solid_lumps, true_places(exam, tactile_map), strict=True)
         ],
-        "masses": [{name: mass[name] for name in keys} for mass in document["masses"]],
     }
+
+
+def _answered(tactile_map: TactileMap) -> Row:
+    """What an estimate lists on a map."""
+    document = answer_of(estimate_one(tactile_map, Settings())).document
+    assert document is not None
+    keys = ("reported", "centre_mm", "detected_probability", "max_size_mm", "reason", "reason_code")
+    masses = [{name: mass[name] for name in keys} for mass in document["masses"]]
+    return {"status": document["status"], "reason": document["reason"], "masses": masses}
+
+
+def drawn(index: int) -> Row:
+    """The masses of a map with one round bump; the lump is where the reported mass is."""
+    found = _answered(draw_map(ROWS[0], np.random.default_rng([SEED, index])))
+    places = [(mass["centre_mm"]["x"], mass["centre_mm"]["y"]) for mass in found["masses"] if mass["reported"]]
+    lumps = [{"d_mm": float("nan"), "centre_mm": place} for place in places]
+    return {"name": f"drawn-{index:03d}", "kind": "drawn", "lumps": lumps, **found}
 
 
 def true_places(exam: Exam, tactile_map: TactileMap) -> list[tuple[float, float]]:
@@ -76,7 +92,11 @@ def run(folder: Path, kinds: Sequence[Any]) -> None:
     path = folder / RESULTS
     done = {row["name"] for row in rows(folder)}
     with path.open("a") as file:
-        for exam in exams(*kinds):
+        for index in range(DRAWN if "drawn" in kinds else 0):
+            if f"drawn-{index:03d}" not in done:
+                file.write(json.dumps(drawn(index)) + "\n")
+                file.flush()
+        for exam in exams(*(kind for kind in kinds if kind != "drawn")):
             scan = folder / f"{exam.name}.mcap"
             if exam.name in done or not scan.exists():
                 continue
@@ -140,7 +160,7 @@ def report(folder: Path) -> None:
             print(f"  {name}, {low:g} to {high:g}: {share(sum(row['listed'] for row in these), len(these))}")
     _first(two)
     _sizes(found)
-    for kind in KINDS:
+    for kind in (*KINDS, "drawn"):
         these = [row for row in found if row["kind"] == kind]
         false = [row["name"] for row in these if matched(row)[1]]
         print(f"exams ({kind}) with a mass that is no lump: {share(len(false), len(these))} {', '.join(false)}")
@@ -165,7 +185,7 @@ def _sizes(found: Sequence[Row]) -> None:
     for row in found:
         own, _ = matched(row)
         for lump, number in zip(row["lumps"], own, strict=True):
-            if number is None:
+            if number is None or row["kind"] == "drawn":
                 continue
             mass = row["masses"][number]
             which = f"{row['kind']}: {'reported' if mass['reported'] else 'other'}"
@@ -189,7 +209,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=["make", "run", "report"])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--kind", action="append", choices=KINDS, help="of exams; may be repeated (two, one)")
+    parser.add_argument(
+        "--kind", action="append", choices=[*KINDS, "drawn"], help="of exams; may be repeated (two, one)"
+    )
     parser.add_argument("--workers", type=int, default=1, help="make: processes (1)")
     given = parser.parse_args()
     kinds = given.kind or ["two", "one"]
