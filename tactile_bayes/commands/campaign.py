@@ -75,6 +75,14 @@ def init(folder: Path, output: Path, force: bool) -> None:
 @click.option(
     "--normalise", type=click.Choice(NORMALISE), default=DEFAULT_NORMALISE, show_default=True, help="As `map`."
 )
+@click.option(
+    "--match-mm",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="MM",
+    default=15.0,
+    show_default=True,
+    help="Distance within which a mass is the one that another exam of the breast names by place.",
+)
 @seed_option(1)
 @click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done and how long it takes, and do nothing.")
@@ -89,6 +97,7 @@ def run(
     size_calibration: str | None,
     settings_file: Path | None,
     normalise: str,
+    match_mm: float,
     seed: int,
     figures: bool,
     dry_run: bool,
@@ -113,7 +122,7 @@ def run(
     from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, write_outputs
 
     settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed)
-    of_all = CampaignSettings(settings, normalise, figures)
+    of_all = CampaignSettings(settings, normalise, figures, match_mm)
     table = read_manifest(exams)
     _check_paths(table, output, of_all)
     refuse_same(
@@ -195,6 +204,7 @@ def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"failed: {len(found.faults) - _MOST_NAMED} more, see failures.csv", err=True)
     _say_names("no size after excision, left out of trial.csv", written.left_out)
+    _say_names("exams with a mass that no row names, see their checks", written.unnamed)
     _say_names("folders of exams that the table does not list", left)
     if written.report:
         click.echo(written.report, nl=False)

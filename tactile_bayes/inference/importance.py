@@ -27,6 +27,12 @@ ADAPTED_FROM = 1024
 """Points a replicate from which a tail heavier than trusted lets a mixture be fitted to them."""
 POOR = 0.5
 """Below this share of effective draws the proposal is moved to the weighted moments of the points so far."""
+FITTED_AT = 4096
+"""Points a replicate at which a mixture is fitted where the error is not reached: with four times as many it is cheaper
+only now and then."""
+NEAR_ENOUGH = 3.0
+"""Points whose weights can be trusted stand at so many times the wanted error, where a fitted proposal is worse: chains
+are asked for five times it."""
 MOST_MOVES = 4
 LEAST_KEPT = 8192
 """Equal-weight draws returned, at least: twice the points where those are more."""
@@ -94,29 +100,9 @@ def importance(
     gaussians = Gaussians.one(mode, covariance)
     if parts is not None and parts.widest(covariance) > TOO_WIDE:
         gaussians = parts
-    sampler = _settled(log_density, gaussians, rng=rng, options=options)
-    adapted = False
-    while True:
-        weights, shape = sampler.weights()
-        # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen where they said 0.015
-        error = sampler.end_error(weights) * (1.0 + max(shape, 0.0) if np.isfinite(shape) else 1.0)
-        trusted = (np.isfinite(shape) and shape <= TRUSTED_SHAPE) or shape == -np.inf
-        if trusted and error <= options.accuracy_sd:
-            break
-        if not adapted and (sampler.points >= options.most or (sampler.points >= ADAPTED_FROM and not trusted)):
-            sampler, adapted = sampler.adapted(rng), True
-            sampler.extend(ADAPTED_FROM)
-            continue
-        hopeless = sampler.points >= HEAVY_POINTS and not (shape <= TRUSTED_SHAPE + HEAVY)
-        # a fitted proposal may take twice the points: chains, which come next, are asked for a fifth of the accuracy
-        if sampler.points >= 2 * options.most or hopeless:
-            raise NotConvergedError(
-                f"importance sampling stopped at {sampler.number} points with an end-point error of {error:.3f} SD "
-                f"(wanted {options.accuracy_sd:g}) and Pareto shape {shape:.2f} (wanted {TRUSTED_SHAPE:g} or less); "
-                "use --method ensemble",
-                diagnostics={"pareto_k": float(shape), "end_error_sd": error},
-            )
-        sampler.extend(sampler.points)
+    sampler, weights, shape, error = _sampled(
+        _settled(log_density, gaussians, rng=rng, options=options), rng=rng, options=options
+    )
     keep = max(LEAST_KEPT, 2 * sampler.number)
     chosen = systematic(weights, keep, rng)
     figures = {
@@ -131,6 +117,64 @@ def importance(
     labels = chosen // sampler.points
     statistics = {name: values[chosen][None] for name, values in sampler.statistics().items()}
     return ParameterDraws(sampler.theta[chosen][None], "importance", figures, labels=labels, statistics=statistics)
+
+
+_Judged = tuple["_Sampler", FloatArray, float, float]
+"""Points with their weights, the Pareto shape of these, and the error of interval ends in SDs."""
+
+
+def _sampled(sampler: _Sampler, *, rng: np.random.Generator, options: ImportanceOptions) -> _Judged:
+    """More points until the error is reached, if need be from a proposal fitted to them; with weights, shape and error.
+
+    Where the fitted proposal turns out worse than the first one, the first one goes on if its points can be trusted.
+    """
+    found = _extended(sampler, options, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM)
+    if _reached(found, options):
+        return found
+    fitted = sampler.adapted(rng)
+    fitted.extend(ADAPTED_FROM)
+    # a fitted proposal may take twice the points: chains, which come next, are asked for a fifth of the accuracy
+    better = _extended(fitted, options, most=2 * options.most, patience=HEAVY_POINTS, heavy=HEAVY)
+    if _reached(better, options):
+        return better
+    if _trusted(found[2]):
+        found = _extended(sampler, options, most=options.most, patience=ADAPTED_FROM)
+        if _reached(found, options, times=NEAR_ENOUGH):
+            return found
+    sampler, _, shape, error = better
+    raise NotConvergedError(
+        f"importance sampling stopped at {sampler.number} points with an end-point error of {error:.3f} SD "
+        f"(wanted {options.accuracy_sd:g}) and Pareto shape {shape:.2f} (wanted {TRUSTED_SHAPE:g} or less); "
+        "use --method ensemble",
+        diagnostics={"pareto_k": float(shape), "end_error_sd": error},
+    )
+
+
+def _extended(
+    sampler: _Sampler, options: ImportanceOptions, *, most: int, patience: int, heavy: float = 0.0
+) -> _Judged:
+    """Double the points until the error is reached, or `most` a replicate.
+
+    Or until the tail is heavier than trusted by `heavy`, from `patience` points a replicate on.
+    """
+    while True:
+        weights, shape = sampler.weights()
+        # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen where they said 0.015
+        error = sampler.end_error(weights) * (1.0 + max(shape, 0.0) if np.isfinite(shape) else 1.0)
+        found = sampler, weights, shape, error
+        hopeless = sampler.points >= patience and not _trusted(shape - heavy)
+        if _reached(found, options) or sampler.points >= most or hopeless:
+            return found
+        sampler.extend(sampler.points)
+
+
+def _trusted(shape: float) -> bool:
+    return shape == -np.inf or bool(np.isfinite(shape) and shape <= TRUSTED_SHAPE)
+
+
+def _reached(found: _Judged, options: ImportanceOptions, *, times: float = 1.0) -> bool:
+    _, _, shape, error = found
+    return _trusted(shape) and error <= times * options.accuracy_sd
 
 
 def _settled(

@@ -22,6 +22,7 @@ from tactile_bayes.batch import CLUSTER_LOST, BatchStore, run_batch
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, median_seconds, unchanged
+from tactile_bayes.pipeline.campaign_match import NamedPlace, named_exams
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, run_step
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import DEFAULT_NORMALISE
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 Progress = Callable[[int, int], None]
+MATCH_MM: Final = 15.0
+"""Default distance for matching a mass by its place: half of what lies between two masses that are told apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,8 @@ class CampaignSettings:
         As of `estimate`; a row of the table may replace place, known values and calibration.
     normalise
         As of `map`.
+    match_mm
+        Within this distance a mass is that which another exam of the breast names by its place.
     figures
         Whether the figures of `estimate` are drawn for each exam.
     """
@@ -50,6 +55,7 @@ class CampaignSettings:
     estimate: Settings = field(default_factory=Settings)
     normalise: str = DEFAULT_NORMALISE
     figures: bool = False
+    match_mm: float = MATCH_MM
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
@@ -160,6 +166,8 @@ class Campaign:
         sound = [exam for exam in self.exams if exam.name not in self.found.faults]
         self._stage("map", [self._map_task(exam) for exam in sound])
         mapped = [exam for exam in sound if self.found.of("map", exam.name)]
+        if not self._dry:
+            mapped = self._placed(mapped)
         unmapped = 0 if not self._dry else len(sound) - len(mapped)
         self._stage("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], unknown=unmapped)
         estimated = [exam for exam in mapped if self.found.of("estimate", exam.name)]
@@ -190,13 +198,13 @@ class Campaign:
                 same[self._digests[exam.path]].append(exam)
         for exams in same.values():
             breasts = {(exam.patient, exam.visit, exam.side) for exam in exams}
-            places = {(exam.mass, exam.centre_mm) for exam in exams if exam.centre_mm is not None}
-            if len(exams) == 1 or (len(breasts) == 1 and len({mass for mass, _ in places}) == len(exams)):
+            placed = {one.mass for one in exams if one.centre_mm is not None or named_exams(one, self.exams)}
+            if len(exams) == 1 or (len(breasts) == 1 and len(placed) == len(exams)):
                 continue
             for exam in exams:
                 others = [other for other in exams if other is not exam]
                 named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
-                way_out = "give each exam its own file, or each mass of one scan its centre_x_mm and centre_y_mm"
+                way_out = "give each exam its own file, or each mass of a breast its centre_x_mm and centre_y_mm"
                 self.found.faults[exam.name] = Fault("read", f"holds the same bytes as {named}; {way_out}")
 
     def _map_task(self, exam: Exam) -> Task:
@@ -222,7 +230,41 @@ class Campaign:
         settings = self.settings.of(exam)
         key = {"map": made["files"][MAP], **self._settings_key(settings, made["normalise"])}
         folder = self.folder / EXAMS / exam.name
-        return Task(step=step, name=exam.name, folder=folder, digest=digest_of(key), settings=settings)
+        places = self._places(exam)
+        if places:
+            key["match"] = {"mass": exam.mass, "most_mm": self.settings.match_mm, "places": self._places_key(places)}
+        return Task(
+            step=step,
+            name=exam.name,
+            folder=folder,
+            digest=digest_of(key),
+            settings=settings,
+            mass=exam.mass,
+            places=places,
+            match_mm=self.settings.match_mm,
+        )
+
+    def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
+        """The exams without those whose mass is named by a place on a map that could not be made."""
+        lost = [exam for exam in mapped if named_exams(exam, self.exams) and not self._places(exam)]
+        for exam in lost:
+            named = ", ".join(one.name for one in named_exams(exam, self.exams) if one.mass == exam.mass)
+            reason = f"the place of its mass is on the map of {named}, which was not made"
+            self.found.faults[exam.name] = Fault("estimate", reason)
+        return [exam for exam in mapped if exam not in lost]
+
+    def _places(self, exam: Exam) -> tuple[NamedPlace, ...]:
+        """Places of the breast's masses that other exams name, where this one names none."""
+        mapped = [one for one in self.exams if self.found.of("map", one.name)]
+        return tuple(
+            NamedPlace(one.mass, one.name, self.folder / EXAMS / one.name / MAP, one.centre_mm)
+            for one in named_exams(exam, mapped)
+            if one.centre_mm is not None
+        )
+
+    def _places_key(self, places: Sequence[NamedPlace]) -> list[Any]:
+        made = self.found.results["map"]
+        return [[one.mass, one.exam, made[one.exam]["files"][MAP], one.centre_mm] for one in places]
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""

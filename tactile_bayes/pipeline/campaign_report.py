@@ -41,6 +41,8 @@ class Written:
         The trial report as text; empty where there is none.
     no_report
         Why there is none, where excision sizes were given.
+    unnamed
+        Exams whose map shows a mass that no row names.
     """
 
     sized: int
@@ -50,6 +52,7 @@ class Written:
     left_out: tuple[str, ...] = ()
     report: str = ""
     no_report: str = field(default="")
+    unnamed: tuple[str, ...] = ()
 
 
 def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | None = None) -> Written:
@@ -80,7 +83,8 @@ def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | No
     known = {(row.exam.patient, row.exam.mass) for row in rows}
     left_out = sorted(known - masses) if masses is not None else []
     names = tuple(f"{patient} {mass}" for patient, mass in left_out)
-    return Written(*counts, len(campaign.found.results["pool"]), names, report, fault)
+    unnamed = tuple(row.exam.name for row in rows if row.unnamed)
+    return Written(*counts, len(campaign.found.results["pool"]), names, report, fault, unnamed)
 
 
 def check_inputs(excision: Path | None, protocol: Path | None) -> None:

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.pipeline.campaign_match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.pipeline.one_map import Answer
+    from tactile_bayes.pipeline.one_map import Answer, Outcome
     from tactile_bayes.scan import Scan
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
@@ -64,6 +65,9 @@ class Task:
         map: as the option of `map`.
     settings
         estimate, figures, pool: of the estimate.
+    mass, places, match_mm
+        estimate, figures: where other exams of the breast have the mass, see `campaign_match`; no places where the
+        exam is not matched.
     members
         pool: names and folders of the exams.
     """
@@ -77,6 +81,9 @@ class Task:
     expected: Mapping[str, str] = field(default_factory=dict)
     normalise: str = ""
     settings: Settings | None = None
+    mass: str = ""
+    places: tuple[NamedPlace, ...] = ()
+    match_mm: float = 0.0
     members: tuple[tuple[str, Path], ...] = ()
 
     @property
@@ -234,11 +241,10 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.files.atomic import write_bytes, write_text
     from tactile_bayes.files.schema import check_document, dump_json
     from tactile_bayes.files.shape_npz import write_shape
-    from tactile_bayes.pipeline.one_map import answer_of, estimate_file
+    from tactile_bayes.pipeline.one_map import answer_of
     from tactile_bayes.report.thumbnail import thumbnail_png
 
-    assert task.settings is not None
-    outcome = estimate_file(task.folder / MAP, task.settings)
+    outcome = _outcome(task)
     answer = answer_of(outcome)
     document = answer.document
     assert document is not None
@@ -252,17 +258,27 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
     picture = thumbnail_png(outcome.tactile_map, document)
     if picture is not None:
         writes[THUMBNAIL] = lambda path: write_bytes(path, picture, force=True)
-    return {"exit_code": answer.exit_code}, writes
+    own_axes = bool(task.places) and in_own_axes(outcome.tactile_map, task.places)
+    return {"exit_code": answer.exit_code, "notes": [OWN_AXES] if own_axes else []}, writes
+
+
+def _outcome(task: Task) -> Outcome:
+    """The exam's estimate: of the mass that its row names, where other exams have it."""
+    from tactile_bayes.pipeline.one_map import estimate_file
+
+    assert task.settings is not None
+    path = task.folder / MAP
+    if not task.places:
+        return estimate_file(path, task.settings)
+    return matched_outcome(path, task.settings, mass=task.mass, places=task.places, most_mm=task.match_mm)
 
 
 def _figures(task: Task) -> tuple[Result, Writes]:
     """Draw the figures of `estimate`; the estimate is made again, for it is not stored whole."""
-    from tactile_bayes.pipeline.one_map import estimate_file
     from tactile_bayes.report.estimate_figures import draw_map, draw_size
 
-    assert task.settings is not None
-    settings = task.settings
-    outcome = estimate_file(task.folder / MAP, settings)
+    outcome = _outcome(task)
+    settings = outcome.settings
     tactile_map, estimate = outcome.tactile_map, outcome.estimate
     size, writes = estimate.size, Writes()
     if tactile_map.covered.any():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +12,7 @@ from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.manifest_csv import Exam, table_text
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
+from tactile_bayes.pipeline.campaign_match import unnamed
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED
 from tactile_bayes.records import dataclass
 
@@ -43,6 +46,8 @@ class Row:
         Of the file: digests and facts, what it lost, whether it is simulated (None: unknown).
     outlying
         Whether the exam lies apart from the others of its mass.
+    unnamed
+        Masses of the scan that no row names, in words.
     """
 
     exam: Exam
@@ -53,6 +58,7 @@ class Row:
     notes: tuple[str, ...] = ()
     synthetic: bool | None = None
     outlying: bool = False
+    unnamed: tuple[str, ...] = ()
 
     @property
     def size(self) -> Mapping[str, float] | None:
@@ -83,9 +89,7 @@ class Row:
         """What is to be looked at besides."""
         if self.document is None:
             return []
-        rises = len(self.document["other_rises"])
-        more = [f"{rises} other {'rise' if rises == 1 else 'rises'} on the map"] if rises else []
-        return [*self.document["diagnostics"].get("assumptions_to_check", []), *more]
+        return [*self.document["diagnostics"].get("assumptions_to_check", []), *self.unnamed]
 
 
 def _status(document: Mapping[str, Any] | None) -> str:
@@ -100,13 +104,21 @@ def exam_rows(campaign: Campaign) -> list[Row]:
     """Every exam of the table, in its order."""
     pooled = pooled_documents(campaign)
     outlying = {one["map"] for document in pooled.values() for one in document["maps"] if one["outlying"]}
-    return [_row(campaign, exam, exam.name in outlying) for exam in campaign.exams]
+    rows = [_row(campaign, exam, exam.name in outlying) for exam in campaign.exams]
+    of_scan: dict[Path, list[Mapping[str, Any]]] = defaultdict(list)
+    for row in rows:
+        if row.document is not None:
+            of_scan[row.exam.path].append(row.document)
+    return [
+        row if row.document is None else replace(row, unnamed=tuple(unnamed(of_scan[row.exam.path]))) for row in rows
+    ]
 
 
 def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
     fault = campaign.found.faults.get(exam.name)
     mapped = campaign.found.of("map", exam.name) or {}
-    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": tuple(mapped.get("notes", ()))}
+    matched = (campaign.found.of("estimate", exam.name) or {}).get("notes", ())
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": (*mapped.get("notes", ()), *matched)}
     if fault is not None and fault.step != "figures":
         return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
     document = load_json(campaign.folder / EXAMS / exam.name / ESTIMATE)

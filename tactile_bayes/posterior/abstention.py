@@ -14,6 +14,7 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import covered_share, trusted, window_cells
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import (
+    AT_RIM,
     LEAST_COVERED_SHARE,
     LEAST_WIDTH_IN_CELLS,
     MOST_AXIS_RATIO,
@@ -182,14 +183,12 @@ def rim_fault(
     wide, narrow, cell = max(widths_mm), min(widths_mm), tactile_map.recipe.cell_mm
     share = covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:
-        return f"at the rim of the map ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
+        return f"{AT_RIM} ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
     wide_rise = wide > WIDE_IN_RADII * radius_mm
     short = missing_strokes(tactile_map, centre_mm, reach_mm=ENCLOSED_IN_WIDTHS * wide)
     if wide_rise and short:
         side, millimetres = max(short.items(), key=lambda one: one[1])
-        return (
-            f"at the rim of the map (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
-        )
+        return f"{AT_RIM} (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
     return _few_readings_fault(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
@@ -202,7 +201,7 @@ def _few_readings_fault(tactile_map: TactileMap, centre_mm: tuple[float, float],
     here = float(np.median(cells.count)) if len(cells) else 0.0
     if here >= LEAST_READ * typical:
         return ""
-    return f"at the rim of the map (its cells hold {here:g} readings, where {typical:g} are typical)"
+    return f"{AT_RIM} (its cells hold {here:g} readings, where {typical:g} are typical)"
 
 
 def extend_advice(short: dict[str, float]) -> str:

@@ -8,6 +8,7 @@ from scipy.special import ndtri
 from scipy.stats import genpareto, qmc
 
 from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import (
     ImportanceOptions,
     importance,
@@ -16,6 +17,7 @@ from tactile_bayes.inference.importance import (
 )
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.pareto import TRUSTED_SHAPE, fit_generalised_pareto, smooth_weights
+from tactile_bayes.inference.proposal import Gaussians
 from tactile_bayes.inference.sobol import BITS, MOST_DIMENSIONS, shifted_sobol, sobol_integers
 
 MEAN = np.array([1.0, -2.0, 0.5])
@@ -127,3 +129,30 @@ def test_weighted_quantiles_and_resampling_agree_with_repetition() -> None:
     np.testing.assert_allclose(found, np.quantile(repeated, [0.1, 0.5, 0.9]), atol=0.03)
     index = systematic(times / times.sum(), int(times.sum()), rng)
     np.testing.assert_array_equal(np.bincount(index, minlength=500), times)
+
+
+def test_points_that_can_be_trusted_go_on_where_a_fitted_proposal_is_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map of a wide, faint lump was once answered by chains: its fitted mixture had the heavier tail."""
+    fits: list[object] = []
+
+    def spoilt(*points: object, **_: object) -> tuple[Gaussians, int]:
+        fits.append(points)
+        return Gaussians.one(np.zeros(3), 0.2 * np.eye(3)), 0
+
+    monkeypatch.setattr("tactile_bayes.inference.importance.fitted_gaussians", spoilt)
+
+    def sampled(accuracy_sd: float) -> ParameterDraws:
+        return importance(
+            lambda theta: -0.5 * np.sum(theta**2, axis=1),
+            np.zeros(3),
+            0.7 * np.eye(3),
+            rng=np.random.default_rng(1),
+            options=ImportanceOptions(accuracy_sd=accuracy_sd),
+        )
+
+    draws = sampled(0.0008)
+    assert fits
+    assert draws.diagnostics["end_error_sd"] <= 3 * 0.0008
+    assert np.quantile(draws.flat[:, 0], 0.975) == pytest.approx(1.96, abs=0.02)
+    with pytest.raises(NotConvergedError):  # the control: an error out of reach is refused
+        sampled(1e-6)
