@@ -75,9 +75,10 @@ def _draw(
 ) -> None:
     if not (trace or rank or corner):
         return
+    from tactile_bayes.report.figure_title import named_exam
     from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
 
-    title = f"{name}, method {found.method}"
+    title = f"{named_exam(name, found.scans)}, method {found.method}"
     for path, figure in ((trace, trace_figure), (rank, rank_figure), (corner, corner_figure)):
         if path is not None:
             figure(found.draws, path, title=title, force=force)

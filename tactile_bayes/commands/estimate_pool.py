@@ -67,5 +67,7 @@ def _write(
         write_pooled(output, size, provenance=provenance, force=force)
     if figure is not None:
         from tactile_bayes.report.estimate_figures import draw_size
+        from tactile_bayes.report.figure_title import named_exam
 
-        draw_size(size, figure, name=f"{len(maps)} maps pooled", probability=settings.interval, force=force)
+        name = named_exam(f"{len(maps)} maps pooled", provenance.scans)
+        draw_size(size, figure, name=name, probability=settings.interval, force=force)

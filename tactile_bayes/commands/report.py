@@ -94,6 +94,8 @@ def command(
     for path in (output, pdf):
         if path is not None:
             refuse_existing(path, force=force)
+    if (size_calibration or settings_file) and any(path.suffix.lower() == ".json" for path in files):
+        raise UsageError("an estimate's JSON has settings of its own; leave out --size-calibration and --settings")
     printer = None if pdf is None else find_printer()
     options: dict[str, Any] = {"calibration": size_calibration, "seed": seed, "interval": interval}
     settings = settings_of(settings_file, **options)

@@ -14,7 +14,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
 from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes, open_netcdf
-from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.inference_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
@@ -122,11 +122,14 @@ class PosteriorDraws:
         (chain, draw) arrays by name.
     diagnostics
         As the estimate's JSON has them.
+    scans
+        The scans at the beginning, as `Provenance.scans` has them.
     """
 
     method: str
     draws: dict[str, FloatArray]
     diagnostics: dict[str, Any]
+    scans: tuple[dict[str, str], ...] = ()
 
 
 def read_posterior(path: Path) -> PosteriorDraws:
@@ -148,7 +151,9 @@ def read_posterior(path: Path) -> PosteriorDraws:
     if not draws or not all(values.size > 1 for values in draws.values()):
         raise BadDataError("holds no draws", way_out=way_out, path=str(path))
     diagnostics = parse_json(attributes.get("diagnostics", "{}"))
-    return PosteriorDraws(attributes.get("method", ""), draws, diagnostics if isinstance(diagnostics, dict) else {})
+    figures = diagnostics if isinstance(diagnostics, dict) else {}
+    scans = scans_of(parse_json(attributes.get("provenance", "{}")))
+    return PosteriorDraws(attributes.get("method", ""), draws, figures, scans)
 
 
 def _plain(value: object) -> bool:

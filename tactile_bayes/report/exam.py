@@ -72,7 +72,7 @@ class Exam:
     Parameters
     ----------
     maps
-        The first is drawn large; the others are repeats of it.
+        Several are repeats of one mass.
     pooled
         The JSON object of the size from all maps; None with one map.
     scans
@@ -90,8 +90,13 @@ class Exam:
 
     @property
     def main(self) -> ExamMap:
-        """The map that is drawn large."""
-        return self.maps[0]
+        """The map that is drawn large: the first on which there is a mass, else the first."""
+        return next((one for one in self.maps if one.masses), self.maps[0])
+
+    @property
+    def main_number(self) -> int:
+        """Its number among the maps, from 1."""
+        return next(number for number, one in enumerate(self.maps, start=1) if one is self.main)
 
     @property
     def drawn(self) -> ExamMap:

@@ -217,8 +217,8 @@ def _repeats(exam: Exam) -> Iterator[str]:
 
 
 def _quality(exam: Exam) -> Iterator[str]:
-    first = " (of the first map)" if len(exam.maps) > 1 else ""
-    yield f"<h2>How good the exam was{first}</h2><table>"
+    which = f" (map {exam.main_number})" if len(exam.maps) > 1 else ""
+    yield f"<h2>How good the exam was{which}</h2><table>"
     for name, text in quality_rows(exam):
         yield f"<tr><th>{html.escape(name)}</th><td>{html.escape(_cut(text, 240))}</td></tr>"
     yield "</table>"

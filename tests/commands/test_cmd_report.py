@@ -89,6 +89,7 @@ REFUSED = [
     (("a.nc", "b.nc", "a.json"), 2, "an estimate's JSON goes with one map"),
     (("a.nc", "a.nc"), 2, "a.nc is given twice; give each file once"),
     (("a.nc", "other.nc"), 3, "the maps differ in subject (P1, P2); give the maps of one mass"),
+    (("a.nc", "a.json", "--size-calibration", "eq6"), 2, "an estimate's JSON has settings of its own; leave out"),
     (("a.nc", "--date", "1.3.2026"), 2, "--date '1.3.2026' is no date; give it as YEAR-MONTH-DAY"),
     (("a.nc", "--title", "x" * 61), 2, "--title is of 61 letters or not printable; give up to 60 letters"),
     (("a.nc", "--name", "a\nb"), 2, "--name is of 3 letters or not printable"),

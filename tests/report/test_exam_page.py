@@ -267,6 +267,19 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
     assert len(page.named("path", **{"class": "centre"})) == 2
 
 
+def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
+    with_lump, without = exam().maps[0], without_lump().maps[0]
+    size = {name: with_lump.document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
+    pooled = {**size, "reason": "", "figures": with_lump.document["diagnostics"], "fat_apart_mm": None}
+    pooled["maps"] = [{"map": f"map {n}", "outlying": False} for n in (1, 2)]
+    both = Exam((without, with_lump), pooled, SCANS)
+    assert both.main is with_lump
+    page = Page(exam_page(both))
+    assert "How good the exam was (map 2)" in page.words
+    assert "1: no size" in page.words
+    assert len(page.named("path", **{"class": "size-high"})) == 1
+
+
 def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() -> None:
     tactile_map, document = demo()
     page = Page(exam_page(Exam((exam_map(replace(tactile_map, nipple_mm=None), document, side=""),), None, ())))

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from in_process import run_here
 from posterior_maps import bump_map
 
 import tactile_bayes as tb
 from tactile_bayes.api.estimates import SizeEstimate
 from tactile_bayes.api.maps import Map
+from tactile_bayes.files.posterior_nc import read_posterior
 from tactile_bayes.posterior.fitted import fitted_cells
 from tactile_bayes.report.figure_title import named_exam
 
@@ -79,3 +81,13 @@ def test_a_dollar_in_a_name_starts_no_formula(tmp_path: Path) -> None:
     found = SizeEstimate(estimated("independent", slope=0.0).outcome, r"a$\frac$")
     found.plot_map(tmp_path / "map.png")
     assert (tmp_path / "map.png").exists()
+
+
+def test_a_posterior_file_names_its_scans_for_the_titles_of_its_figures(tmp_path: Path) -> None:
+    scans = ({"sha256": "0123456789ab", "subject": "P07"},)
+    given = Map(bump_map(noise=0.004 * np.random.default_rng(5).standard_normal((51, 51))), scans=scans)
+    tb.estimate(given, size_calibration="none", method="laplace").save(tmp_path / "post.nc")
+    assert read_posterior(tmp_path / "post.nc").scans == scans
+    done = run_here("diagnose", "post.nc", "--corner", "corner.svg", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "post (P07, scan 01234567), method laplace" in (tmp_path / "corner.svg").read_text()
