@@ -12,23 +12,21 @@ table of exams, a few hundred bytes for each step, and one block.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from tactile_bayes import __version__
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.pipeline.campaign_copies import copy_tasks
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, StepResults, median_seconds, unchanged
 from tactile_bayes.pipeline.campaign_inputs import READ, read_sources, same_bytes
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, run_step
+from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, digest_of, run_step
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import DEFAULT_NORMALISE
 from tactile_bayes.records import dataclass
@@ -207,7 +205,8 @@ class Campaign:
 
     def _size(self, exams: Sequence[Exam]) -> None:
         """Maps, estimates and figures of some exams."""
-        self._stage("map", [self._map_task(exam) for exam in exams])
+        known = [exam for exam in exams if exam.path in self._digests]  # a plan fetches nothing from a store
+        self._stage("map", [self._map_task(exam) for exam in known], without=len(exams) - len(known))
         mapped = [exam for exam in exams if exam.name in self.found.results["map"]]
         unmapped = len(exams) - len(mapped)
         self._stage("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
@@ -219,21 +218,9 @@ class Campaign:
 
     def _copy(self, kind: str, names: Sequence[str]) -> None:
         """Copy the files of exams or masses into the object store."""
-        if not self.settings.copy_to:
-            return
-        steps = ("pool",) if kind == MASSES else ("map", "estimate", "figures")
-        tasks = []
-        for name in names:
-            made = [result["files"] for step in steps if (result := self.found.of(step, name)) is not None]
-            files = {file: digest for one in made for file, digest in one.items()}
-            if files:
-                tasks.append(self._copy_task(kind, name, files))
-        self._stage("copy", tasks, without=len(names) - len(tasks))
-
-    def _copy_task(self, kind: str, name: str, files: Mapping[str, str]) -> Task:
-        to = f"{self.settings.copy_to}/{kind}/{name}"
-        copies = {file: f"{to}/{file}" for file in files}
-        return Task("copy", name, self.folder / kind / name, digest_of({"to": to, "files": files}), copies=copies)
+        if self.settings.copy_to:
+            tasks = copy_tasks(self.folder / kind, names, self.found.results, to=f"{self.settings.copy_to}/{kind}")
+            self._stage("copy", tasks, without=len(names) - len(tasks))
 
     def _map_task(self, exam: Exam) -> Task:
         digest = self._digests[exam.path]
@@ -298,6 +285,8 @@ class Campaign:
             self._stage("pool", [self._pool_task(name, groups[name]) for name in names])
             self._copy(MASSES, names)
         self._stage("pool", [], without=unknown)
+        if self.settings.copy_to:
+            self._stage("copy", [], without=unknown)
 
     def _why_not_pooled(self) -> str:
         """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
@@ -392,12 +381,6 @@ def _untold(_done: int, _total: int) -> None:
 
 def _no_bar(_label: str) -> AbstractContextManager[Progress]:
     return nullcontext(_untold)
-
-
-def digest_of(key: object) -> str:
-    """Digest of plain data and the program's version."""
-    text = json.dumps([__version__, key], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _key(task: Task) -> str:

@@ -66,7 +66,7 @@ def read_sources(
     Parameters
     ----------
     keep
-        Whether new digests go into the journal.
+        Whether new digests go into the journal. Without, files in object stores that are not known are passed over.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def read_sources(
     values: Mapping[str, Any] = {} if store is None else store.values
     found = Sources({one.path: values[one.key]["sha256"] for one in settled if one.key in values}, {})
     for sources, kept in ((settled, store if keep else None), (fresh, None)):
-        waiting = [one for one in sources if one.path not in found.digests]
+        waiting = [one for one in sources if one.path not in found.digests and (keep or not one.address)]
         outcomes = run_batch(_read, waiting, key=_key, executor=executor, store=kept, progress=progress)
         for one, outcome in zip(waiting, outcomes, strict=True):
             if outcome.value is not None:

@@ -6,12 +6,15 @@ digests, so that a later run can tell whether they are still what it made.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
@@ -88,6 +91,12 @@ class Task:
     def key(self) -> str:
         """Name in the store of the campaign's results."""
         return f"{self.step} {self.name} {self.digest}"
+
+
+def digest_of(key: object) -> str:
+    """Digest of plain data and the program's version."""
+    text = json.dumps([__version__, key], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def run_step(task: Task) -> Result:
