@@ -166,7 +166,18 @@ def _jsons(folder: Path) -> list[bytes]:
         "sternal_notch_mm": [0.0, 90.0, 0.0],
         "xiphoid_mm": [0.0, -90.0, 0.0],
     }
-    made = [json.dumps(document).encode() for document in (eq6, head, array, points)]
+    repeat = {"exams": ["P.v1.m1.r1", "P.v1.m1.r2"], "log_size": [2.6, 2.7], "map_sd": [0.03, 0.02], "by_chance": 0.4}
+    site = {
+        "schema": "tactile-bayes/repeatability/1",
+        "research_use": "Research use only: not a diagnostic device.",
+        **{"between_map_sd": 0.08, "log_sd": 0.2, "median": 0.078, "low": 0.06, "high": 0.11, "probability": 0.95},
+        **{"masses": 3, "maps": 6, "outlying": ["M1"], "left_out": []},
+        "calibration": {"name": "solid", "sha256": "0" * 64, "normalise": "gain"},
+        "half_width": {"as_estimated": 0.2, "with_it": 0.3},
+        "repeats": [{"name": f"M{i}", **repeat} for i in range(3)],
+        "provenance": {"inputs": [{"role": "draws_1", "sha256": "0" * 64}]},
+    }
+    made = [json.dumps(document).encode() for document in (eq6, head, array, points, site)]
     return [(PACKAGE / "calibrations" / "solid.json").read_bytes(), report, *made]
 
 
@@ -273,10 +284,14 @@ def _read_tomls(path: Path) -> object:
 def _read_jsons(path: Path) -> object:
     from tactile_bayes.files.head_json import read_head_geometry
     from tactile_bayes.files.instrument_json import read_array_calibration, read_landmarks
+    from tactile_bayes.files.repeatability_json import read_repeatability
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.files.size_posterior import read_stated_size
 
-    readers = (read_size_calibration, read_stated_size, read_head_geometry, read_array_calibration, read_landmarks)
+    readers = (
+        read_size_calibration, read_stated_size, read_head_geometry, read_array_calibration, read_landmarks,
+        read_repeatability,
+    )  # fmt: skip
     return _first([lambda read=read: read(path) for read in readers])
 
 

@@ -23,6 +23,7 @@ SECTIONS = {
     "Settings of estimate (TOML)": "settings.schema.json",
     "Session (TOML)": "scan_session.schema.json",
     "Protocol (TOML)": "protocol.schema.json",
+    "Worklist (JSON)": "worklist.schema.json",
     "Mapping of columns (TOML)": "column_map.schema.json",
 }
 """Heading of each schema of what users write themselves."""

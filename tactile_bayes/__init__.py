@@ -6,6 +6,7 @@
 - `build_map`: from scans to a map
 - `estimate`, `pool`: from a map, or from several maps of one mass, to a size
 - `calibrate_size`, `validate`: from tables to a size calibration, or to a trial's report
+- `calibrate_repeatability`: from a campaign's folder to the spread between exams of one mass at its site
 - `record`: from devices to a scan
 - `Map`, `SizeEstimate`, `PooledSize`, `TrialResult`, `Draws`: what they return; `errors`: what they raise
 """
@@ -23,6 +24,7 @@ __all__ = [
     "SizeEstimate",
     "TrialResult",
     "build_map",
+    "calibrate_repeatability",
     "calibrate_size",
     "demo_map",
     "demo_scan",
@@ -43,6 +45,7 @@ _HOME = {
     "SizeEstimate": "api.estimates",
     "TrialResult": "api.trials",
     "build_map": "api.maps",
+    "calibrate_repeatability": "api.trials",
     "calibrate_size": "api.trials",
     "demo_map": "api.maps",
     "demo_scan": "api.maps",

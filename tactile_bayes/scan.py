@@ -195,17 +195,26 @@ class Landmarks:
     sternal_notch_mm, xiphoid_mm : (3,) arrays
     spread_mm
         Largest distance of an earlier touch from the last one, where a landmark was touched again; else None.
+    nipple_mm : (3,) array or None
+        None where it was not touched: a lump then has no place by the clock.
     """
 
     sternal_notch_mm: FloatArray
     xiphoid_mm: FloatArray
     spread_mm: float | None = field(default=None, kw_only=True)
+    nipple_mm: FloatArray | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.spread_mm is not None and not 0 <= self.spread_mm < np.inf:
             raise BadDataError(f"spread_mm is {self.spread_mm}", way_out="give a distance of 0 mm or more")
-        for name in ("sternal_notch_mm", "xiphoid_mm"):
-            object.__setattr__(self, name, _check_finite(getattr(self, name), name=name, shape=(3,)))
+        for name in ("sternal_notch_mm", "xiphoid_mm", "nipple_mm"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _check_finite(getattr(self, name), name=name, shape=(3,)))
+
+    def points(self) -> dict[str, FloatArray]:
+        """(3,) points in `base` by name: ``sternal_notch``, ``xiphoid``, and ``nipple`` where it was touched."""
+        named = {"sternal_notch": self.sternal_notch_mm, "xiphoid": self.xiphoid_mm}
+        return named if self.nipple_mm is None else {**named, "nipple": self.nipple_mm}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.sized import MassEstimate, Sized
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.posterior import SIZES
 
 if TYPE_CHECKING:
-    import pandas
     from matplotlib.figure import Figure
 
     from tactile_bayes.pipeline.pooled import PooledOutcome
@@ -31,92 +26,8 @@ if TYPE_CHECKING:
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 
 
-class _Sized:
-    """Base of the estimates from one map and from several."""
-
-    name: str
-    probability: float
-
-    @property
-    def _size(self) -> SizePosterior | None:
-        raise NotImplementedError
-
-    @property
-    def why(self) -> str:
-        """Why there is no size, or no estimate at all; empty where there is a size."""
-        raise NotImplementedError
-
-    def _of_size(self, name: str) -> Draws | None:
-        size = self._size
-        if size is None:
-            return None
-        return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
-
-    @property
-    def max_size_mm(self) -> Draws | None:
-        """Largest diameter; None without a size."""
-        return self._of_size("max_size_mm")
-
-    @property
-    def min_size_mm(self) -> Draws | None:
-        """Smallest diameter; None without a size."""
-        return self._of_size("min_size_mm")
-
-    @property
-    def max_size_another_exam_mm(self) -> Draws | None:
-        """Largest diameter if another exam of the mass may come out as far apart as the paper's maps.
-
-        None without a size, or where the spread between exams was stated: `max_size_mm` has it then.
-        """
-        size = None if self._size is None else self._size.another_exam
-        if size is None:
-            return None
-        return Draws(np.atleast_2d(size.max_size_mm), "mm", self.probability, size.replicates)
-
-    def _columns(self) -> dict[str, Draws]:
-        found = {name: self._of_size(name) for name in SIZES}
-        return {name: draws for name, draws in found.items() if draws is not None}
-
-    def to_dataframe(self) -> pandas.DataFrame:
-        """One row for each draw: chain, draw and a column for each quantity; no rows without an estimate."""
-        import pandas
-
-        columns = self._columns()
-        shape = next(iter(columns.values())).values.shape if columns else (0, 0)
-        chain, draw = (index.ravel() for index in np.indices(shape))
-        values = {name: draws.values.ravel() for name, draws in columns.items()}
-        return pandas.DataFrame({"chain": chain, "draw": draw, **values})
-
-    def to_arviz(self) -> Any:
-        """The draws as arviz has them, one group ``posterior``.
-
-        Raises
-        ------
-        UsageError
-            Without an estimate: there are no draws.
-        """
-        from tactile_bayes.inference.arviz_data import inference_data
-
-        columns = self._columns()
-        if not columns:
-            raise UsageError(f"there are no draws: {self.why}")
-        return inference_data({name: draws.values for name, draws in columns.items()})
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self._words()}>"
-
-    def _words(self) -> str:
-        return f"no size: {self.why}" if self.max_size_mm is None else f"largest size {self.max_size_mm}"
-
-    def _repr_html_(self) -> str:
-        rows = [("largest size", self.max_size_mm), ("smallest size", self.min_size_mm)]
-        cells = [f"<tr><th>{name}</th><td>{escape(repr(draws))}</td></tr>" for name, draws in rows if draws is not None]
-        table = f"<table>{''.join(cells)}</table>" if cells else f"<p>No size: {escape(self.why)}</p>"
-        return f"{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class SizeEstimate(_Sized):
+class SizeEstimate(Sized):
     """The estimate of one map.
 
     Parameters
@@ -185,6 +96,23 @@ class SizeEstimate(_Sized):
         """Centre of the lump on the map, along the head; None without an estimate."""
         return self._of_shape("y_mm")
 
+    @property
+    def masses(self) -> tuple[MassEstimate, ...]:
+        """All masses of the map, the largest first; this estimate is of the one that is `reported`."""
+        from tactile_bayes.report.masses_document import patient_mm
+
+        found, tactile_map = self.outcome.estimate, self.outcome.tactile_map
+        return tuple(
+            MassEstimate(
+                number,
+                mass,
+                patient_mm(tactile_map, mass.x_mm, mass.y_mm),
+                self.probability,
+                "" if mass.estimate.size is not None else found.reason if mass.reported else mass.estimate.reason,
+            )
+            for number, mass in enumerate(found.masses, start=1)
+        )
+
     def _of_shape(self, name: str) -> Draws | None:
         found = self.outcome.estimate
         if found.map_posterior is None or found.draws is None:
@@ -215,13 +143,46 @@ class SizeEstimate(_Sized):
         size = self.outcome.estimate.size
         if size is None:
             return self.plot_map(path, force=force)
-        return draw_size(size, path_of(path), name=self.name, probability=self.probability, force=force)
+        return draw_size(size, path_of(path), name=self._titled, probability=self.probability, force=force)
 
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
         from tactile_bayes.report.estimate_figures import draw_map
 
-        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self.name, force=force)
+        return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
+
+    def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw data, fit and residual of the fit window side by side; without an estimate the map.
+
+        Parameters
+        ----------
+        path
+            Also write it there, as PNG, PDF or SVG.
+        """
+        from tactile_bayes.report.estimate_figures import draw_fit
+
+        if self.status != "estimate":
+            return self.plot_map(path, force=force)
+        return draw_fit(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
+
+    @property
+    def _titled(self) -> str:
+        """Name for the titles of figures, with the subject's code and the scan's digest."""
+        from tactile_bayes.report.figure_title import named_exam
+
+        return named_exam(self.name, self.outcome.provenance.scans)
+
+    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
+        """Write one page of the exam as HTML, as ``tactile-bayes report`` does.
+
+        Parameters
+        ----------
+        path
+            Usually ``*.html``.
+        title, name, day
+            To print on the page; nothing is where they are not given.
+        """
+        _write_report((self,), path_of(path), self.outcome.settings, (title, name, day), force=force)
 
     def save(self, path: PathLike, *, force: bool = False) -> None:
         """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
@@ -237,7 +198,7 @@ class SizeEstimate(_Sized):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PooledSize(_Sized):
+class PooledSize(Sized):
     """One size from several maps of one mass.
 
     Parameters
@@ -254,6 +215,7 @@ class PooledSize(_Sized):
     maps: tuple[SizeEstimate, ...]
     probability: float
     name: str = field(default="")
+    settings: Settings = field(default_factory=Settings)
 
     @property
     def _size(self) -> SizePosterior | None:
@@ -268,6 +230,10 @@ class PooledSize(_Sized):
     def document(self) -> dict[str, Any]:
         """What ``estimate --pool --json`` prints."""
         return self.outcome.document
+
+    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
+        """Write one page of the exam as HTML, with the repeat maps; see `SizeEstimate.report`."""
+        _write_report(self.maps, path_of(path), self.settings, (title, name, day), force=force)
 
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the posterior of the size; with a path also write it.
@@ -284,6 +250,17 @@ class PooledSize(_Sized):
             raise UsageError(f"there is no size to draw: {self.why}")
         name = self.name or f"{len(self.maps)} maps pooled"
         return draw_size(size, path_of(path), name=name, probability=self.probability, force=force)
+
+
+def _write_report(
+    maps: Sequence[SizeEstimate], path: Path, settings: Settings, words: tuple[str, str, str], *, force: bool
+) -> None:
+    from tactile_bayes.files.atomic import write_text
+    from tactile_bayes.pipeline.exam_report import EstimatedMap, Given, make_exam
+    from tactile_bayes.report.exam_page import exam_page
+
+    found = [EstimatedMap(one.outcome.tactile_map, one.answer, one.outcome.provenance.scans) for one in maps]
+    write_text(path, exam_page(make_exam(found, settings, Given(*words))), force=force)
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -304,6 +281,10 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
         given["calibration"] = str(calibration.expanduser())
     if isinstance(given.get("known"), Mapping):
         given["known"] = tuple((name, float(value)) for name, value in given["known"].items())
+    if isinstance(given.get("repeatability"), str | Path):
+        from tactile_bayes.files.repeatability_json import read_repeatability
+
+        given["repeatability"] = read_repeatability(path_of(given["repeatability"]))
     if given.get("checkpoint") is not None:
         given["checkpoint"] = path_of(given["checkpoint"])
     return Settings(**given)
@@ -327,7 +308,8 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
         Called with effective draws done and wanted.
     **settings
         As of `tactile_bayes.pipeline.settings.Settings`, by default as on the command line; `size_calibration` is a
-        name, a path or a calibration from `calibrate_size`, `known` a mapping such as ``{"seat": 1.2}``.
+        name, a path or a calibration from `calibrate_size`, `known` a mapping such as ``{"seat": 1.2}``,
+        `repeatability` a path or what `calibrate_repeatability` returns.
 
     Returns
     -------
@@ -387,7 +369,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
         raise UsageError("a map is given twice; give each map once")
     names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
     outcome = pool_answers([one.answer for one in found], used, names=names, inputs={})
-    return PooledSize(outcome, found, used.interval)
+    return PooledSize(outcome, found, used.interval, settings=used)
 
 
 def _several(maps: Iterable[Any]) -> list[Any]:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tactile_bayes.pipeline.size_calibration import EqSixFit
     from tactile_bayes.pipeline.trial import TrialOutcome
     from tactile_bayes.size.calibration import Calibration
+    from tactile_bayes.size.repeatability import Repeatability
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -187,6 +188,41 @@ def calibrate_size(
         provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)
         write_size_calibration(path_of(path), learned.calibration, provenance=provenance, force=force)
     return learned.calibration
+
+
+def calibrate_repeatability(
+    folder: PathLike, *, size_calibration: PathLike | None = None, path: PathLike | None = None, force: bool = False
+) -> Repeatability:
+    """Learn how far sizes of one mass lie apart between its exams at a site.
+
+    Parameters
+    ----------
+    folder
+        Of a ``campaign run`` with at least 3 masses that have repeated exams.
+    size_calibration
+        Calibration that the exams were sized by, where the name in their estimates does not lead to its file.
+    path
+        Also write it there.
+
+    Returns
+    -------
+    Repeatability
+        For ``estimate(..., repeatability=...)``: `median`, `low` and `high` of the spread, a share of the size.
+
+    Raises
+    ------
+    BadDataError
+        When there are too few masses with repeated exams, or the exams were sized by several calibrations.
+    UsageError
+        When the calibration's file is not found.
+    """
+    from tactile_bayes.pipeline.repeatability import exams_in, learn_from_exams
+
+    given = None if size_calibration is None else str(size_calibration)
+    learned = learn_from_exams(exams_in(path_of(folder)), size_calibration=given)
+    if path is not None:
+        learned.write(path_of(path), force=force)
+    return learned.repeatability
 
 
 def _table(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:

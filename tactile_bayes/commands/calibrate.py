@@ -1,4 +1,4 @@
-"""`calibrate`: learn a calibration from known objects."""
+"""`calibrate`: learn a calibration from known objects, and a site's repeatability from its own exams."""
 
 from __future__ import annotations
 
@@ -220,6 +220,37 @@ def _over_bodies(table: Path, output: Path, form: PopulationForm, normalise: str
     provenance = Provenance("calibrate size", settings, hash_inputs(table=table))
     write_body_calibration(output, calibration, provenance=provenance, force=force)
     return body_calibration_text(calibration)
+
+
+@command.command("repeatability")
+@click.argument("folder", metavar="OUT", type=_FILE)
+@click.option("-o", "--output", required=True, metavar="SITE.json", type=_FILE, help="Where to write the spread.")
+@click.option(
+    "--size-calibration",
+    metavar="SIZE.json",
+    help="Calibration that the exams were sized by, where the name in their estimates does not lead to its file.",
+)
+@FORCE
+def repeatability(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:
+    """Learn how far sizes of one mass lie apart between its exams at this site.
+
+    OUT is the folder of a `campaign run`. Masses with two exams or more at one visit take part, from 3 such masses on,
+    better 10: their own size cancels, and errors that each map has anyway are taken off. What is left is the spread
+    that `estimate --repeatability SITE.json` uses instead of that of simulated exams and of the paper's 15 %. Exams
+    without a size, and those of a scan that another exam has, take no part.
+
+    Example: tactile-bayes calibrate repeatability out -o site.json
+    """
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.pipeline.repeatability import exams_in, learn_from_exams
+    from tactile_bayes.report.repeatability_text import repeatability_text
+
+    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
+    refuse_existing(output, force=force)
+    learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
+    learned.write(output, force=force)
+    click.echo(repeatability_text(learned.document), nl=False)
 
 
 @command.command("array")

@@ -16,8 +16,9 @@ from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARC
 
 if TYPE_CHECKING:
     from tactile_bayes.files.manifest_csv import Exam
-    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
+    from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_report import Written
+    from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 
 _FILE = FilePath()
 _MOST_NAMED = 5
@@ -77,6 +78,20 @@ def init(folder: Path | str, output: Path, force: bool) -> None:
 @click.option(
     "--normalise", type=click.Choice(NORMALISE), default=DEFAULT_NORMALISE, show_default=True, help="As `map`."
 )
+@click.option(
+    "--match-mm",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="MM",
+    default=15.0,
+    show_default=True,
+    help="Distance within which a mass is the one that another exam of the breast names by place.",
+)
+@click.option(
+    "--repeatability",
+    metavar="none|SITE.json",
+    help="Spread between exams of one mass: a file as for `estimate`, or none (two intervals, the first of them in the "
+    "tables). Default: learned from this campaign's repeats, where 5 masses have them.",
+)
 @seed_option(1)
 @click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done and how long it takes, and do nothing.")
@@ -94,6 +109,8 @@ def run(
     size_calibration: str | None,
     settings_file: Path | None,
     normalise: str,
+    match_mm: float,
+    repeatability: str | None,
     seed: int,
     figures: bool,
     dry_run: bool,
@@ -104,27 +121,42 @@ def run(
     """Map, estimate and pool the exams of a table, and report the trial.
 
     DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
-    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. An exam's fault is
-    its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
+    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. Where 5 masses have
+    several exams at one visit, the spread between exams is learned from them and every size is by it. An exam's fault
+    is its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
     what depends on a file or setting that changed, and what failed.
 
     Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
     """
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
     from tactile_bayes.executors import open_executor
     from tactile_bayes.files.manifest_csv import read_manifest
     from tactile_bayes.files.remote import check_address
-    from tactile_bayes.pipeline.campaign import Campaign, CampaignSettings
+    from tactile_bayes.files.shipped import NONE
+    from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
     from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, copy_outputs, write_outputs
+    from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 
-    settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed)
-    of_all = CampaignSettings(settings, normalise, figures, "" if copy_to is None else check_address(copy_to))
+    given = None if repeatability in (None, NONE) else Path(str(repeatability))
+    also_read(given)
+    settings = settings_of(
+        settings_file, calibration=size_calibration, method=method, seed=seed, repeatability=repeatability_in(given)
+    )
+    of_all = CampaignSettings(
+        settings,
+        normalise,
+        figures,
+        match_mm,
+        own_repeatability=repeatability is None,
+        copy_to="" if copy_to is None else check_address(copy_to),
+    )
     table = read_manifest(exams)
     _check_paths(table, output, of_all)
     refuse_same(
-        [output / name for name in WRITTEN], [path for path in (exams, excision, protocol, settings_file) if path]
+        [output / name for name in WRITTEN],
+        [path for path in (exams, excision, protocol, settings_file, given) if path],
     )
     check_inputs(excision, protocol)
     with (
@@ -191,7 +223,7 @@ def _duration(seconds: float) -> str:
 
 
 def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence[str]) -> None:
-    from tactile_bayes.pipeline.campaign_report import counts_words
+    from tactile_bayes.pipeline.campaign_report import counts_words, repeatability_words
 
     found = campaign.found
     counts = counts_words(written.sized, written.unsized, written.failed)
@@ -200,12 +232,15 @@ def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence
         click.echo(f"{written.pooled} masses pooled")
     elif campaign.not_pooled:
         click.echo(f"no mass pooled: {campaign.not_pooled}")
+    if line := repeatability_words(campaign):
+        click.echo(line)
     click.echo(f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs")
     for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"failed: {name}: {fault.step}: {fault.reason}", err=True)
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"failed: {len(found.faults) - _MOST_NAMED} more, see failures.csv", err=True)
     _say_names("no size after excision, left out of trial.csv", written.left_out)
+    _say_names("exams with a mass that no row names, see their checks", written.unnamed)
     _say_names("folders of exams that the table does not list", left)
     if written.report:
         click.echo(written.report, nl=False)

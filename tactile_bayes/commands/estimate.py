@@ -63,6 +63,12 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="Draw the map with the lump's size, or with the places looked at.",
 )
 @click.option(
+    "--fit-figure",
+    metavar=METAVAR,
+    type=FigurePath(),
+    help="Draw data, fit and residual of the fit window, or the map where there is no estimate.",
+)
+@click.option(
     "--centre-mm",
     type=(FiniteRange(), FiniteRange()),
     metavar="X Y",
@@ -96,6 +102,13 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     help="Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
     "stiffness_ratio, fat_kpa, gland_ratio or thickness_mm.",
 )
+@click.option(
+    "--repeatability",
+    metavar="SITE.json",
+    type=_FILE,
+    help="Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then have one interval, "
+    "for any exam there. Default: two, for exams as alike as simulated ones and as the paper's.",
+)
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @click.option(
     "--workers",
@@ -122,11 +135,13 @@ def command(
     as_json: bool,
     figure: Path | None,
     map_figure: Path | None,
+    fit_figure: Path | None,
     centre_mm: tuple[float, float] | None,
     accuracy_sd: float | None,
     scene: str,
     settings_file: Path | None,
     known: tuple[tuple[str, float], ...],
+    repeatability: Path | None,
     pool: bool,
     workers: int,
     scheduler: str | None,
@@ -142,7 +157,7 @@ def command(
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """
-    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
 
     settings = settings_of(
         settings_file,
@@ -154,25 +169,26 @@ def command(
         accuracy_sd=accuracy_sd,
         known=known,
         scene=scene,
+        repeatability=repeatability_in(repeatability),
     )
     if settings.checkpoint is not None and len(maps) > 1:
         raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")
     if figure is not None and size_calibration == "none":
         raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
-    outputs = {"output": output, "figure": figure, "map figure": map_figure}
+    outputs = {"output": output, "figure": figure, "map figure": map_figure, "fit figure": fit_figure}
     _check_outputs([path for path in outputs.values() if path], maps, pool, force=force)
     also_read(_named(size_calibration))
     begun = time.perf_counter()
     if pool:
         from tactile_bayes.commands.estimate_pool import estimate_pool
 
-        if map_figure:
-            raise UsageError("--map-figure draws one map; leave out --pool")
+        if map_figure or fit_figure:
+            raise UsageError("--map-figure and --fit-figure draw one map; leave out --pool")
         answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
         printed = {"as_json": as_json, "verbose": verbose}
         ctx.exit(estimate_pool(maps, answers, settings, output, figure, **printed, force=force))
     if len(maps) == 1:
-        answers = [_one_map(maps[0], settings, output, figure, map_figure, force=force)]
+        answers = [_one_map(maps[0], settings, output, (figure, map_figure, fit_figure), force=force)]
     else:
         with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
@@ -205,8 +221,7 @@ def _one_map(
     path: Path,
     settings: Settings,
     output: Path | None,
-    figure: Path | None,
-    map_figure: Path | None,
+    figures: tuple[Path | None, Path | None, Path | None],
     *,
     force: bool,
 ) -> Answer:
@@ -219,12 +234,12 @@ def _one_map(
     tactile_map, estimate = outcome.tactile_map, outcome.estimate
     if output and estimate.status == "estimate":
         outcome.write(output, force=force)
-    if figure or map_figure:
+    if any(figures):
         from tactile_bayes.report.estimate_figures import draw_figures
+        from tactile_bayes.report.figure_title import named_exam
 
-        draw_figures(
-            tactile_map, estimate, figure, map_figure, name=path.stem, probability=settings.interval, force=force
-        )
+        name = named_exam(path.stem, outcome.provenance.scans)
+        draw_figures(tactile_map, estimate, *figures, name=name, probability=settings.interval, force=force)
     return answer_of(outcome)
 
 

@@ -160,13 +160,13 @@ def describe_scan(scan: Scan) -> list[str]:
     span = float(times[-1] - times[0]) if len(times) else 0.0
     calibration = scan.element_calibration
     saturated = int((scan.frames.counts >= calibration.saturation_count).sum())
-    missing = "not touched" if scan.landmarks is None else "sternal notch and xiphoid"
+    marks = [] if scan.landmarks is None else [name.replace("_", " ") for name in scan.landmarks.points()]
     return [
         f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
         f"{len(poses)} poses, {_rate(poses.time_s)}",
         f"dropped frames {_dropped(times)}, dropped poses {_dropped(poses.time_s)}, "
         f"duplicate pose stamps {_duplicates(poses.time_s)}, saturated readings {saturated}",
-        f"landmarks: {missing}",
+        f"landmarks: {' and '.join(', '.join(marks).rsplit(', ', 1)) or 'not touched'}",
     ]
 
 

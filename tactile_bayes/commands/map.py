@@ -117,11 +117,14 @@ def command(
             progress=progress,
         )
     clock.tell("map")
-    write_map(output, tactile_map, provenance=map_provenance(scans, loaded, settings), force=force)
+    provenance = map_provenance(scans, loaded, settings)
+    write_map(output, tactile_map, provenance=provenance, force=force)
     if figure:
+        from tactile_bayes.report.figure_title import named_exam
         from tactile_bayes.report.map_figure import map_figure
 
-        map_figure(tactile_map, figure, title=f"Tactile map: {output.stem}", force=force)
+        title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
+        map_figure(tactile_map, figure, title=title, force=force)
     clock.tell("write")
     click.echo(map_text(tactile_map, lost=lost), nl=False)
 

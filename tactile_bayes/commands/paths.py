@@ -11,7 +11,9 @@ import click
 
 from tactile_bayes.errors import UsageError
 
-WRITTEN: Final = frozenset({"output", "figure", "map_figure", "figures", "html", "trace", "rank", "corner"})
+WRITTEN: Final = frozenset(
+    {"output", "figure", "map_figure", "fit_figure", "figures", "html", "pdf", "trace", "rank", "corner", "dictionary"}
+)
 """The options that name what a command writes; every other path is read."""
 _SEEN: Final = "tactile_bayes.paths"
 

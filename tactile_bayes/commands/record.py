@@ -147,7 +147,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     from datetime import date
 
     from tactile_bayes.commands.record_keys import Stopper
-    from tactile_bayes.commands.record_parts import instrument_of, provenance_of, refuse_calibration
+    from tactile_bayes.commands.record_parts import calibration_age, instrument_of, provenance_of, refuse_calibration
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
     from tactile_bayes.files.schema import check_document
@@ -161,7 +161,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     with ExitStack() as stack:
         hello, lines = _connect(request, stack)
         _check_fit(hello, head, request)
-        session = request.session(hello, facts)
+        session = request.session(hello, facts) | calibration_age(request, today=date.today())
         check_document(session, SCHEMA, path=request.output)
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
         observer = _look_on(request, head, calibration, stack)
@@ -266,8 +266,7 @@ def _place(landmarks: Landmarks | None, writer: Any, observer: Observer | None) 
     """Write the landmarks given in a file, and show them in the live view."""
     if landmarks is None:
         return
-    for name in ("sternal_notch", "xiphoid"):
-        position_mm = getattr(landmarks, f"{name}_mm")
+    for name, position_mm in landmarks.points().items():
         writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
         if observer is not None:
             observer.landmark(name, position_mm)

@@ -68,7 +68,7 @@ class Keys:
             self._settings = termios.tcgetattr(sys.stdin)
             tty.setcbreak(sys.stdin)
         if self.waiting:
-            click.echo("n sternal notch, x xiphoid, space start, q stop", err=True)
+            click.echo("n sternal notch, x xiphoid, p nipple, space start, q stop", err=True)
             self._recorder.listen()
         return self
 
@@ -97,7 +97,7 @@ class Keys:
     def _press(self, key: str) -> None:
         from tactile_bayes.hardware.landmarks import LandmarkTouch
 
-        names = {"n": "sternal_notch", "x": "xiphoid"}
+        names = {"n": "sternal_notch", "x": "xiphoid", "p": "nipple"}
         if key in names:
             self._recorder.touch(LandmarkTouch(names[key], scanhead_from_tracker=self._lever))
         elif key == " " and self.waiting:

@@ -73,6 +73,15 @@ def refuse_calibration(request: Request, *, head_id: str, today: date) -> None:
         )
 
 
+def calibration_age(request: Request, *, today: date) -> dict[str, str]:
+    """Session fact on the age of the array calibration, in days; empty where it came from no calibration file."""
+    from tactile_bayes.files.instrument_json import read_array_calibration
+
+    if not request.array_calibration or request.uncalibrated:
+        return {}
+    return {"array_calibration_days": str((today - read_array_calibration(request.array_calibration).day).days)}
+
+
 def _landmarks(request: Request) -> Landmarks | None:
     from tactile_bayes.files.instrument_json import read_landmarks
     from tactile_bayes.files.scan_mcap import read_scan

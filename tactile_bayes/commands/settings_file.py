@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.commands.paths import also_read, refuse_same
 from tactile_bayes.pipeline.settings import Settings
+
+if TYPE_CHECKING:
+    from tactile_bayes.size.repeatability import Repeatability
 
 
 def settings_of(path: Path | None, **options: Any) -> Settings:
@@ -28,3 +31,12 @@ def settings_of(path: Path | None, **options: Any) -> Settings:
     if settings.checkpoint is not None:
         refuse_same([settings.checkpoint], [path])
     return settings
+
+
+def repeatability_in(path: Path | None) -> Repeatability | None:
+    """The repeatability that an option names; None where it names none."""
+    if path is None:
+        return None
+    from tactile_bayes.files.repeatability_json import read_repeatability
+
+    return read_repeatability(path)

@@ -56,10 +56,11 @@ LAYOUT: Final[dict[str, ArrayLayout]] = {
         frame="scanhead",
     ),
     "landmarks_mm": ArrayLayout((2, 3), "sternal notch and xiphoid in the base frame", unit="mm", frame="base"),
+    "nipple_mm": ArrayLayout((3,), "nipple in the base frame, beside landmarks_mm", unit="mm", frame="base"),
     "saturation_count": ArrayLayout((), "readings at or above it carry no pressure; 4095 if left out"),
 }
 """Each array by its name."""
-OPTIONAL: Final = ("landmarks_mm", "saturation_count")
+OPTIONAL: Final = ("landmarks_mm", "nipple_mm", "saturation_count")
 
 
 def in_words(shape: Shape) -> str:

@@ -99,6 +99,8 @@ def _check_units(arrays: Arrays) -> None:
         apart = float(np.linalg.norm(arrays["landmarks_mm"][0] - arrays["landmarks_mm"][1]))
         if apart < 10.0:
             raise BadDataError(f"the points of landmarks_mm are {apart:.4g} apart", way_out=metres)
+    if "nipple_mm" in arrays:
+        _check_nipple(arrays, metres)
     full_scale = float(np.median(arrays["gain_kpa_per_count"])) * 4095
     if full_scale > 1000.0 or 0 < full_scale < 0.5:
         raise BadDataError(
@@ -106,6 +108,16 @@ def _check_units(arrays: Arrays) -> None:
         )
     _check_clock(arrays["frame_time_s"], arrays["pose_time_s"])
     _check_pitch(surface, float(arrays["pitch_mm"]))
+
+
+def _check_nipple(arrays: Arrays, metres: str) -> None:
+    if "landmarks_mm" not in arrays:
+        raise BadDataError(
+            "nipple_mm is without landmarks_mm", way_out="give notch and xiphoid too: they say what is up"
+        )
+    near = float(np.linalg.norm(arrays["landmarks_mm"] - arrays["nipple_mm"], axis=1).min())
+    if near < 10.0:
+        raise BadDataError(f"nipple_mm is {near:.4g} from a point of landmarks_mm", way_out=metres)
 
 
 def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any, Any]) -> None:
@@ -144,6 +156,6 @@ def _scan(arrays: Arrays) -> Scan:
         element_calibration=ElementCalibration(
             values["gain_kpa_per_count"], values["offset_kpa"], int(values.get("saturation_count", 4095))
         ),
-        landmarks=None if landmarks is None else Landmarks(landmarks[0], landmarks[1]),
+        landmarks=None if landmarks is None else Landmarks(*landmarks, nipple_mm=values.get("nipple_mm")),
         session={"source": "imported"},
     )

@@ -104,6 +104,7 @@ def _map(path: Path) -> dict[str, Any]:
         "background": tactile_map.background,
         "frames": tactile_map.frame_count,
         "patient_frame": tactile_map.patient_from_plane is not None,
+        **({} if tactile_map.nipple_mm is None else {"nipple_mm": tactile_map.nipple_mm.tolist()}),
         "recipe": asdict(tactile_map.recipe),
         **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
         "quality": dict(tactile_map.quality),
@@ -123,6 +124,8 @@ def _json(path: Path) -> dict[str, Any]:
         return _size_calibration(path, document)
     if schema.startswith("tactile-bayes/site-calibration/"):
         return _site_calibration(path, document)
+    if schema.startswith("tactile-bayes/repeatability/"):
+        return _repeatability(path, document)
     kept = {name: value for name, value in document.items() if name not in ("schema", "modalities")}
     return {"schema": schema, "kind": schema.split("/")[1], **kept}
 
@@ -147,6 +150,28 @@ def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
         },
         "base": _described(calibration, document["base"]),
         "provenance": document["provenance"],
+    }
+
+
+def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
+    from tactile_bayes.files.repeatability_json import read_repeatability
+
+    found = read_repeatability(path)
+    provenance = dict(document["provenance"])
+    if isinstance(inputs := provenance.get("inputs"), list):  # those of a long list that are no exam's draws
+        drawn = [isinstance(one, dict) and str(one.get("role")).startswith("draws_") for one in inputs]
+        provenance["inputs"] = [one for one, left_out in zip(inputs, drawn, strict=True) if not left_out]
+    kept = ("between_map_sd", "log_sd", "median", "low", "high", "probability", "masses", "maps", "calibration")
+    return {
+        "schema": document["schema"],
+        "kind": "spread between exams of one mass at a site",
+        "in_words": found.words(),
+        **{name: document[name] for name in (*kept, *(["half_width"] if "half_width" in document else []))},
+        "units": {"between_map_sd, median, low, high, half_width": "share of the size"},
+        "repeats": {one["name"]: f"{len(one['exams'])} exams" for one in document["repeats"]},
+        "outlying": document["outlying"],
+        "left_out": document["left_out"],
+        "provenance": provenance,
     }
 
 

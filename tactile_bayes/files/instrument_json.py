@@ -86,10 +86,12 @@ def read_array_calibration(path: Path) -> ArrayCalibrationFile:
 
 
 def read_landmarks(path: Path) -> Landmarks:
-    """Read both landmarks in `base`."""
+    """Read sternal notch and xiphoid in `base`, and the nipple where the file has it."""
     document = _read(path, LANDMARKS_SCHEMA, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
     try:
-        return Landmarks(*(np.array(document[name], dtype=np.float64) for name in ("sternal_notch_mm", "xiphoid_mm")))
+        notch, xiphoid = (np.array(document[name], dtype=np.float64) for name in ("sternal_notch_mm", "xiphoid_mm"))
+        nipple = np.array(document["nipple_mm"], dtype=np.float64) if document.get("nipple_mm") is not None else None
+        return Landmarks(notch, xiphoid, nipple_mm=nipple)
     except BadDataError as error:
         raise error.at(path) from None
     except (KeyError, TypeError, ValueError) as error:

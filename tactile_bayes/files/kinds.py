@@ -28,6 +28,7 @@ _KINDS = {
     "pooled": "a pooled estimate (JSON)",
     "size-calibration": "a size calibration (JSON)",
     "site-calibration": "a size calibration corrected by phantoms (JSON)",
+    "repeatability": "a site's repeatability (JSON)",
     "validate": "a trial report (JSON)",
     "plan": "a trial plan (JSON)",
 }

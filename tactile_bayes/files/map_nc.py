@@ -22,7 +22,7 @@ from tactile_bayes.files.map_frames_nc import FRAMES_GROUP, frame_contents, read
 from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
-from tactile_bayes.geometry import check_rigid
+from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.presets import NORMALISE
@@ -134,6 +134,7 @@ def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ..
             quality=header["quality"],
             masked_taxels=tuple(header["masked_taxels"]),
             head=header["head"],
+            nipple_mm=header["nipple_mm"],
             frames=read_frames(file, way_out=_WAY_OUT),
         )
         return tactile_map, scans_of(header["provenance"])
@@ -144,8 +145,8 @@ def read_map_header(path: Path) -> dict[str, Any]:
 
     Returns
     -------
-    dict with ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``head``, ``provenance``,
-    ``background``, ``frame_count`` and ``shape`` (ny, nx).
+    dict with ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``head``, ``nipple_mm``,
+    ``provenance``, ``background``, ``frame_count`` and ``shape`` (ny, nx).
     """
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         shape = tuple(_dimension(file, name) for name in ("y", "x"))
@@ -177,6 +178,7 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
         "quality": _json({name: _finite(value) for name, value in tactile_map.quality.items()}),
         "masked_taxels": _json(list(tactile_map.masked_taxels)),
         **({} if tactile_map.head is None else {"head": _json(tactile_map.head.as_dict())}),
+        **({} if tactile_map.nipple_mm is None else {"nipple_mm": _json(tactile_map.nipple_mm.tolist())}),
         "provenance": _json(provenance.as_dict()),
     }
 
@@ -205,6 +207,7 @@ def _header(file: Group) -> dict[str, Any]:
         "quality": _quality(_decoded(texts, "quality", dict)),
         "masked_taxels": [str(line) for line in _decoded(texts, "masked_taxels", list)],
         "head": _head(texts),
+        "nipple_mm": _nipple(texts),
         "provenance": _decoded(texts, "provenance", dict),
     }
 
@@ -277,6 +280,16 @@ def _head(texts: Mapping[str, str]) -> HeadShape | None:
         return HeadShape.from_document(_decoded(texts, "head", dict))
     except BadDataError as error:
         raise BadDataError(f"attribute head: {error.what}", way_out=_WAY_OUT) from None
+
+
+def _nipple(texts: Mapping[str, str]) -> FloatArray | None:
+    """The nipple in the plane; None where it was not touched and in files of earlier versions."""
+    if "nipple_mm" not in texts:
+        return None
+    values = _decoded(texts, "nipple_mm", list)
+    if len(values) != 3 or not all(_is_number(one) for one in values):
+        raise BadDataError(f"attribute nipple_mm holds {_short(values)}", way_out=_WAY_OUT)
+    return np.array(values, dtype=np.float64)
 
 
 def _is_number(value: object) -> bool:

@@ -11,8 +11,8 @@ from tactile_bayes import __version__
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.records import dataclass
 
-EXAM_FACTS: Final = ("subject", "side", "posture", "examiner", "visit", "mass")
-"""What a scan's session says of the exam; codes only, see ``scan_session.schema.json``."""
+EXAM_FACTS: Final = ("subject", "side", "posture", "examiner", "visit", "mass", "array_calibration_days")
+"""What a scan's session says of its exam and array calibration; codes only, see ``scan_session.schema.json``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,6 +63,8 @@ from tactile_bayes.scan import (
 SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
 CHUNK_BYTES: Final = 64 * 1024
 LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
+NIPPLE: Final = "nipple"
+"""A landmark that a scan may do without; a file has a channel for it only where it was touched."""
 TOPICS: Final = ("/pressure", "/pose", "/landmark")
 _SESSION_SCHEMA: Final = "scan_session.schema.json"
 _NS: Final = 1_000_000_000
@@ -121,7 +123,7 @@ class ScanWriter:
         self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type="application/json", data=data)
 
     def _register(self) -> None:
-        schema_of = {
+        self._schema_of = {
             kind: self._writer.register_schema(
                 name=kind.DESCRIPTOR.full_name,
                 encoding="protobuf",
@@ -130,18 +132,18 @@ class ScanWriter:
             for kind in (Grid, PoseInFrame)
         }
 
-        def channel(topic: str, kind: Any, **metadata: str) -> int:
-            number: int = self._writer.register_channel(
-                topic=topic,
-                message_encoding="protobuf",
-                schema_id=schema_of[kind],
-                metadata={"length_unit": "mm", **metadata},
-            )
-            return number
+        self._frame_channel = self._channel("/pressure", Grid)
+        self._pose_channel = self._channel("/pose", PoseInFrame)
+        self._landmark_channel = {name: self._channel("/landmark", PoseInFrame, name=name) for name in LANDMARK_NAMES}
 
-        self._frame_channel = channel("/pressure", Grid)
-        self._pose_channel = channel("/pose", PoseInFrame)
-        self._landmark_channel = {name: channel("/landmark", PoseInFrame, name=name) for name in LANDMARK_NAMES}
+    def _channel(self, topic: str, kind: Any, **metadata: str) -> int:
+        number: int = self._writer.register_channel(
+            topic=topic,
+            message_encoding="protobuf",
+            schema_id=self._schema_of[kind],
+            metadata={"length_unit": "mm", **metadata},
+        )
+        return number
 
     def add_frame(self, counts: CountArray, *, device_ns: int, host_ns: int) -> None:
         """Add one (rows, columns) frame of raw counts."""
@@ -161,8 +163,10 @@ class ScanWriter:
         self._send_message(self._pose_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def add_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int, host_ns: int) -> None:
-        """Add one (3,) point of `LANDMARK_NAMES` in `base`."""
+        """Add one (3,) point of `LANDMARK_NAMES`, or the `NIPPLE`, in `base`."""
         message = _pose_message(position_mm, np.array([1.0, 0.0, 0.0, 0.0]))
+        if name not in self._landmark_channel:
+            self._landmark_channel[name] = self._channel("/landmark", PoseInFrame, name=name)
         self._send_message(self._landmark_channel[name], message, device_ns=device_ns, host_ns=host_ns)
 
     def _send_message(self, channel: int, message: Any, *, device_ns: int, host_ns: int) -> None:
@@ -252,8 +256,7 @@ def _write_messages(writer: ScanWriter, scan: Scan) -> None:
     all_ns = np.concatenate([frame_ns, ns_from_s(scan.poses.time_s)])
     if scan.landmarks is not None:
         start = int(all_ns.min()) if len(all_ns) else 0
-        for name in LANDMARK_NAMES:
-            point = getattr(scan.landmarks, f"{name}_mm")
+        for name, point in scan.landmarks.points().items():
             writer.add_landmark(name, point, device_ns=start, host_ns=start)
     for i in np.argsort(all_ns, kind="stable").tolist():
         time = int(all_ns[i])
@@ -411,11 +414,13 @@ def _pose_table(messages: Messages) -> FloatArray:
 
 
 def _landmarks(records: McapRecords) -> Landmarks | None:
-    """Last touch of each landmark, and the distance of earlier ones from it; None unless all were touched."""
+    """Last touch of each landmark, and the distance of earlier ones from it; None unless `LANDMARK_NAMES` were."""
     points, apart = {}, []
-    for name in LANDMARK_NAMES:
+    for name in (*LANDMARK_NAMES, NIPPLE):
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
         if not len(touches):
+            if name == NIPPLE:
+                continue
             return None
         places = _pose_table(touches)[:, :3]
         points[f"{name}_mm"] = places[-1]

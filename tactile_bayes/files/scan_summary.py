@@ -12,6 +12,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.mcap_records import McapRecords
 from tactile_bayes.files.scan_mcap import (
     LANDMARK_NAMES,
+    NIPPLE,
     SCAN_SCHEMA,
     json_attachment,
     json_object,
@@ -58,6 +59,7 @@ def _summary(records: McapRecords) -> dict[str, Any]:
         "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
         **_recording(account, topics, time_s),
         "landmarks": all(_touched(records, name) for name in LANDMARK_NAMES),
+        "nipple": _touched(records, NIPPLE),
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
         "session": dict(records.metadata.get("session", {})),
         "provenance": json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance"),

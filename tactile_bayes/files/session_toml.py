@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tactile_bayes.scan import Scan
 
 SCHEMA: Final = "scan_session.schema.json"
-SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation")
+SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation", "array_calibration_days")
 """Keys that the recording itself writes."""
 
 

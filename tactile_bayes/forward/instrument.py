@@ -194,10 +194,11 @@ def _poses(scene: Scene, depth: Depth | None, *, rng: np.random.Generator) -> Tr
 def _landmarks(scene: Scene) -> Landmarks | None:
     if not scene.landmarks.touched:
         return None
-    base = scene.tracker.base_from_plane()
+    base, nipple = scene.tracker.base_from_plane(), scene.landmarks.nipple_mm
     return Landmarks(
         sternal_notch_mm=apply(base, np.array(scene.landmarks.sternal_notch_mm)),
         xiphoid_mm=apply(base, np.array(scene.landmarks.xiphoid_mm)),
+        nipple_mm=None if nipple is None else apply(base, np.array(nipple)),
     )
 
 

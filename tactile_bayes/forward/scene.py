@@ -216,11 +216,12 @@ class Taxels:
 
 @dataclass(frozen=True, slots=True)
 class SceneLandmarks:
-    """Landmarks in the scene's `plane`; `touched` false leaves them out of the scan."""
+    """Landmarks in the scene's `plane`; `touched` false leaves them out of the scan, None the nipple alone."""
 
     touched: bool = True
     xiphoid_mm: Point = (-60.0, -90.0, 0.0)
     sternal_notch_mm: Point = (-60.0, 90.0, 0.0)
+    nipple_mm: Point | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ class SeenPose(NamedTuple):
 
 
 class SeenLandmark(NamedTuple):
-    """One landmark, ``sternal_notch`` or ``xiphoid``, in `base`."""
+    """One landmark, ``sternal_notch``, ``xiphoid`` or ``nipple``, in `base`."""
 
     name: str
     position_mm: tuple[float, ...]

@@ -22,7 +22,7 @@ class Touch:
     Parameters
     ----------
     name
-        ``sternal_notch`` or ``xiphoid``.
+        ``sternal_notch``, ``xiphoid`` or ``nipple``.
     position_mm : (3,) array
         Mean in `base`.
     spread_mm

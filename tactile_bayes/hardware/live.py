@@ -190,7 +190,7 @@ class LiveMap:
         if self._map is None or not self._map.figures["frames_used"]:
             return None
         found = self._map.snapshot()
-        if found.plane_from_base is None or len(self._landmarks) < len(LANDMARKS):
+        if found.plane_from_base is None or not all(name in self._landmarks for name in LANDMARKS):
             return found
         notch, xiphoid = (self._landmarks[name] for name in LANDMARKS)
         try:

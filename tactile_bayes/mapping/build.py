@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.geometry import FloatArray, Plane, patient_from_plane
+from tactile_bayes.geometry import FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.accumulate import Accumulated, accumulate
 from tactile_bayes.mapping.convention import check_convention, hint
@@ -239,7 +239,7 @@ def _as_map(
     figures: dict[str, float],
 ) -> TactileMap:
     sums, scans = done.sums.trimmed(), [part.scan for part in selections]
-    patient, spread = _patient_from_plane(scans, plane)
+    patient, nipple, spread = _landmarks(scans, plane)
     quality = {
         **frame_figures(selections),
         **timing_figures(scans),
@@ -261,6 +261,7 @@ def _as_map(
         recipe=recipe,
         plane_from_base=plane.plane_from_base,
         patient_from_plane=patient,
+        nipple_mm=nipple,
         background=None if recipe.normalise == "none" else 1.0,
         frame_count=int(quality["frames_used"]),
         quality=quality,
@@ -292,20 +293,30 @@ def _masked(selections: list[SelectedFrames]) -> tuple[str, ...]:
     )
 
 
-def _patient_from_plane(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, dict[str, float]]:
-    """Patient frame from the mean landmarks of the scans that have them, and the distance between repeats."""
+def _landmarks(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, FloatArray | None, dict[str, float]]:
+    """Patient frame and nipple in the plane, from the mean landmarks of the scans, and the distance between repeats."""
     touched = [scan.landmarks for scan in scans if scan.landmarks is not None]
     if not touched:
-        return None, {}
-    pairs = np.stack([[marks.sternal_notch_mm, marks.xiphoid_mm] for marks in touched])
-    mean = np.sort(pairs, axis=0).mean(axis=0)  # sorted, so that the order of the scans leaves no trace
-    shift = float(np.linalg.norm(pairs - mean, axis=2).max())
+        return None, None, {}
+    nipples = [marks.nipple_mm for marks in touched if marks.nipple_mm is not None]
+    notch, notch_shift = _mean_point([marks.sternal_notch_mm for marks in touched])
+    xiphoid, xiphoid_shift = _mean_point([marks.xiphoid_mm for marks in touched])
+    nipple, nipple_shift = _mean_point(nipples) if nipples else (None, 0.0)
+    shift = max(notch_shift, xiphoid_shift, nipple_shift)
     if shift > MAX_LANDMARK_SHIFT_MM:
         raise BadDataError(
             f"the scans' landmarks lie up to {shift:.0f} mm from their mean",
             way_out="the patient or the tracker moved between them: build one map per scan",
         )
-    transform = patient_from_plane(mean[0], mean[1], plane.plane_from_base)
+    transform = patient_from_plane(notch, xiphoid, plane.plane_from_base)
     repeats = [marks.spread_mm for marks in touched if marks.spread_mm is not None]
     repeats += [shift] if len(touched) > 1 else []
-    return transform, {"landmark_spread_mm": max(repeats)} if repeats else {}
+    on_plane = None if nipple is None else apply(plane.plane_from_base, nipple)
+    return transform, on_plane, {"landmark_spread_mm": max(repeats)} if repeats else {}
+
+
+def _mean_point(points_mm: list[FloatArray]) -> tuple[FloatArray, float]:
+    """Mean of points, and the largest distance from it."""
+    found = np.stack(points_mm)
+    mean = np.sort(found, axis=0).mean(axis=0)  # sorted, so that the order of the scans leaves no trace
+    return mean, float(np.linalg.norm(found - mean, axis=1).max())

@@ -105,6 +105,8 @@ class TactileMap:
     frames
         Some of its frames; None for an imported grid, for a map in kPa, while a scan is going on, and for files of
         earlier versions.
+    nipple_mm : (3,) array or None
+        The nipple in `plane`; None where it was not touched.
     """
 
     mean: FloatArray
@@ -121,6 +123,7 @@ class TactileMap:
     masked_taxels: tuple[str, ...] = ()
     head: HeadShape | None = None
     frames: FrameSample | None = None
+    nipple_mm: FloatArray | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))

@@ -1,10 +1,11 @@
 """A campaign: from a table of exams to maps, estimates and pooled sizes, step by step, resumable.
 
 Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...) and
-``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), and the journal, which
-holds for each step its key, the digests of its files and how long it took. The key is the step, the exam or mass, and a
-digest of the program's version, the settings and the content of the inputs. A step whose key is in the journal and
-whose files are what it made is not run again.
+``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), repeatability.json
+where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the journal, which holds for each step its
+key, the digests of its files and how long it took. The key is the step, the exam or mass, and a digest of the program's
+version, the settings and the content of the inputs. A step whose key is in the journal and whose files are what it made
+is not run again.
 
 Exams go through the steps in blocks, in the order of the table, and the results stay in the journal: memory holds the
 table of exams, a few hundred bytes for each step, and one block.
@@ -15,98 +16,41 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
-from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.pipeline.campaign_copies import copy_tasks
-from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES, StepResults, median_seconds, unchanged
+from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
 from tactile_bayes.pipeline.campaign_inputs import READ, read_sources, same_bytes
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, FILES, MAP, SHAPE, Result, Task, digest_of, run_step
+from tactile_bayes.pipeline.campaign_keys import digest_of
+from tactile_bayes.pipeline.campaign_match import Breasts, NamedPlace
+from tactile_bayes.pipeline.campaign_repeatability import (
+    FEWEST_MASSES,
+    NOT_LEARNED,
+    exam_folders,
+    repeated_masses,
+    too_few,
+)
+from tactile_bayes.pipeline.campaign_settings import CampaignSettings
+from tactile_bayes.pipeline.campaign_stages import CampaignState, Fault, Progress, Stages, untold
+from tactile_bayes.pipeline.campaign_steps import ESTIMATE, MAP, REPEATABILITY, SHAPE, Task
 from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.presets import DEFAULT_NORMALISE
-from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-Progress = Callable[[int, int], None]
+    from tactile_bayes.size.repeatability import Repeatability
+
 Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")
 _BLOCK: Final = 64
 """Exams that go through the steps together at least; workers wait for the slowest of a block."""
 _AHEAD_IN_BLOCK: Final = 16
 """Blocks hold so many times what an executor takes ahead."""
-
-
-@dataclass(frozen=True, slots=True)
-class CampaignSettings:
-    """Settings of all exams.
-
-    Parameters
-    ----------
-    estimate
-        As of `estimate`; a row of the table may replace place, known values and calibration.
-    normalise
-        As of `map`.
-    figures
-        Whether the figures of `estimate` are drawn for each exam.
-    copy_to
-        Address of a folder in an object store that gets a copy of every file; empty for none.
-    """
-
-    estimate: Settings = field(default_factory=Settings)
-    normalise: str = DEFAULT_NORMALISE
-    figures: bool = False
-    copy_to: str = ""
-
-    def of(self, exam: Exam) -> Settings:
-        """Settings of one exam's estimate."""
-        given: dict[str, Any] = {
-            "centre_mm": exam.centre_mm,
-            "calibration": exam.calibration,
-            "known": exam.known or None,
-        }
-        return replace(self.estimate, **{name: value for name, value in given.items() if value is not None})
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """Why a step of an exam or a mass gave nothing."""
-
-    step: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CampaignState:
-    """How far a campaign is: results by step and name, faults by name, counts and times of steps.
-
-    Parameters
-    ----------
-    results
-        By step, then by the name of the exam or mass.
-    faults
-        By the name of the exam or mass.
-    kept, todo
-        Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do.
-    seconds
-        Median time that one of each step took so far.
-    """
-
-    results: dict[str, StepResults]
-    faults: dict[str, Fault] = field(default_factory=dict)
-    kept: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    todo: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def of(self, step: str, name: str) -> Result | None:
-        """Result of a step of an exam or mass; None where there is none."""
-        return self.results[step].get(name)
 
 
 class Campaign:
@@ -135,6 +79,10 @@ class Campaign:
         Results, faults and counts, filled by `run`.
     not_pooled
         Why no mass is pooled; empty where masses are.
+    repeatability
+        Learned from the repeats; None where it was not.
+    not_learned
+        Why it was not, where masses have repeats; empty otherwise.
     unread
         Names of the exams whose file could not be read.
     """
@@ -151,21 +99,22 @@ class Campaign:
         bar: Bar | None = None,
     ) -> None:
         self.exams, self.folder, self.settings = exams, folder, settings
-        values = {} if store is None else store.values
-        results = {step: StepResults(values) for step in FILES}
-        self.found = CampaignState(results, seconds=median_seconds(values))
+        self._stages = Stages(store=store, executor=executor, dry=dry)
+        self.found: CampaignState = self._stages.found
         self.not_pooled = ""
         self.unread: set[str] = set()
+        self.repeatability: Repeatability | None = None
+        self.not_learned = ""
+        self._sizes_unknown = False
         self._store, self._executor, self._dry = store, executor, dry
         self._bar: Bar = _no_bar if bar is None else bar
-        self._tell: Progress = _untold
-        self._done, self._total = 0, 0
         self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
+        self._breasts = Breasts(exams)
         self._digests: dict[Path, str] = {}
         self._calibrations: dict[str, str] = {}
 
     def run(self) -> CampaignState:
-        """Run what is missing: maps, estimates and figures of exams, block by block, then pooled sizes.
+        """Run what is missing: maps, estimates and figures block by block, repeatability, sizes by it, pooled sizes.
 
         Raises
         ------
@@ -181,10 +130,11 @@ class Campaign:
         self.not_pooled = self._why_not_pooled()
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
         per_exam = 2 + self.settings.figures + bool(self.settings.copy_to)
-        self._total = len(sound) * per_exam + masses * (2 if self.settings.copy_to else 1)
-        with self._bar("steps") as self._tell:
-            for block in _blocks(sound, self._block):
+        self._stages.total = len(sound) * per_exam + masses * (2 if self.settings.copy_to else 1)
+        with self._bar("steps") as self._stages.tell:
+            for block in _blocks_of_patients(sound, self._block):
                 self._size(block)
+            self._learn_repeatability(sound)
             if masses:
                 self._pool(sound)
         return self.found
@@ -200,27 +150,29 @@ class Campaign:
             if exam.path in sources.faults:
                 self.found.faults[exam.name] = Fault(READ, sources.faults[exam.path])
                 self.unread.add(exam.name)
-        for name, reason in same_bytes(self.exams, self._digests).items():
+        for name, reason in same_bytes(self.exams, self._digests, self._breasts).items():
             self.found.faults[name] = Fault(READ, reason)
 
     def _size(self, exams: Sequence[Exam]) -> None:
         """Maps, estimates and figures of some exams."""
         known = [exam for exam in exams if exam.path in self._digests]  # a plan fetches nothing from a store
-        self._stage("map", [self._map_task(exam) for exam in known], without=len(exams) - len(known))
+        self._stages.run("map", [self._map_task(exam) for exam in known], without=len(exams) - len(known))
         mapped = [exam for exam in exams if exam.name in self.found.results["map"]]
+        mapped = mapped if self._dry else self._placed(mapped)
         unmapped = len(exams) - len(mapped)
-        self._stage("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
+        self._stages.run("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
         if self.settings.figures:
             estimated = [exam for exam in mapped if exam.name in self.found.results["estimate"]]
             tasks = [self._estimate_task(exam, "figures") for exam in estimated]
-            self._stage("figures", tasks, without=len(exams) - len(estimated))
-        self._copy(EXAMS, [exam.name for exam in exams])
+            self._stages.run("figures", tasks, without=len(exams) - len(estimated))
+        self._copy(EXAMS, [exam.name for exam in exams], steps=("map", "estimate", "figures"))
 
-    def _copy(self, kind: str, names: Sequence[str]) -> None:
-        """Copy the files of exams or masses into the object store."""
+    def _copy(self, kind: str, names: Sequence[str], *, steps: Sequence[str]) -> None:
+        """Copy what steps made of exams or masses into the object store."""
         if self.settings.copy_to:
-            tasks = copy_tasks(self.folder / kind, names, self.found.results, to=f"{self.settings.copy_to}/{kind}")
-            self._stage("copy", tasks, without=len(names) - len(tasks))
+            results = [self.found.results[step] for step in steps]
+            tasks = copy_tasks(self.folder / kind, names, results, to=f"{self.settings.copy_to}/{kind}")
+            self._stages.run("copy", tasks, without=len(names) - len(tasks))
 
     def _map_task(self, exam: Exam) -> Task:
         digest = self._digests[exam.path]
@@ -246,7 +198,40 @@ class Campaign:
         settings = self.settings.of(exam)
         key = {"map": made["files"][MAP], **self._settings_key(settings, made["normalise"])}
         folder = self.folder / EXAMS / exam.name
-        return Task(step=step, name=exam.name, folder=folder, digest=digest_of(key), settings=settings)
+        places = self._places(exam)
+        if places:
+            key["match"] = {"mass": exam.mass, "most_mm": self.settings.match_mm, "places": self._places_key(places)}
+        return Task(
+            step=step,
+            name=exam.name,
+            folder=folder,
+            digest=digest_of(key),
+            settings=settings,
+            mass=exam.mass,
+            places=places,
+            match_mm=self.settings.match_mm,
+        )
+
+    def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
+        """The exams without those whose mass is named by a place on a map that could not be made."""
+        lost = [exam for exam in mapped if self._breasts.named(exam) and not self._places(exam)]
+        for exam in lost:
+            named = ", ".join(one.name for one in self._breasts.named(exam) if one.mass == exam.mass)
+            reason = f"the place of its mass is on the map of {named}, which was not made"
+            self.found.faults[exam.name] = Fault("estimate", reason)
+        return [exam for exam in mapped if exam not in lost]
+
+    def _places(self, exam: Exam) -> tuple[NamedPlace, ...]:
+        """Places of the breast's masses that other exams name, where this one names none."""
+        return tuple(
+            NamedPlace(one.mass, one.name, self.folder / EXAMS / one.name / MAP, one.centre_mm)
+            for one in self._breasts.named(exam, of=self.found.results["map"])
+            if one.centre_mm is not None
+        )
+
+    def _places_key(self, places: Sequence[NamedPlace]) -> list[Any]:
+        made = self.found.results["map"]
+        return [[one.mass, one.exam, made[one.exam]["files"][MAP], one.centre_mm] for one in places]
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
@@ -255,6 +240,9 @@ class Campaign:
         plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
         name = str(plain.pop("calibration") or default_for(normalise))
         file = plain.pop("settings_file")
+        repeatability = plain.pop("repeatability")
+        if repeatability is not None:
+            plain["repeatability"] = repeatability.sha256 or repr(repeatability)
         used = {"settings_sha256": None if file is None else self._file_digest(file), "calibration": name}
         return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
 
@@ -274,19 +262,83 @@ class Campaign:
             self._digests[path] = sha256(path)
         return self._digests[path]
 
+    def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
+        """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
+        given = self.settings.estimate
+        if not self.settings.own_repeatability or given.repeatability or given.between_map_sd is not None:
+            return
+        estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
+        masses = repeated_masses(sound if self._dry else estimated)
+        if masses < FEWEST_MASSES:
+            self.not_learned = too_few(masses) if masses else ""
+            return
+        self._stages.total += 1
+        complete = not self._dry or len(estimated) == len(sound)
+        tasks = [self._repeatability_task(estimated)] if complete else []
+        self._stages.run("repeatability", tasks, without=int(not complete))
+        result = self.found.of("repeatability", SITE)
+        self._sizes_unknown = result is None and self._dry
+        if result is None:
+            fault = self.found.faults.pop(SITE, None)
+            self.not_learned = "" if fault is None else fault.reason
+        elif NOT_LEARNED in result:
+            self.not_learned = result[NOT_LEARNED]
+        else:
+            self.repeatability = read_repeatability(self.folder / REPEATABILITY)
+        if self._sizes_unknown:
+            self._stages.run("size", [], without=len(sound))
+        elif self.repeatability is not None:
+            self._stages.total += len(estimated)
+            for block in _blocks(estimated, self._block):
+                tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
+                self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
+                self._copy(EXAMS, [exam.name for exam in block], steps=("size",))
+
+    def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
+        files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
+        repeats = tuple(exam_folders(exams, self.folder / EXAMS))
+        return Task("repeatability", SITE, self.folder, digest_of([FEWEST_MASSES, files]), repeats=repeats)
+
+    def _size_task(self, exam: Exam) -> Task | None:
+        """Task of a size by the repeatability; None where the exam has no draws, or another calibration."""
+        made = self.found.of("map", exam.name)
+        assert made is not None
+        settings = self._by_repeatability(self.settings.of(exam), made["normalise"])
+        shape = self._file("estimate", exam, SHAPE)
+        if settings.repeatability is None or shape is None:
+            return None
+        files = [made["files"][MAP], self._file("estimate", exam, ESTIMATE), shape]
+        key = {"files": files, "figures": self.settings.figures, **self._settings_key(settings, made["normalise"])}
+        folder = self.folder / EXAMS / exam.name
+        figures = self.settings.figures
+        return Task("size", exam.name, folder, digest_of(key), settings=settings, figures=figures)
+
+    def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
+        """Settings with the learned repeatability, where it is for the calibration that they lead to."""
+        from tactile_bayes.files.shipped import default_for
+
+        found = self.repeatability
+        if found is None or self._calibration_digest(settings.calibration_name or default_for(normalise)) != (
+            found.calibration_sha256
+        ):
+            return settings
+        return replace(settings, repeatability=found)
+
     def _pool(self, sound: Sequence[Exam]) -> None:
         """Pool every mass at every visit from the exams that were estimated."""
         groups: dict[str, list[Exam]] = defaultdict(list)
         for exam in sound:
             if exam.name in self.found.results["estimate"]:
                 groups[exam.of_mass].append(exam)
+        if self._sizes_unknown:
+            groups.clear()
         unknown = len({exam.of_mass for exam in sound}) - len(groups)
         for names in _blocks(list(groups), self._block):
-            self._stage("pool", [self._pool_task(name, groups[name]) for name in names])
-            self._copy(MASSES, names)
-        self._stage("pool", [], without=unknown)
+            self._stages.run("pool", [self._pool_task(name, groups[name]) for name in names])
+            self._copy(MASSES, names, steps=("pool",))
+        self._stages.run("pool", [], without=unknown)
         if self.settings.copy_to:
-            self._stage("copy", [], without=unknown)
+            self._stages.run("copy", [], without=unknown)
 
     def _why_not_pooled(self) -> str:
         """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
@@ -306,6 +358,7 @@ class Campaign:
         first = self.found.of("map", exams[0].name)
         assert first is not None
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
+        settings = self._by_repeatability(settings, first["normalise"])
         files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
         key = {"exams": files, **self._settings_key(settings, first["normalise"])}
         members = tuple((exam.name, self.folder / EXAMS / exam.name) for exam in exams)
@@ -316,57 +369,9 @@ class Campaign:
         result = self.found.of(step, exam.name)
         return None if result is None else result["files"].get(file)
 
-    def _stage(self, step: str, tasks: Sequence[Task], *, without: int = 0) -> None:
-        """Run one step for those that need it.
 
-        Parameters
-        ----------
-        without
-            How many more have no inputs: in a plan they will need the step, in a run they failed before it.
-        """
-        kept = self._kept(tasks)
-        for task in kept:
-            self.found.results[step].add(task.name, task.key)
-        missing = [task for task in tasks if task.name not in self.found.results[step]]
-        self.found.kept[step] += len(kept)
-        self.found.todo[step] += len(missing) + (without if self._dry else 0)
-        self._total -= len(kept) + without
-        if self._dry:
-            return
-        for task, outcome in zip(missing, self._run(missing), strict=True):
-            if outcome.value is not None:
-                self.found.results[step].add(task.name, task.key)
-            elif outcome.error == CLUSTER_LOST:
-                raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
-            else:
-                self.found.faults[task.name] = Fault(step, outcome.error)
-
-    def _run(self, tasks: Sequence[Task]) -> list[Outcome[Result]]:
-        before = self._done
-
-        def tell(done: int, _total: int) -> None:
-            self._tell(before + done, self._total)
-
-        try:
-            outcomes = run_batch(run_step, tasks, key=_key, executor=self._executor, store=self._store, progress=tell)
-        except BatchInterrupted as stop:
-            path = None if self._store is None else self._store.path
-            raise BatchInterrupted(stop.outcomes, total=self._total, store=path, before=before) from None
-        self._done += len(tasks)
-        return outcomes
-
-    def _kept(self, tasks: Sequence[Task]) -> list[Task]:
-        """Tasks done by earlier runs whose files are still what they were; the results of others are forgotten."""
-        if self._store is None:
-            return []
-        values = self._store.values
-        known = [task for task in tasks if task.key in values]
-        for task in known:
-            if not unchanged(task.folder, values[task.key]):
-                values.forget(task.key)
-        return [task for task in known if task.key in values]
-
-
+SITE: Final = "site"
+"""Name of the one step that is of no exam or mass."""
 _POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
 
 
@@ -375,13 +380,14 @@ def _blocks(items: Sequence[_Any], size: int) -> Iterator[Sequence[_Any]]:
         yield items[start : start + size]
 
 
-def _untold(_done: int, _total: int) -> None:
-    """Progress that nobody watches."""
+def _blocks_of_patients(exams: Sequence[Exam], size: int) -> Iterator[Sequence[Exam]]:
+    """Blocks of at least so many exams; a patient's stay together, for one may name the place of another's mass."""
+    start = 0
+    for end in range(1, len(exams) + 1):
+        if end == len(exams) or (end - start >= size and exams[end].patient != exams[end - 1].patient):
+            yield exams[start:end]
+            start = end
 
 
 def _no_bar(_label: str) -> AbstractContextManager[Progress]:
-    return nullcontext(_untold)
-
-
-def _key(task: Task) -> str:
-    return task.key
+    return nullcontext(untold)

@@ -21,7 +21,8 @@ from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.remote import sha256_of, version_of
-from tactile_bayes.pipeline.campaign_steps import stamp
+from tactile_bayes.pipeline.campaign_keys import stamp
+from tactile_bayes.pipeline.campaign_match import Breasts
 from tactile_bayes.records import dataclass
 
 READ: Final = "read"
@@ -124,7 +125,7 @@ def _read(source: _Source) -> dict[str, Any]:
     return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
 
 
-def same_bytes(exams: Iterable[Exam], digests: Mapping[Path, str]) -> dict[str, str]:
+def same_bytes(exams: Iterable[Exam], digests: Mapping[Path, str], breasts: Breasts) -> dict[str, str]:
     """Reasons against exams of one file, by the exam's name; masses of one scan, each with its place, are sound."""
     same: dict[str, list[Exam]] = defaultdict(list)
     for exam in exams:
@@ -132,13 +133,15 @@ def same_bytes(exams: Iterable[Exam], digests: Mapping[Path, str]) -> dict[str, 
             same[digests[exam.path]].append(exam)
     faults = {}
     for alike in same.values():
-        breasts = {(exam.patient, exam.visit, exam.side) for exam in alike}
-        places = {(exam.mass, exam.centre_mm) for exam in alike if exam.centre_mm is not None}
-        if len(alike) == 1 or (len(breasts) == 1 and len({mass for mass, _ in places}) == len(alike)):
+        if len(alike) == 1:
+            continue
+        one_visit = len({(exam.patient, exam.visit, exam.side) for exam in alike}) == 1
+        placed = {one.mass for one in alike if one.centre_mm is not None or breasts.named(one)}
+        if one_visit and len(placed) == len(alike):
             continue
         for exam in alike:
             others = [other for other in alike if other is not exam]
             named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
-            way_out = "give each exam its own file, or each mass of one scan its centre_x_mm and centre_y_mm"
+            way_out = "give each exam its own file, or each mass of a breast its centre_x_mm and centre_y_mm"
             faults[exam.name] = f"holds the same bytes as {named}; {way_out}"
     return faults

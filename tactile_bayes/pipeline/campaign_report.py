@@ -11,7 +11,16 @@ from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_folder import EXAMS, JOURNAL
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, MAP, MAP_FIGURE, SIZE_FIGURE, THUMBNAIL
+from tactile_bayes.pipeline.campaign_steps import (
+    ESTIMATE,
+    MAP,
+    MAP_FIGURE,
+    REPEATABILITY,
+    SIZE_FIGURE,
+    SIZED,
+    SIZED_FIGURE,
+    THUMBNAIL,
+)
 from tactile_bayes.pipeline.campaign_tables import DONE, FAILURES, TRIAL, Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass
 
@@ -20,13 +29,13 @@ if TYPE_CHECKING:
     from tactile_bayes.report.campaign_html import Card
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
-WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX)
+WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX, REPEATABILITY)
 """Files beside the exams."""
 _MOST_INLINE: Final = 300
 """With more exams the contact sheet names its thumbnails' files instead of holding them."""
 _MOST_CARDS: Final = 10_000
 """More exams than a browser shows at ease."""
-_LINKS: Final = {"map.png": MAP_FIGURE, "size.png": SIZE_FIGURE, "estimate.json": ESTIMATE, "map.nc": MAP}
+_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +54,8 @@ class Written:
         The trial report as text; empty where there is none.
     no_report
         Why there is none, where excision sizes were given.
+    unnamed
+        Exams whose map shows a mass that no row names.
     """
 
     sized: int
@@ -54,6 +65,7 @@ class Written:
     left_out: tuple[str, ...] = ()
     report: str = ""
     no_report: str = field(default="")
+    unnamed: tuple[str, ...] = ()
 
 
 def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | None = None) -> Written:
@@ -79,12 +91,14 @@ def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | No
         for name in (REPORT, PAGE):
             (campaign.folder / name).unlink(missing_ok=True)
     links = {name: name for name in (DONE, FAILURES, TRIAL)} | ({"trial report": PAGE} if report else {})
+    links |= {REPEATABILITY: REPEATABILITY} if campaign.repeatability else {}
     page = _page(campaign, rows, counts, links)
     write_text(campaign.folder / INDEX, page, force=True)
     known = {(row.exam.patient, row.exam.mass) for row in rows}
     left_out = sorted(known - masses) if masses is not None else []
     names = tuple(f"{patient} {mass}" for patient, mass in left_out)
-    return Written(*counts, len(campaign.found.results["pool"]), names, report, fault)
+    unnamed = tuple(row.exam.name for row in rows if row.unnamed)
+    return Written(*counts, len(campaign.found.results["pool"]), names, report, fault, unnamed)
 
 
 def copy_outputs(folder: Path, address: str) -> None:
@@ -180,6 +194,7 @@ def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int],
     lines = [f"{len(rows)} exams: {counts_words(*counts)}."] + ([f"{masses} masses pooled."] if masses else [])
     if len(cards) < len(rows):
         lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
+    lines += [repeatability_words(campaign)] if campaign.repeatability else []
     return campaign_html(cards, lines=lines, links=links, version=__version__)
 
 
@@ -190,6 +205,15 @@ def _self_contained(card: Card, folder: Path) -> Card:
     if not isinstance(card.thumbnail, str):
         return card
     return replace(card, thumbnail=read_bytes(folder / card.thumbnail, most=IMAGE_BYTES))
+
+
+def repeatability_words(campaign: Campaign) -> str:
+    """What the repeats say of the site, and that the sizes are by it; why they do not where they might have."""
+    found = campaign.repeatability
+    if found is None:
+        return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
+    words = found.words()
+    return f"{words[0].upper()}{words[1:]}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
 
 
 def counts_words(sized: int, unsized: int, failed: int) -> str:
@@ -203,7 +227,7 @@ def _card(campaign: Campaign, row: Row) -> Card:
     exam = row.exam
     made = {
         name
-        for step in ("map", "estimate", "figures")
+        for step in ("map", "estimate", "figures", "size")
         for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
         if row.document is not None
     }
@@ -218,5 +242,5 @@ def _card(campaign: Campaign, row: Row) -> Card:
         cautions=tuple(row.cautions),
         checks=tuple(row.checks),
         thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
-        links={words: f"{EXAMS}/{exam.name}/{name}" for words, name in _LINKS.items() if name in made},
+        links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},
     )

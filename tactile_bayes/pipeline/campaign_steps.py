@@ -1,4 +1,4 @@
-"""Steps of a campaign: the map, the estimate and the figures of an exam, the pooled size of a mass.
+"""Steps of a campaign: map, estimate, figures and size of an exam, the site's repeatability, a mass's pooled size.
 
 A step runs in any process. It gets all that its result depends on, writes its files into one folder, and returns their
 digests, so that a later run can tell whether they are still what it made.
@@ -6,32 +6,35 @@ digests, so that a later run can tell whether they are still what it made.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.pipeline.campaign_keys import stamp
+from tactile_bayes.pipeline.campaign_match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.pipeline.one_map import Answer
+    from tactile_bayes.pipeline.one_map import Answer, Outcome
+    from tactile_bayes.pipeline.repeatability import ExamFolder
     from tactile_bayes.scan import Scan
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
 SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.png", "size.png"
 POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"
+REPEATABILITY, SIZED, SIZED_FIGURE = "repeatability.json", "sized.json", "sized.png"
 FILES: Final = {
     "map": (SCAN, MAP),
     "estimate": (ESTIMATE, POSTERIOR, SHAPE, THUMBNAIL),
     "figures": (MAP_FIGURE, SIZE_FIGURE),
+    "repeatability": (REPEATABILITY,),
+    "size": (SIZED, SIZED_FIGURE),
     "pool": (POOLED, POOLED_DRAWS),
     "copy": (),
 }
@@ -67,11 +70,18 @@ class Task:
     normalise
         map: as the option of `map`.
     settings
-        estimate, figures, pool: of the estimate.
+        estimate, figures, size, pool: of the estimate.
+    mass, places, match_mm
+        estimate, figures: where other exams of the breast have the mass, see `campaign_match`; no places where the
+        exam is not matched.
     members
         pool: names and folders of the exams.
     copies
         copy: addresses in an object store, by the names of the files.
+    repeats
+        repeatability: the exams.
+    figures
+        size: whether to draw it.
     """
 
     step: str
@@ -83,20 +93,19 @@ class Task:
     expected: Mapping[str, str] = field(default_factory=dict)
     normalise: str = ""
     settings: Settings | None = None
+    mass: str = ""
+    places: tuple[NamedPlace, ...] = ()
+    match_mm: float = 0.0
     members: tuple[tuple[str, Path], ...] = ()
     address: str = ""
     copies: Mapping[str, str] = field(default_factory=dict)
+    repeats: tuple[ExamFolder, ...] = ()
+    figures: bool = False
 
     @property
     def key(self) -> str:
         """Name in the store of the campaign's results."""
         return f"{self.step} {self.name} {self.digest}"
-
-
-def digest_of(key: object) -> str:
-    """Digest of plain data and the program's version."""
-    text = json.dumps([__version__, key], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def run_step(task: Task) -> Result:
@@ -129,12 +138,6 @@ def run_step(task: Task) -> Result:
 
 
 Writes = dict[str, Callable[[Path], object]]
-
-
-def stamp(path: Path) -> str:
-    """Size, times and inode of a file, which differ when it was written to or replaced."""
-    known = path.stat()
-    return f"{known.st_size} {known.st_mtime_ns} {known.st_ctime_ns} {known.st_ino}"
 
 
 def _digests(folder: Path, names: list[str]) -> tuple[dict[str, str], dict[str, str]]:
@@ -269,11 +272,10 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.files.atomic import write_bytes, write_text
     from tactile_bayes.files.schema import check_document, dump_json
     from tactile_bayes.files.shape_npz import write_shape
-    from tactile_bayes.pipeline.one_map import answer_of, estimate_file
+    from tactile_bayes.pipeline.one_map import answer_of
     from tactile_bayes.report.thumbnail import thumbnail_png
 
-    assert task.settings is not None
-    outcome = estimate_file(task.folder / MAP, task.settings)
+    outcome = _outcome(task)
     answer = answer_of(outcome)
     document = answer.document
     assert document is not None
@@ -287,17 +289,27 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
     picture = thumbnail_png(outcome.tactile_map, document)
     if picture is not None:
         writes[THUMBNAIL] = lambda path: write_bytes(path, picture, force=True)
-    return {"exit_code": answer.exit_code}, writes
+    own_axes = bool(task.places) and in_own_axes(outcome.tactile_map, task.places)
+    return {"exit_code": answer.exit_code, "notes": [OWN_AXES] if own_axes else []}, writes
+
+
+def _outcome(task: Task) -> Outcome:
+    """The exam's estimate: of the mass that its row names, where other exams have it."""
+    from tactile_bayes.pipeline.one_map import estimate_file
+
+    assert task.settings is not None
+    path = task.folder / MAP
+    if not task.places:
+        return estimate_file(path, task.settings)
+    return matched_outcome(path, task.settings, mass=task.mass, places=task.places, most_mm=task.match_mm)
 
 
 def _figures(task: Task) -> tuple[Result, Writes]:
     """Draw the figures of `estimate`; the estimate is made again, for it is not stored whole."""
-    from tactile_bayes.pipeline.one_map import estimate_file
     from tactile_bayes.report.estimate_figures import draw_map, draw_size
 
-    assert task.settings is not None
-    settings = task.settings
-    outcome = estimate_file(task.folder / MAP, settings)
+    outcome = _outcome(task)
+    settings = outcome.settings
     tactile_map, estimate = outcome.tactile_map, outcome.estimate
     size, writes = estimate.size, Writes()
     if tactile_map.covered.any():
@@ -330,15 +342,9 @@ def _pool(task: Task) -> tuple[Result, Writes]:
 
 
 def _copy(task: Task) -> tuple[Result, Writes]:
-    """Copy files into an object store."""
-    from tactile_bayes.files.remote import put
+    from tactile_bayes.pipeline.campaign_copies import copy_step
 
-    try:
-        for name, address in task.copies.items():
-            put(task.folder / name, address)
-    except UsageError as error:
-        return {UNWRITTEN: str(error)}, {}
-    return {}, {}
+    return copy_step(task)
 
 
 def _answer(folder: Path) -> Answer:
@@ -362,10 +368,24 @@ def _answer(folder: Path) -> Answer:
     )
 
 
+def _repeatability(task: Task) -> tuple[Result, Writes]:
+    from tactile_bayes.pipeline.campaign_repeatability import learn_step
+
+    return learn_step(task)
+
+
+def _size(task: Task) -> tuple[Result, Writes]:
+    from tactile_bayes.pipeline.campaign_repeatability import size_step
+
+    return size_step(task)
+
+
 RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
     "map": _map,
     "estimate": _estimate,
     "figures": _figures,
+    "repeatability": _repeatability,
+    "size": _size,
     "pool": _pool,
     "copy": _copy,
 }

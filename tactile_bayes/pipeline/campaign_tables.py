@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +12,8 @@ from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.manifest_csv import Exam, table_text
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED
+from tactile_bayes.pipeline.campaign_match import unnamed
+from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED, SIZED
 from tactile_bayes.records import dataclass
 
 DONE, FAILURES, TRIAL = "exams_done.csv", "failures.csv", "trial.csv"
@@ -26,7 +29,7 @@ _DONE_COLUMNS: Final = (
 )  # fmt: skip
 _FAILURE_COLUMNS: Final = ("patient", "visit", "mass", "replicate", "file", "step", "reason")
 _OF_ESTIMATE: Final = (
-    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "other_rises",
+    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability",
 )  # fmt: skip
 _OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
 _OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
@@ -42,13 +45,15 @@ class Row:
     exam
         Of exams.csv.
     document
-        The estimate's JSON object; None where a step failed.
+        The estimate's JSON object, by the campaign's repeatability where it has one; None where a step failed.
     step, fault
         Which step failed and why; empty where none did.
     scans, notes, synthetic
         Of the file: digests and facts, what it lost, whether it is simulated (None: unknown).
     outlying
         Whether the exam lies apart from the others of its mass.
+    unnamed
+        Masses of the scan that no row names, in words.
     """
 
     exam: Exam
@@ -59,6 +64,7 @@ class Row:
     notes: tuple[str, ...] = ()
     synthetic: bool | None = None
     outlying: bool = False
+    unnamed: tuple[str, ...] = ()
 
     @property
     def size(self) -> Mapping[str, float] | None:
@@ -89,9 +95,7 @@ class Row:
         """What is to be looked at besides."""
         if self.document is None:
             return []
-        rises = len(self.document["other_rises"])
-        more = [f"{rises} other {'rise' if rises == 1 else 'rises'} on the map"] if rises else []
-        return [*self.document["diagnostics"].get("assumptions_to_check", []), *more]
+        return [*self.document["diagnostics"].get("assumptions_to_check", []), *self.unnamed]
 
 
 def _status(document: Mapping[str, Any] | None) -> str:
@@ -106,23 +110,33 @@ def exam_rows(campaign: Campaign) -> list[Row]:
     """Every exam of the table, in its order."""
     pooled = pooled_documents(campaign)
     outlying = {one["map"] for document in pooled.values() for one in document["maps"] if one["outlying"]}
-    return [_row(campaign, exam, exam.name in outlying) for exam in campaign.exams]
+    rows = [_row(campaign, exam, exam.name in outlying) for exam in campaign.exams]
+    of_scan: dict[Path, list[Mapping[str, Any]]] = defaultdict(list)
+    for row in rows:
+        if row.document is not None:
+            of_scan[row.exam.path].append(row.document)
+    return [
+        row if row.document is None else replace(row, unnamed=tuple(unnamed(of_scan[row.exam.path]))) for row in rows
+    ]
 
 
 def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
     fault = campaign.found.faults.get(exam.name)
     mapped = campaign.found.of("map", exam.name) or {}
-    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": tuple(mapped.get("notes", ()))}
+    matched = (campaign.found.of("estimate", exam.name) or {}).get("notes", ())
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": (*mapped.get("notes", ()), *matched)}
     if fault is not None and fault.step != "figures":
         return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
-    document = estimate_facts(load_json(campaign.folder / EXAMS / exam.name / ESTIMATE))
+    by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
+    document = estimate_facts(load_json(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE)))
     return Row(exam, document, synthetic=mapped.get("synthetic"), outlying=outlying, **facts)
 
 
 def estimate_facts(document: Any) -> dict[str, Any]:
     """What tables and pages need of an estimate's JSON object."""
     diagnostics = {name: document["diagnostics"].get(name, []) for name in _OF_DIAGNOSTICS}
-    return {name: document[name] for name in _OF_ESTIMATE} | {"diagnostics": diagnostics}
+    masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document["masses"]]
+    return {name: document[name] for name in _OF_ESTIMATE} | {"diagnostics": diagnostics, "masses": masses}
 
 
 def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:

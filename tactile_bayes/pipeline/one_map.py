@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
+from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.records import dataclass
@@ -146,7 +147,7 @@ def estimate_one(
     from tactile_bayes.mapping.fine_cells import many_cells
     from tactile_bayes.posterior.drawn import fitting_calibration
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
-    from tactile_bayes.posterior.other_rises import other_rises
+    from tactile_bayes.posterior.masses import with_masses
     from tactile_bayes.report.population_text import calibration_line
     from tactile_bayes.report.site_text import site_words
     from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
@@ -156,20 +157,26 @@ def estimate_one(
     options = _options(settings, calibration, tactile_map)
     if notice is not None and (line := many_cells(tactile_map, options.fit.radius_mm)) is not None:
         notice(line)
-    if calibration is not None:
-        calibration = calibration_for(tactile_map, calibration)
     files = {**(inputs or {}), **({"size_calibration": source} if source else {})}
     files |= {"settings": settings.settings_file} if settings.settings_file else {}
-    digests = hash_inputs(**files)
+    digests = hash_inputs(**files) | repeatability_digest(settings)
+    if calibration is not None:
+        check_repeatability(settings, calibration, digests)
+        calibration = calibration_for(tactile_map, calibration)
     if settings.checkpoint is not None:
         from tactile_bayes.files.checkpoint_npz import CheckpointFile
 
         context = digests.get("size_calibration", "no calibration")
         options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
-    # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history
-    rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
-    estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=rng, progress=progress)
-    estimate = replace(estimate, other_rises=other_rises(tactile_map, estimate, options))
+
+    # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history,
+    # and a mass has the numbers that its place alone would give
+    def estimated(a_map: TactileMap, given: EstimateOptions) -> Estimate:
+        rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
+        told = progress if given is options else None
+        return estimate_map(a_map, calibration=calibration, options=given, rng=rng, progress=told)
+
+    estimate = with_masses(tactile_map, estimated(tactile_map, options), options, estimated)
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     posterior = estimate.map_posterior
@@ -182,7 +189,8 @@ def estimate_one(
             by += f" ({site_words(used.site, math.log(sigma_mm))})"
         words = calibration_line(by, used, sigma_mm=sigma_mm)
         assert estimate.diagnostics is not None
-        diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words)
+        site = "" if settings.repeatability is None else settings.repeatability.words()
+        diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words, repeatability=site)
         estimate = replace(estimate, diagnostics=diagnostics)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     recorded = _recorded(settings, options, calibration=named)
@@ -206,6 +214,7 @@ def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str)
         "accuracy_mm": settings.accuracy_mm,
         "scene": settings.scene,
         "between_map_sd": settings.between_map_sd,
+        **repeatability_setting(settings),
         "known": dict(settings.known),
     }
 
@@ -320,7 +329,7 @@ def estimate_inputs(
 
 
 def size_priors(settings: Settings) -> SizePriors:
-    """Priors of a size; a spread between maps that is given holds for both of its intervals."""
+    """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
     from tactile_bayes.size.between_maps import BetweenMaps
     from tactile_bayes.size.pooling import SizePriors
 
@@ -329,22 +338,26 @@ def size_priors(settings: Settings) -> SizePriors:
             raise UsageError(
                 f"--known {name} is {value:g}; it must {'not be below' if name == 'seat' else 'be above'} 0"
             )
-    fixed = settings.between_map_sd
-    if fixed is None:
+    fixed, learned = settings.between_map_sd, settings.repeatability
+    if learned is None and fixed is None:
         return SizePriors(known=dict(settings.known))
-    return SizePriors(between_maps=BetweenMaps(fixed, 0.0), another_exam=None, known=dict(settings.known))
+    between = learned.between_maps if learned is not None else BetweenMaps(fixed or 0.0, 0.0)
+    return SizePriors(between_maps=between, another_exam=None, known=dict(settings.known))
 
 
 def answer_of(outcome: Outcome) -> Answer:
     """Report of an outcome as JSON and text."""
     from tactile_bayes.posterior.lump.bump import BumpPrior
-    from tactile_bayes.report.estimate_document import estimate_document, estimate_quantities
+    from tactile_bayes.report.estimate_document import estimate_document
     from tactile_bayes.report.estimate_summary import estimate_summary
     from tactile_bayes.report.estimate_text import estimate_text
+    from tactile_bayes.report.lump_place import lump_place
+    from tactile_bayes.report.quantities import estimate_quantities
 
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
     prior = BumpPrior(**(settings.prior or {}))
     quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
+    place = lump_place(estimate.map_posterior, tactile_map, outcome.provenance.scans)
     document = estimate_document(
         estimate,
         tactile_map,
@@ -352,9 +365,11 @@ def answer_of(outcome: Outcome) -> Answer:
         prior=prior,
         provenance=outcome.provenance,
         quantities=quantities,
+        place=place,
     )
-    text = estimate_summary(estimate, quantities, probability=settings.interval)
-    full_text = estimate_text(estimate, tactile_map, probability=settings.interval, prior=prior, quantities=quantities)
+    told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
+    text = estimate_summary(estimate, quantities, **told)
+    full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
     shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
     return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.one_map import Answer, size_priors
+from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.records import dataclass
 
@@ -56,6 +57,8 @@ def pool_answers(
 
     path, calibration = _calibration(answers, settings)
     _check_heads(answers, calibration, names)
+    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
+    check_repeatability(settings, calibration, digests)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
     pooled = _too_far(answers) or pool_maps(
@@ -64,12 +67,17 @@ def pool_answers(
         priors=size_priors(settings),
         rng=np.random.default_rng([settings.seed, *words]),
     )
-    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {}))
     documents = [answer.document for answer in answers if answer.document is not None]
     scans = [scan for document in documents for scan in scans_of(document["provenance"])]
     provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed, scans=scans)
     document = pooled_document(
-        pooled, list(names), documents, calibration, probability=settings.interval, provenance=provenance
+        pooled,
+        list(names),
+        documents,
+        calibration,
+        probability=settings.interval,
+        provenance=provenance,
+        repeatability=settings.repeatability,
     )
     return PooledOutcome(pooled, document, provenance)
 
@@ -132,6 +140,7 @@ def _plain(settings: Settings) -> dict[str, Any]:
     """Settings as JSON values."""
     plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
     plain = {name: list(v) if isinstance(v, tuple) else v for name, v in plain.items()}
-    del plain["seed"], plain["settings_file"]
+    del plain["seed"], plain["settings_file"], plain["repeatability"]
+    plain |= repeatability_setting(settings)
     checkpoint = None if settings.checkpoint is None else settings.checkpoint.name
     return plain | {"calibration": settings.calibration_name, "known": dict(settings.known), "checkpoint": checkpoint}

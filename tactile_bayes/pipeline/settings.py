@@ -12,6 +12,7 @@ from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.size.calibration import Calibration
+    from tactile_bayes.size.repeatability import Repeatability
 
 GIVEN: Final = "given in Python"
 """Name of a calibration that is in no file."""
@@ -57,6 +58,8 @@ class Settings:
         As `EstimateOptions`.
     between_map_sd
         SD of ln size between maps of one mass, taken as known; None learns it.
+    repeatability
+        Spread between exams of one mass as this site's repeated exams show it; sizes then have one interval.
     known
         Properties of the body, by the names of `HiddenTerms`.
     prior
@@ -84,6 +87,7 @@ class Settings:
     noise: Noise | None = None
     accuracy_sd: float | None = None
     between_map_sd: float | None = None
+    repeatability: Repeatability | None = None
     known: tuple[tuple[str, float], ...] = ()
     scene: SceneAsked = "auto"
     accuracy_mm: float | None = None
@@ -99,6 +103,10 @@ class Settings:
                 check_choice(name, value, choices)
         if not 0.0 < self.interval < 1.0:
             raise UsageError(f"interval is {self.interval:g}; give a probability between 0 and 1")
+        if self.between_map_sd is not None and self.repeatability is not None:
+            raise UsageError("between_map_sd states the spread that the repeatability has learned; give one of them")
+        if self.repeatability is not None and self.calibration == "none":
+            raise UsageError("a repeatability is for sizes; leave it out, or name a size calibration")
         if self.seed < 0:
             raise UsageError(f"seed is {self.seed}; give a whole number from 0 on")
 

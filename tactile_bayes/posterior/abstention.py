@@ -14,6 +14,7 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import covered_share, trusted, window_cells
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import (
+    AT_RIM,
     LEAST_COVERED_SHARE,
     LEAST_WIDTH_IN_CELLS,
     MOST_AXIS_RATIO,
@@ -59,7 +60,7 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
     """
     if centre_mm is None:
         area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
-        return f"on the {area:.2g} cm2 that the map covers"
+        return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"
     half = tactile_map.recipe.cell_mm / 2.0
     ends = [(float(axis[0]) - half, float(axis[-1]) + half) for axis in (tactile_map.x_mm, tactile_map.y_mm)]
     if not all(low <= at <= high for at, (low, high) in zip(centre_mm, ends, strict=True)):
@@ -182,14 +183,12 @@ def rim_fault(
     wide, narrow, cell = max(widths_mm), min(widths_mm), tactile_map.recipe.cell_mm
     share = covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:
-        return f"at the rim of the map ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
+        return f"{AT_RIM} ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
     wide_rise = wide > WIDE_IN_RADII * radius_mm
     short = missing_strokes(tactile_map, centre_mm, reach_mm=ENCLOSED_IN_WIDTHS * wide)
     if wide_rise and short:
         side, millimetres = max(short.items(), key=lambda one: one[1])
-        return (
-            f"at the rim of the map (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
-        )
+        return f"{AT_RIM} (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
     return _few_readings_fault(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
@@ -202,7 +201,7 @@ def _few_readings_fault(tactile_map: TactileMap, centre_mm: tuple[float, float],
     here = float(np.median(cells.count)) if len(cells) else 0.0
     if here >= LEAST_READ * typical:
         return ""
-    return f"at the rim of the map (its cells hold {here:g} readings, where {typical:g} are typical)"
+    return f"{AT_RIM} (its cells hold {here:g} readings, where {typical:g} are typical)"
 
 
 def extend_advice(short: dict[str, float]) -> str:

@@ -14,6 +14,7 @@ from tactile_bayes.posterior.abstention import rim_fault
 from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import DETECTED, EstimateOptions, scene_asked
+from tactile_bayes.posterior.result import ModalBump
 from tactile_bayes.posterior.white.detection import Detection, detect
 from tactile_bayes.posterior.white.estimate import chosen_rotation, draw_independent, judged_noise
 from tactile_bayes.posterior.white.fit import BumpFit
@@ -54,17 +55,6 @@ class MapDraws:
     scene: SceneChoice | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ModalBump:
-    """The bump at the mode: its amplitude, its centre and its widths along the ellipse's axes."""
-
-    amplitude: float
-    x_mm: float
-    y_mm: float
-    sigma_x_mm: float
-    sigma_y_mm: float
-
-
 class Assessment(Protocol):
     """A place on a map under one noise model."""
 
@@ -100,6 +90,12 @@ class Assessment(Protocol):
         """
 
 
+def bump_of(fit: BumpFit) -> ModalBump:
+    """The bump of a least-squares fit."""
+    amplitude, x, y = (float(value) for value in fit.theta[:3])
+    return ModalBump(amplitude, x, y, *fit.widths()[:2])
+
+
 def assess(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> Assessment:
     """Assess whether there is a lump at a fitted place, under the noise model of the options."""
     if not options.fit.correlated:
@@ -119,8 +115,7 @@ class _White:
     scene: None = None
 
     def bump(self) -> ModalBump:
-        amplitude, x, y = (float(value) for value in self.fit.theta[:3])
-        return ModalBump(amplitude, x, y, *self.widths_mm())
+        return bump_of(self.fit)
 
     def widths_mm(self) -> tuple[float, float]:
         return self.fit.widths()[:2]

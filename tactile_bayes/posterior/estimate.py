@@ -12,12 +12,12 @@ from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
 from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
-from tactile_bayes.posterior.assessment import MapDraws
+from tactile_bayes.posterior.assessment import Assessment, MapDraws, bump_of
 from tactile_bayes.posterior.drawn import Drawn, draw_sized
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
-from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.result import Estimate, ModalBump
 from tactile_bayes.posterior.search import best_chance, search
 from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.white.detection import Detection
@@ -76,50 +76,68 @@ def estimate_map(
     if seen is None:
         likeliest = best_chance(tactile_map, candidates, options)
         why = no_bump(tactile_map, candidates, likeliest, where=where)
-        return _none(why, candidates, None if likeliest is None else likeliest[1])
+        if likeliest is None:
+            return _none(why, candidates)
+        candidate, detection = likeliest
+        lump = detection.probability >= DETECTED and why.code != "undetected"
+        return _none(why, candidates, detection, bump_of(candidate.fit) if lump and candidate.fit else None)
     detection = seen.detection
     if detection.probability < DETECTED:
         return _none(undetected(detection, DETECTED, where=where), candidates, detection)
     if options.scene == "none":
         chance = f"the map gives one a probability of {detection.probability:.2g}"
         return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)
+    return _measured(tactile_map, seen, candidates, calibration, options, rng=rng, progress=progress)
+
+
+def _measured(
+    tactile_map: TactileMap,
+    seen: Assessment,
+    candidates: tuple[Candidate, ...],
+    calibration: Calibration | None,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] | None,
+) -> Estimate:
+    """Draw a lump that is one by the evidence, and size it; or the reason why not."""
+    detection, bump = seen.detection, seen.bump()
     hopeless = hopeless_shape(*seen.widths_mm(), cell_mm=tactile_map.recipe.cell_mm)
     if hopeless is not None:
-        return _none(hopeless, candidates, detection)
+        return _none(hopeless, candidates, detection, bump)
     try:
         found = draw_sized(tactile_map, seen, calibration, options, rng=rng, progress=progress)
     except NotConvergedError as error:
         if options.method == "ensemble" or not options.fit.correlated:
             raise
         advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
-        return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection)
-    made, size = found.made, found.size
-    detection, draws, posterior = made.detection, made.draws, made.posterior
+        return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection, bump)
+    made, size, calibration = found.made, found.size, found.calibration
+    detection = made.detection
     if found.fault is not None:
-        return _none(found.fault, candidates, detection)
-    calibration = found.calibration
+        return _none(found.fault, candidates, detection, bump)
     diagnostics = _diagnostics(tactile_map, found)
     if found.too_far:
-        return _none(extrapolated(list(found.too_far)), candidates, detection, diagnostics)
+        return _none(extrapolated(list(found.too_far)), candidates, detection, bump, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         outside = Abstention("extrapolated", reason, "learn a calibration whose table holds such lumps")
-        return _none(outside, candidates, detection, diagnostics)
-    reason = "" if calibration is not None else "no size calibration was given: widths only"
+        return _none(outside, candidates, detection, bump, diagnostics)
     return Estimate(
         "estimate",
-        reason,
+        "" if calibration is not None else "no size calibration was given: widths only",
         detection=detection,
         fit=made.fit,
-        draws=draws,
-        map_posterior=posterior,
+        draws=made.draws,
+        map_posterior=made.posterior,
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
         left_out=_left_out(tactile_map, options, calibration, made.figures),
         scene=made.scene,
-        sensitivity=_sensitivity(posterior, size, options),
+        sensitivity=_sensitivity(made.posterior, size, options),
         by_place=found.by_place,
+        bump=bump,
     )
 
 
@@ -127,12 +145,14 @@ def _none(
     why: Abstention,
     candidates: tuple[Candidate, ...] = (),
     detection: Detection | None = None,
+    bump: ModalBump | None = None,
     diagnostics: Diagnostics | None = None,
 ) -> Estimate:
     return Estimate(
         "no_estimate",
         why.reason,
         detection=detection,
+        bump=bump,
         candidates=candidates,
         diagnostics=diagnostics,
         code=why.code,

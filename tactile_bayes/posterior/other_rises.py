@@ -9,16 +9,21 @@ import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.assessment import Assessment
+from tactile_bayes.posterior.assessment import Assessment, bump_of
 from tactile_bayes.posterior.correlated.neighbour import LEAST_RISE
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, candidate_centres, levelled, smoothed_excess
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions
-from tactile_bayes.posterior.result import Estimate, Rise
-from tactile_bayes.posterior.search import search
+from tactile_bayes.posterior.result import Estimate, ModalBump, Rise
+from tactile_bayes.posterior.search import best_chance, search
+from tactile_bayes.posterior.white.fit import AT_RIM, Candidate
 
 BESIDE_IN_WIDTHS = 2.5
 """Nearer to the lump than this many of its larger width, what a lump that is no Gaussian leaves looks like a rise."""
+FAR_IN_WIDTHS, LEAST_RISE_FAR = 4.0, 0.02
+"""Farther than so many widths a rise needs this share of the lump's amplitude only."""
+LEAST_RISE_AT_RIM = 0.5
+"""Of the lump's amplitude, for a rise that the map covers too poorly: the ends of strokes make small ones."""
 MOST_NAMED, MOST_LOOKS = 4, 3
 """Rises that are named, and places that turn out to be none before the search ends: each look costs some 50 ms."""
 LEAST_PROBABILITY = 0.95
@@ -27,18 +32,21 @@ LEAST_PROBABILITY = 0.95
 def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOptions) -> tuple[Rise, ...]:
     """Find rises that are lumps by the evidence once the measured lump is subtracted, the highest first.
 
-    A structure that the lump's own scene holds (a second lump, a rib) is named there. Without an estimate the whole map
-    has been searched, unless a place was given: then the rest of the map is searched here.
+    A structure that the lump's own scene holds (a second lump, a rib) is named there. Where there is no lump the whole
+    map has been searched, unless a place was given: then the rest of the map is searched here.
     """
-    if estimate.map_posterior is None and options.fit.centre_mm is None:
+    if estimate.bump is None and options.fit.centre_mm is None:
         return ()
-    rest = tactile_map if estimate.map_posterior is None else _without(tactile_map, estimate.map_posterior)
+    rest = tactile_map if estimate.map_posterior is None else without(tactile_map, estimate.map_posterior)
     rises: list[Rise] = []
     misses = 0
     for centre in _places(rest, estimate):
         given = replace(options, fit=replace(options.fit, centre_mm=centre, start_width_mm=None), scene="auto")
-        _, seen = search(rest, given)
-        found = _rise(seen, estimate) if seen is not None and seen.detection.probability >= LEAST_PROBABILITY else None
+        candidates, seen = search(rest, given)
+        if seen is None:
+            found = _at_rim(rest, candidates, given, estimate)
+        else:
+            found = _rise(seen, estimate) if seen.detection.probability >= LEAST_PROBABILITY else None
         if found is None or _is_known(found, rises, estimate):
             misses += 1
         else:
@@ -52,7 +60,7 @@ def _median(posterior: MapPosterior, name: str) -> float:
     return float(np.median(getattr(posterior, name)))
 
 
-def _without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
+def without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
     """The map less the bump at the posterior medians."""
     x, y, angle = (_median(posterior, name) for name in ("x_mm", "y_mm", "angle_rad"))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -64,25 +72,42 @@ def _without(tactile_map: TactileMap, posterior: MapPosterior) -> TactileMap:
     return replace(tactile_map, mean=tactile_map.mean - _median(posterior, "amplitude") * bump.reshape(u.shape))
 
 
+def _lump(estimate: Estimate) -> ModalBump | None:
+    """The lump that an estimate is about: at the posterior medians where it was drawn."""
+    posterior = estimate.map_posterior
+    if posterior is None:
+        return estimate.bump
+    names = ("amplitude", "x_mm", "y_mm", "sigma_x_mm", "sigma_y_mm")
+    return ModalBump(*(_median(posterior, name) for name in names))
+
+
 def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float]]:
-    """Local maxima above a share of the lump's amplitude and clear of it, highest first."""
-    found_on, posterior = levelled(rest), estimate.map_posterior
-    least = 0.0 if posterior is None else LEAST_RISE * _median(posterior, "amplitude")
+    """Local maxima above a share of the lump's amplitude, clear of it and of the map's rim, highest first."""
+    found_on = levelled(rest)
     height = smoothed_excess(found_on)
-    for x, y in candidate_centres(found_on):
+    for x, y in candidate_centres(found_on, rim_limit=0):
         row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
-        if height[row, column] > least and _beside(x, y, estimate):
+        if height[row, column] > _least_rise(x, y, estimate) and _beside(x, y, estimate):
             yield x, y
 
 
+def _least_rise(x: float, y: float, estimate: Estimate) -> float:
+    """Height below which a rise may be what the subtracted lump left of itself; less of it is left farther away."""
+    lump = _lump(estimate)
+    if lump is None:
+        return 0.0
+    away = np.hypot(x - lump.x_mm, y - lump.y_mm)
+    far = away > FAR_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm)
+    return (LEAST_RISE_FAR if far else LEAST_RISE) * lump.amplitude
+
+
 def _beside(x: float, y: float, estimate: Estimate) -> bool:
-    """Whether a place is clear of the measured lump and of its scene's second structure."""
-    posterior = estimate.map_posterior
-    if posterior is None:
+    """Whether a place is clear of the lump and of its scene's second structure."""
+    lump = _lump(estimate)
+    if lump is None:
         return True
-    wide = max(_median(posterior, name) for name in ("sigma_x_mm", "sigma_y_mm"))
-    away = float(np.hypot(x - _median(posterior, "x_mm"), y - _median(posterior, "y_mm")))
-    return away > BESIDE_IN_WIDTHS * wide and not _in_scene(x, y, estimate)
+    away = float(np.hypot(x - lump.x_mm, y - lump.y_mm))
+    return away > BESIDE_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm) and not _in_scene(x, y, estimate)
 
 
 def _in_scene(x: float, y: float, estimate: Estimate) -> bool:
@@ -101,17 +126,27 @@ def _in_scene(x: float, y: float, estimate: Estimate) -> bool:
 
 def _rise(seen: Assessment, estimate: Estimate) -> Rise:
     """The assessed place as a `Rise`."""
-    bump, lump = seen.bump(), estimate.map_posterior
-    away = None if lump is None else (bump.x_mm - _median(lump, "x_mm"), bump.y_mm - _median(lump, "y_mm"))
+    bump, lump, away = seen.bump(), _lump(estimate), None
+    if lump is not None and estimate.map_posterior is not None:
+        away = float(np.hypot(bump.x_mm - lump.x_mm, bump.y_mm - lump.y_mm))
     return Rise(
-        bump.x_mm,
-        bump.y_mm,
-        None if away is None else float(np.hypot(*away)),
-        bump.amplitude,
-        bump.sigma_x_mm,
-        bump.sigma_y_mm,
-        seen.detection.probability,
+        bump.x_mm, bump.y_mm, away, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, seen.detection.probability
     )
+
+
+def _at_rim(
+    rest: TactileMap, candidates: tuple[Candidate, ...], options: EstimateOptions, estimate: Estimate
+) -> Rise | None:
+    """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none."""
+    if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
+        return None
+    bump, lump = bump_of(candidates[0].fit), _lump(estimate)
+    if bump.amplitude <= (0.0 if lump is None else LEAST_RISE_AT_RIM * lump.amplitude):
+        return None
+    chance = best_chance(rest, candidates, options)
+    if chance is None or chance[1].probability < LEAST_PROBABILITY:
+        return None
+    return Rise(bump.x_mm, bump.y_mm, None, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, chance[1].probability)
 
 
 def _is_known(rise: Rise, rises: list[Rise], estimate: Estimate) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.lump.posterior import MapPosterior
@@ -18,6 +20,17 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.selection import SceneChoice
 
 Status = Literal["estimate", "no_estimate"]
+
+
+@dataclass(frozen=True, slots=True)
+class ModalBump:
+    """The bump at the mode: its amplitude, its centre and its widths along the ellipse's axes."""
+
+    amplitude: float
+    x_mm: float
+    y_mm: float
+    sigma_x_mm: float
+    sigma_y_mm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +91,10 @@ class Estimate:
         Figures `presets.BY_PLACE` of the lump; None without an estimate, and where the map has none.
     other_rises
         Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked.
+    bump
+        The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump.
+    masses
+        All masses of the map, see `masses.with_masses`; empty where nobody has looked.
     """
 
     status: Status
@@ -96,3 +113,34 @@ class Estimate:
     sensitivity: Sensitivity | None = None
     by_place: tuple[float, ...] | None = None
     other_rises: tuple[Rise, ...] = ()
+    bump: ModalBump | None = None
+    masses: tuple[Mass, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mass:
+    """One of the masses on a map.
+
+    Parameters
+    ----------
+    x_mm, y_mm
+        Its centre in `plane`: the posterior median, or where the fit has it.
+    probability
+        That it is a lump, as `Detection` has it; of a second lump in another's window, by its odds.
+    estimate
+        Its own: draws and size, or why there is none.
+    reported
+        Whether the map's `Estimate` is this mass's.
+    """
+
+    x_mm: float
+    y_mm: float
+    probability: float
+    estimate: Estimate
+    reported: bool = False
+
+    @property
+    def largest_mm(self) -> float | None:
+        """Median of the largest diameter; None without a size."""
+        size = self.estimate.size
+        return None if size is None else float(np.nanmedian(size.max_size_mm))

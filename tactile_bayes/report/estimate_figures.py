@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.result import Estimate
-    from tactile_bayes.report.map_figure import FitContour
+    from tactile_bayes.posterior.result import Estimate, Mass
+    from tactile_bayes.report.map_figure import FitContour, NumberedMass
     from tactile_bayes.size.posterior import SizePosterior
 
 
@@ -19,16 +19,17 @@ def draw_figures(
     estimate: Estimate,
     figure: Path | None,
     map_figure: Path | None,
+    fit_figure: Path | None = None,
     *,
     name: str,
     probability: float,
     force: bool,
 ) -> None:
-    """Draw the requested figures. Without a size both show the map, the places looked at and the reason.
+    """Draw the requested figures. Without a size, or a fit, they show the map, the places looked at and the reason.
 
     Parameters
     ----------
-    figure, map_figure
+    figure, map_figure, fit_figure
         Where to; None draws nothing. A map without data cannot be drawn.
     name
         Of the map, for the titles.
@@ -38,8 +39,11 @@ def draw_figures(
     if figure is not None and estimate.size is not None:
         draw_size(estimate.size, figure, name=name, probability=probability, force=force)
         figure = None
+    if fit_figure is not None and estimate.draws is not None:
+        draw_fit(tactile_map, estimate, fit_figure, name=name, force=force)
+        fit_figure = None
     if tactile_map.covered.any():
-        for path in (figure, map_figure):
+        for path in (figure, map_figure, fit_figure):
             if path is not None:
                 draw_map(tactile_map, estimate, path, name=name, force=force)
 
@@ -65,6 +69,16 @@ def draw_size(size: SizePosterior, path: Path | None, *, name: str, probability:
     )
 
 
+def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
+    """Draw data, fit and residual of the fit window side by side."""
+    from tactile_bayes.posterior.fitted import fitted_cells
+    from tactile_bayes.report.fit_figure import fit_figure
+
+    fitted = fitted_cells(estimate)
+    assert fitted is not None
+    return fit_figure(tactile_map, fitted, path, title=f"Fit: {name}", force=force)
+
+
 def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
     """Draw the map with the lump's ellipse and size, or with the places looked at and the reason for no number."""
     from tactile_bayes.report.estimate_text import no_estimate_line
@@ -79,6 +93,7 @@ def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
         tactile_map,
         path,
         fit=_contour(estimate),
+        masses=[_numbered(number, mass) for number, mass in enumerate(estimate.masses, start=1)],
         looked_at=places,
         title=f"Tactile map: {name}",
         note=note,
@@ -99,3 +114,13 @@ def _contour(estimate: Estimate) -> FitContour | None:
     x, y, sigma_x, sigma_y, angle, level, amplitude = (float(np.median(getattr(found, name))) for name in names)
     sizes = None if size is None else (float(np.nanmedian(size.d_x_mm)), float(np.nanmedian(size.d_y_mm)))
     return FitContour((x, y), sigma_x, sigma_y, float(np.degrees(angle)), sizes, level, amplitude)
+
+
+def _numbered(number: int, mass: Mass) -> NumberedMass:
+    """A mass for the picture, its size at the medians."""
+    from tactile_bayes.report.map_figure import NumberedMass
+
+    contour = _contour(mass.estimate)
+    if contour is None:
+        return NumberedMass(number, (mass.x_mm, mass.y_mm))
+    return NumberedMass(number, contour.centre_mm, contour.size_mm, contour.angle_deg)

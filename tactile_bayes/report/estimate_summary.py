@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from tactile_bayes.inference.summary import Quantity
-from tactile_bayes.posterior.result import Estimate, Rise
+from tactile_bayes.mapping.clock_face import ClockPosition
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import (
     ANOTHER_LARGEST,
@@ -17,18 +18,26 @@ from tactile_bayes.report.estimate_text import (
     tracker_share,
     warnings,
 )
+from tactile_bayes.report.masses_document import MassDocument, mass_lines, numbered
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
-from tactile_bayes.report.rise_text import away_text
 from tactile_bayes.report.scene_text import scene_line
 from tactile_bayes.size.posterior import EXTREMES
 
 MOST_LINES = 12
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 MOST_CAUTIONS = 3
-MOST_RISES = 3
+MOST_MASSES = 3
+"""Masses besides the reported one that have a line."""
 
 
-def estimate_summary(estimate: Estimate, quantities: Mapping[str, Quantity], *, probability: float) -> str:
+def estimate_summary(
+    estimate: Estimate,
+    quantities: Mapping[str, Quantity],
+    *,
+    probability: float,
+    masses: Sequence[MassDocument] = (),
+    place: ClockPosition | None = None,
+) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
     Parameters
@@ -37,29 +46,40 @@ def estimate_summary(estimate: Estimate, quantities: Mapping[str, Quantity], *, 
         As `estimate_quantities` gives them; empty without an estimate.
     probability
         Of the intervals.
+    masses
+        As `masses_document` gives them.
+    place
+        Of the lump about the nipple, where it is known.
     """
-    body = _nothing(estimate) if estimate.status == "no_estimate" else _something(estimate, quantities, probability)
+    if estimate.status == "no_estimate":
+        body = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
+        body += _masses(masses, room=MOST_MASSES)
+    else:
+        body = _something(estimate, quantities, probability, masses, place)
     return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
 
 
-def _nothing(estimate: Estimate) -> list[str]:
-    return [no_estimate_line(estimate.reason), *advice_lines(estimate), *_rises(estimate.other_rises)]
-
-
-def _something(estimate: Estimate, quantities: Mapping[str, Quantity], probability: float) -> list[str]:
+def _something(
+    estimate: Estimate,
+    quantities: Mapping[str, Quantity],
+    probability: float,
+    masses: Sequence[MassDocument],
+    place: ClockPosition | None,
+) -> list[str]:
+    """The body of a report with an estimate; what makes the interval wide gives way to masses."""
     lines = _cautions(estimate)
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
     table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
     lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
-    lines += _lump(estimate, quantities)
-    lines += _rises(estimate.other_rises)
-    if estimate.reason:
-        lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
-    if estimate.size is not None:
-        lines += width_lines(estimate.size.variance_share)
-    lines += _quality(estimate, {name: quantities[name] for name in shown})
+    lines += _lump(estimate, quantities, numbered(masses), place)
+    after = [f"No size: {estimate.reason}.", *advice_lines(estimate)] if estimate.reason else []
     doubts = [text.rstrip(".") for text in warnings(estimate)]
-    return [*lines, *joined(doubts, most=2, lead="Check: ")]
+    last = [*_quality(estimate, {name: quantities[name] for name in shown})]
+    last += joined(doubts, most=2, lead="Check: ")
+    room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
+    beside = _masses(masses, room=min(MOST_MASSES, room))
+    widths = [] if estimate.size is None else width_lines(estimate.size.variance_share)
+    return [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
 
 
 def _cautions(estimate: Estimate) -> list[str]:
@@ -72,12 +92,16 @@ def _cautions(estimate: Estimate) -> list[str]:
     return joined(texts, most=MOST_CAUTIONS, lead="CAUTION: ")
 
 
-def _lump(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
-    """Probability of a lump, and its place."""
+def _lump(
+    estimate: Estimate, quantities: Mapping[str, Quantity], number: str, place: ClockPosition | None
+) -> list[str]:
+    """Probability of a lump, and its place; `number` says which of several masses it is."""
     parts = [] if estimate.detection is None else [f"Probability of a lump {estimate.detection.probability:.3f}"]
     if "amplitude" in quantities:
         parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
-    if "centre_patient_mm.x" in quantities:
+    if place is not None:
+        parts.append(place.text())
+    elif "centre_patient_mm.x" in quantities:
         x, y = (quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")
         parts.append(
             f"{abs(x):.0f} mm {'right' if x >= 0 else 'left'} of the xiphoid and "
@@ -85,18 +109,17 @@ def _lump(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
         )
     if "centre_mm.x" in quantities:
         parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*(quantities[f"centre_mm.{a}"].median for a in "xy")))
-    return [f"{', '.join(parts)}."] if parts else []
+    text = ", ".join(parts)
+    return [f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."] if parts else []
 
 
-def _rises(rises: tuple[Rise, ...]) -> list[str]:
-    places = [
-        f"({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm{away_text(rise)} (probability of a lump {rise.probability:.3f})"
-        for rise in rises
-    ]
-    lead = "Another rise (measure it by estimate --centre-mm X Y): "
-    return joined(
-        places, most=MOST_RISES, lead=lead if len(places) == 1 else lead.replace("Another rise", "Other rises")
-    )
+def _masses(masses: Sequence[MassDocument], *, room: int) -> list[str]:
+    """At most `room` lines on the masses besides the reported one, at least one; the last counts those left out."""
+    lines = mass_lines(masses)
+    shown = lines[: max(room, 1)]
+    if left := len(lines) - len(shown):
+        shown[-1] = f"{shown[-1].rstrip('.')}; and {left} more {'mass' if left == 1 else 'masses'}."
+    return shown
 
 
 def _model(estimate: Estimate) -> str:
@@ -115,6 +138,8 @@ def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:
     parts = [f"method {estimate.draws.method}, {ends}"]
     if estimate.diagnostics is not None and estimate.diagnostics.calibration:
         parts.insert(0, f"sizes by the {estimate.diagnostics.calibration}")
+    if estimate.diagnostics is not None and estimate.diagnostics.repeatability:
+        parts.append(estimate.diagnostics.repeatability)
     if measure := convergence_text(estimate.draws):
         parts.append(measure)
     if share := tracker_share(estimate):

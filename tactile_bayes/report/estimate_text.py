@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import ANOTHER_EXAM, estimate_quantities
+from tactile_bayes.report.lump_place import place_line
+from tactile_bayes.report.masses_document import MassDocument, mass_lines, masses_document, numbered, others
 from tactile_bayes.report.narrowing import width_lines
-from tactile_bayes.report.rise_text import rise_lines
+from tactile_bayes.report.quantities import ANOTHER_EXAM, estimate_quantities
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
 from tactile_bayes.report.size_text import (
     SIZE_DECIMALS,
@@ -22,6 +24,7 @@ from tactile_bayes.report.size_text import (
     exams_label,
     range_cautions,
     shape_text,
+    site_interval_text,
     table_head,
     table_row,
     two_intervals_text,
@@ -63,23 +66,30 @@ def estimate_text(
     probability: float,
     prior: BumpPrior | None = None,
     quantities: Mapping[str, Quantity] | None = None,
+    masses: Sequence[MassDocument] | None = None,
+    place: ClockPosition | None = None,
 ) -> str:
     """Full report of one map: findings with intervals, sources of uncertainty, omissions.
 
-    `quantities` where they are at hand.
+    `quantities`, `masses` (see `masses_document`) and the lump's `place` about the nipple where they are at hand.
     """
-    if estimate.status == "no_estimate":
-        first = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
-        return "\n".join([*first, *rise_lines(estimate.other_rises), *passed_over(estimate), RESEARCH_USE]) + "\n"
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
+    if masses is None:
+        masses = masses_document(
+            estimate.masses, tactile_map, probability=probability, quantities=quantities, reason=estimate.reason
+        )
+    if estimate.status == "no_estimate":
+        first = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
+        return "\n".join([*first, *mass_lines(masses), *passed_over(estimate), RESEARCH_USE]) + "\n"
     table = size_table(quantities, probability, exam_spread=exam_spread(estimate))
     lines = [*_cautions(estimate), *table, ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
+    lines += [] if place is None else [place_line(place, probability)]
     lines += [
-        *_findings(estimate, quantities),
-        *_scene(estimate),
+        *_findings(estimate, quantities, masses),
+        *_scene(estimate, masses),
         *warnings(estimate),
         *passed_over(estimate),
         *_left_out(estimate),
@@ -123,15 +133,18 @@ def exam_spread(estimate: Estimate) -> float | None:
     return None if another is None else another.figures["between_map_sd"]
 
 
-def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
+def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Sequence[MassDocument]) -> list[str]:
     lines, found = [], estimate.diagnostics
     if estimate.detection is not None:
-        lines.append(f"Probability of a lump: {estimate.detection.probability:.3f}.")
-    lines += rise_lines(estimate.other_rises)
+        which = f"{number}. " if (number := numbered(masses)) else ""
+        lines.append(f"{which}Probability of a lump: {estimate.detection.probability:.3f}.")
+    lines += mass_lines(masses)
     if estimate.size is not None:
         spread = exam_spread(estimate)
         lines += [] if spread is None else [two_intervals_text(estimate.size.figures.get("between_map_sd"), spread)]
         lines += width_lines(estimate.size.variance_share)
+        if found is not None and found.repeatability:
+            lines.append(site_interval_text(found.repeatability))
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
         if found is not None and found.size_calibration:
@@ -191,11 +204,17 @@ def _ends(what: str, names: tuple[str, ...], quantities: Mapping[str, Quantity])
     return ends_text(what, worst.mc_error, worst.sd)
 
 
-def _scene(estimate: Estimate) -> list[str]:
+def _scene(estimate: Estimate, masses: Sequence[MassDocument]) -> list[str]:
     """Lines on the structures in the window, and on the influence of the prior."""
-    lines = [] if estimate.scene is None else scene_lines(estimate.scene)
+    lines = [] if estimate.scene is None else [*scene_lines(estimate.scene), *_elsewhere(masses)]
     prior = "" if estimate.sensitivity is None else sensitivity_line(estimate.sensitivity)
     return [*lines, prior] if prior else lines
+
+
+def _elsewhere(masses: Sequence[MassDocument]) -> list[str]:
+    """A line on what the odds of a second lump do not speak of; empty where there is one mass."""
+    numbers = " and ".join(str(one["number"]) for one in others(masses))
+    return [f"These odds are of this window alone: mass {numbers} of the map is above."] if numbers else []
 
 
 def _cautions(estimate: Estimate) -> list[str]:

@@ -27,7 +27,7 @@ _SHADES: Final = " .:-=+*#%@"
 _FULL_BAR_KPA: Final = 20.0
 _SAID: Final = {"low": "press harder", "in": "in range", "high": "press less", "off": "waiting for the head"}
 _TINT: Final = {"low": "94", "in": "92", "high": "91", "off": "90"}
-KEYS: Final = "keys: n sternal notch, x xiphoid, space start, q stop"
+KEYS: Final = "keys: n sternal notch, x xiphoid, p nipple, space start, q stop"
 _EDGE_WORDS: Final = {"H": "H (head)", "F": "F (feet)"}
 _LEGEND_LINES: Final = 3
 _LEAST_ROWS: Final = 6

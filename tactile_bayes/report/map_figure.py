@@ -75,11 +75,22 @@ class Place:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class NumberedMass:
+    """One of several masses on the map; `size_mm` along its ellipse's axes, None without a size."""
+
+    number: int
+    centre_mm: tuple[float, float]
+    size_mm: tuple[float, float] | None = None
+    angle_deg: float = 0.0
+
+
 def map_figure(
     tactile_map: TactileMap,
     path: Path | None,
     *,
     fit: FitContour | None = None,
+    masses: Sequence[NumberedMass] = (),
     looked_at: Sequence[Place] = (),
     title: str = "",
     note: str = "",
@@ -94,6 +105,8 @@ def map_figure(
     ----------
     fit
         Drawn as an ellipse of the lump's size, and dashed as one of the fitted bump's sigmas.
+    masses
+        Numbered where there are several; those besides the fitted lump with an ellipse of their size.
     looked_at
         Drawn as numbered crosses, the first few with their reasons below the coverage.
     title
@@ -121,6 +134,8 @@ def map_figure(
             _orient(axes, view, tactile_map)
         if fit:
             _draw_fit(left, fit, view)
+        if len(masses) > 1:
+            _draw_masses(left, masses, fit, view)
         _draw_scale_bar(left)
         _draw_edges(left, view)
         _draw_notch(left, view)
@@ -150,6 +165,16 @@ def _draw_cells(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientat
     axes.set_facecolor("0.85")
     across = values.T if view.swapped else values
     return axes.imshow(across, origin="lower", extent=_extent(tactile_map, view), interpolation="nearest", **how)
+
+
+def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, title: str, **how: Any) -> None:
+    """Draw cells in the map's orientation, with its sides and a colour bar; NaN stays grey."""
+    view = orientation_of(tactile_map)
+    image = _draw_cells(axes, np.ma.masked_invalid(values), tactile_map, view, **how)
+    _colour_bar(axes, image, label)
+    _orient(axes, view, tactile_map)
+    _draw_edges(axes, view)
+    axes.set_title(title, loc="left", fontsize=11)
 
 
 def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, fit: FitContour | None) -> None:
@@ -308,6 +333,30 @@ def _draw_fit(axes: Axes, fit: FitContour, view: Orientation) -> None:
     axes.plot(*centre, "+", color="white", markersize=9, markeredgewidth=1.6, path_effects=_outlined(3.2))
     place = (0.0, -0.13)  # below the picture, where it hides no cell
     axes.legend(loc="upper left", bbox_to_anchor=place, ncols=2, fontsize=8, facecolor="0.5", labelcolor="white")
+
+
+def _draw_masses(axes: Axes, masses: Sequence[NumberedMass], fit: FitContour | None, view: Orientation) -> None:
+    """Draw the number of each mass, and a cross and the size of those besides the fitted lump."""
+    from matplotlib.patches import Ellipse
+
+    for mass in masses:
+        centre = _pair(view, *mass.centre_mm)
+        above = max(mass.size_mm or (0.0, 0.0)) / 2.0
+        axes.annotate(
+            f"mass {mass.number}",
+            (centre[0], centre[1] + (above if axes.get_ylim()[1] > axes.get_ylim()[0] else -above)),
+            xytext=(0, 4),
+            path_effects=_outlined(2.5),
+            **_ABOVE,
+        )
+        if fit is not None and mass.centre_mm == fit.centre_mm:
+            continue
+        axes.plot(*centre, "+", color="white", markersize=7, markeredgewidth=1.4, path_effects=_outlined(3.0))
+        if mass.size_mm is not None:
+            angle = -mass.angle_deg if view.swapped else mass.angle_deg
+            ellipse = Ellipse(centre, *_pair(view, *mass.size_mm), angle=angle, fill=False, edgecolor="white")
+            ellipse.set_path_effects(_outlined(2.6))
+            axes.add_patch(ellipse)
 
 
 def _draw_places(axes: Axes, places: Sequence[Place], view: Orientation) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.narrowing import MORE, joined, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
+from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.site_text import site_words
 from tactile_bayes.report.size_text import (
     SIZE_DECIMALS,
@@ -20,6 +20,7 @@ from tactile_bayes.report.size_text import (
     exams_label,
     range_cautions,
     shape_text,
+    site_interval_text,
     table_head,
     table_row,
 )
@@ -27,6 +28,7 @@ from tactile_bayes.size import omissions
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.size.posterior import EXTREMES, SizePosterior
+from tactile_bayes.size.repeatability import Repeatability
 
 SCHEMA = "tactile-bayes/pooled/1"
 MOST_NAMED = 4
@@ -40,6 +42,7 @@ def pooled_document(
     *,
     probability: float,
     provenance: Provenance,
+    repeatability: Repeatability | None = None,
 ) -> dict[str, Any]:
     """JSON object of a mass, see data_schema/pooled.schema.json.
 
@@ -47,6 +50,8 @@ def pooled_document(
     ----------
     names, documents
         Of the maps, with what `estimate` says of each.
+    repeatability
+        The site's, where the size is by it.
     """
     size, used = pooled.size, pooled.calibration or calibration
     sizes: dict[str, Any] = dict.fromkeys(EXTREMES)
@@ -67,6 +72,7 @@ def pooled_document(
         "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
         "site": None if used.site is None else site_words(used.site),
+        **({} if repeatability is None else {"repeatability": repeatability.words()}),
         "outside_calibration": list(pooled.outside),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
@@ -113,7 +119,8 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         lines += _table(document) + width_lines(document["variance_share"])
         ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
         by = f"sizes by {document['site']}; " if document["site"] else ""
-        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %.")
+        site = f"; {document['repeatability']}" if "repeatability" in document else ""
+        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %{site}.")
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
@@ -147,6 +154,8 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     worst, figures = _worst(document), document["figures"]
     lines += ["", *width_lines(document["variance_share"])]
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
+    if "repeatability" in document:
+        lines.append(site_interval_text(document["repeatability"]))
     lines.append(shape_text(figures))
     lines.append(f"Monte-Carlo error of the interval ends: {ends_text('sizes', worst['mc_error'], worst['sd'])}.")
     lines.append(_unknowns(document))

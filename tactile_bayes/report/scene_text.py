@@ -45,7 +45,8 @@ def scene_line(choice: SceneChoice) -> str:
     """Scene of the fit window in one line: structures supported, and those not needed."""
     used = _named(choice)
     names = [BUMP[choice.supported], *(ASKED[one.name] for one in used)]
-    out = [ASKED[one.name].removesuffix(" in this window") for one in choice.structures if not one.used]
+    near = f" within {choice.fit.target.problem.radius_mm:g} mm"
+    out = [ASKED[one.name].replace(" in this window", near) for one in choice.structures if not one.used]
     return f"The map supports {' and '.join(names)}" + (f"; not needed: {', '.join(out)}." if out else ".")
 
 

@@ -32,6 +32,11 @@ def two_intervals_text(this: float | None, another: float) -> str:
     )
 
 
+def site_interval_text(repeatability: str) -> str:
+    """What the interval of a size supposes where the site's repeatability is known, from `Repeatability.words`."""
+    return f"The interval is for any exam of the mass: {repeatability}."
+
+
 def range_cautions(outside: Sequence[str]) -> list[str]:
     """First lines of a report of a size outside its calibration's range."""
     return [f"CAUTION: outside the calibration's range: {text}." for text in outside]

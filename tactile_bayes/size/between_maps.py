@@ -55,11 +55,8 @@ class BetweenMaps:
         grid = self.grid
         if len(grid) == 1:
             return np.ones(1)
-        variance = noise[:, None] + grid**2
-        weight = 1.0 / variance
-        mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
-        log = -0.5 * np.sum(np.log(variance) + weight * (centre[:, None] - mean) ** 2, axis=0)
-        log += -0.5 * np.log(weight.sum(axis=0)) - 0.5 * (np.log(grid / self.median) / self.log_sd) ** 2
+        log = restricted_log_likelihood(centre, noise, grid)
+        log -= 0.5 * (np.log(grid / self.median) / self.log_sd) ** 2
         density = np.exp(log - log.max())  # even steps in ln tau, in which the prior is normal
         return np.asarray(density / density.sum())
 
@@ -67,6 +64,21 @@ class BetweenMaps:
         """(n,) draws of tau from its posterior by uniform points."""
         edges = np.cumsum(self.density(centre, noise))
         return np.asarray(self.grid[np.minimum(np.searchsorted(edges, points), len(self.grid) - 1)])
+
+
+def restricted_log_likelihood(centre: FloatArray, noise: FloatArray, grid: FloatArray) -> FloatArray:
+    """(n,) log-likelihood of each tau of a grid by the maps of one mass, its mean integrated out.
+
+    Parameters
+    ----------
+    centre, noise : (k,) arrays
+        Mean and variance of each map's log size.
+    """
+    variance = noise[:, None] + grid**2
+    weight = 1.0 / variance
+    mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
+    log = -0.5 * np.sum(np.log(variance) + weight * (centre[:, None] - mean) ** 2, axis=0)
+    return np.asarray(log - 0.5 * np.log(weight.sum(axis=0)))
 
 
 def outlying_maps(centre: FloatArray, noise: FloatArray, prior: BetweenMaps) -> tuple[int, ...]:

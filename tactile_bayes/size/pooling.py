@@ -52,6 +52,11 @@ class SizePriors:
     shape: ShapePrior = field(default_factory=ShapePrior)
     known: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def learned_between_maps(self) -> BetweenMaps | None:
+        """The spread between the maps at hand where it was learned; None where it is stated, or the calibration's."""
+        return self.between_maps if self.between_maps is not None and self.between_maps.log_sd > 0 else None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeDraws:
@@ -178,7 +183,7 @@ def pooled_size(
     another = priors.another_exam
     return replace(
         pool.size(between, figures),
-        outliers=outlying_maps(centre, noise, BetweenMaps() if another is None else another),
+        outliers=outlying_maps(centre, noise, another or priors.learned_between_maps or BetweenMaps()),
         another_exam=None if another is None else pool.size(another, figures),
     )
 

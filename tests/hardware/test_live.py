@@ -133,7 +133,7 @@ def test_a_view_says_why_there_is_no_size_yet(state):
 def test_a_screen_names_its_keys_colours_scale_and_the_lump(state):
     marked = replace(state, lump_base_mm=np.linalg.inv(state.tactile_map.plane_from_base)[:3, 3])
     text = live_text(marked, columns=100, lines=40, colour=False, keys=True)
-    assert "keys: n sternal notch, x xiphoid, space start, q stop" in text
+    assert "keys: n sternal notch, x xiphoid, p nipple, space start, q stop" in text
     assert "pressure / mean of its frame: dark " in text
     assert "a character is 1 mm wide; X the lump" in text
     assert sum(line.count("X") for line in text.splitlines() if line.startswith("    ")) == 1

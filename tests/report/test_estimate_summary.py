@@ -19,13 +19,14 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.correlated.selection import Structure
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.result import Estimate, Rise
+from tactile_bayes.posterior.result import Estimate, Mass
 from tactile_bayes.posterior.sensitivity import Sensitivity
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import estimate_quantities
 from tactile_bayes.report.estimate_summary import MOST_LINES, estimate_summary
 from tactile_bayes.report.estimate_text import estimate_text
+from tactile_bayes.report.masses_document import masses_document
 from tactile_bayes.report.narrowing import joined, width_lines
+from tactile_bayes.report.quantities import estimate_quantities
 from tactile_bayes.report.scene_text import _change, sensitivity_line
 from tactile_bayes.report.size_text import decimals
 
@@ -61,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("words", "code", "first", "also"),
     [
         (["clear.nc"], 0, " ", "What makes the interval wide: "),
-        (["two.nc"], 0, " ", "Another rise (measure it by estimate --centre-mm X Y): (2"),
+        (["two.nc"], 0, " ", "Mass 2 at (2"),
         (["empty.nc"], 6, "No lump found", "What would help: "),
         (["outside.nc"], 0, "CAUTION: outside the calibration's range: ", "What would narrow it: "),
         (["level.nc"], 0, " ", "No size: the "),
@@ -103,7 +104,7 @@ def crowded() -> tuple[Estimate, dict]:
     """An estimate with everything there is to say about it."""
     options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
     found = estimate_map(MAPS["clear.nc"], calibration=None, options=options, rng=np.random.default_rng(1))
-    rise = Rise(10.0, 1.0, 30.0, amplitude=0.1, sigma_x_mm=4.0, sigma_y_mm=4.0, probability=0.97)
+    mass = Mass(10.0, 1.0, 0.97, Estimate("no_estimate", "a reason"))
     assert found.diagnostics is not None
     odd = replace(
         found.diagnostics,
@@ -111,21 +112,33 @@ def crowded() -> tuple[Estimate, dict]:
         coarse_cells=True,
         noise=replace(found.diagnostics.noise, level_offset=0.2, places_share=0.4),
     )
-    full = replace(found, other_rises=(rise,) * 9, diagnostics=odd, reason="of a reason", advice="advice")
+    full = replace(
+        found,
+        masses=(Mass(-10.0, 2.0, 1.0, found, reported=True), *((mass,) * 9)),
+        diagnostics=odd,
+        reason="of a reason",
+        advice="advice",
+    )
     return full, estimate_quantities(full, MAPS["clear.nc"], probability=0.9)
 
 
 def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show() -> None:
     full, quantities = crowded()
     size = {name: summarise(np.linspace(10.0, 20.0, 99), probability=0.9) for name in ("max_size_mm", "min_size_mm")}
-    for shown in (quantities, quantities | size):
-        text = estimate_summary(full, shown, probability=0.9)
+    another = size | {"another_exam.max_size_mm": size["max_size_mm"]}
+    told = {"probability": 0.9, "quantities": quantities, "reason": full.reason}
+    masses = masses_document(full.masses, MAPS["clear.nc"], **told)
+    sized = replace(full, reason="", advice="")
+    for one, shown in ((full, quantities), (full, quantities | size), (sized, quantities | another)):
+        text = estimate_summary(one, shown, probability=0.9, masses=masses)
         assert len(text.splitlines()) <= MOST_LINES
-        assert "(and 6 more)" in text
+        assert "Mass 1 of 10: probability of a lump 1.000" in text
+        listed = re.findall(r"^Mass \d+ at .*$", text, re.MULTILINE)
+        assert f"; and {9 - len(listed)} more masses." in listed[-1]
         assert "40 % of the width variance is tracker position error" in text
     whole = estimate_text(full, MAPS["clear.nc"], probability=0.9)
     assert whole.count("CAUTION") == 9  # the control: there is more than 12 lines can hold
-    assert whole.count("Another rise stands at") == 9
+    assert len(re.findall(r"^Mass \d+ at ", whole, re.MULTILINE)) == 9
 
 
 def test_a_broken_assumption_stands_first_and_one_to_check_after_the_size() -> None:

@@ -32,6 +32,7 @@ NOT_RUN = {
     "device": "needs a scan head, a tracker or a bladder on a port",
     "by-hand": "needs two terminals and a key; tests/hardware/test_recording_by_hand.py runs it with both",
     "setup": "makes an environment with pip; .ci/run does it",
+    "browser": "needs Chromium or WeasyPrint; tests/report/test_exam_page.py prints with one",
     "long": "takes a quarter of a minute of CPU or more; tests of the command run a smaller one",
 }
 """Why a block may be left out of the tests."""

@@ -44,10 +44,7 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
     window, fixed = target.window, _fixed_columns(target)
     templates = [window.of_cells(one.full()) for one in target.scene.templates(theta, window)]
-    # a row a cell: its products with the cosines, over its independent variance
-    cosines = window.project(
-        Profiles(grid=window.on_grid(np.eye(len(window.cells)))), np.zeros((1, *window.weight.shape))
-    ).low
+    cosines = _cosines(target)
     inverse, h = np.full((len(theta), len(window.cells)), -np.inf), 0
     for columns in target.fields:
         low = cosines @ columns.field.turn
@@ -60,6 +57,30 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
                 inverse[m] = np.logaddexp(inverse[m], log_share[m, h] - found)
             h += 1
     return -inverse
+
+
+def fitted_values(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
+    """(n,) values of the model without noise at a (p,) shape, by generalised least squares in the likeliest field."""
+    window, at = target.window, theta[None]
+    likeliest, h = int(np.argmax(target.by_field(at)[0])), 0
+    templates = [window.of_cells(one.full())[0] for one in target.scene.templates(at, window)]
+    regressors = np.stack([*_fixed_columns(target), *templates])
+    for columns in target.fields:
+        if likeliest < h + len(columns.shares):
+            break
+        h += len(columns.shares)
+    precision = _Precision(1.0 / window.variance, _cosines(target) @ columns.field.turn, columns, likeliest - h)
+    middle = window.cells.value.mean()
+    across = precision.times(regressors)
+    solved = np.linalg.solve(across @ regressors.T, across @ (window.cells.value - middle))
+    return np.asarray(middle + solved @ regressors)
+
+
+def _cosines(target: CollapsedTarget) -> FloatArray:
+    """A row for each cell: its products with the cosines, over its independent variance."""
+    window = target.window
+    unit = Profiles(grid=window.on_grid(np.eye(len(window.cells))))
+    return np.asarray(window.project(unit, np.zeros((1, *window.weight.shape))).low)
 
 
 def _fixed_columns(target: CollapsedTarget) -> FloatArray:

@@ -71,6 +71,8 @@ class Diagnostics:
         Name of the calibration that gave the size, in words; not in the JSON.
     size_calibration
         Which calibration gave the size and what it cannot know, in words.
+    repeatability
+        How far exams of one mass lie apart at the site, in words; empty where nobody learned it.
     broken_assumptions
         What in the scan may put the size outside its interval, in words, see `mapping.assumptions`.
     assumptions_to_check
@@ -89,6 +91,7 @@ class Diagnostics:
     noise: NoiseFigures
     calibration: str = ""
     size_calibration: str = ""
+    repeatability: str = ""
     broken_assumptions: tuple[str, ...] = ()
     assumptions_to_check: tuple[str, ...] = ()
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
@@ -98,6 +101,8 @@ class Diagnostics:
     def as_dict(self) -> dict[str, object]:
         """The diagnostics as plain data."""
         words: dict[str, object] = {"size_calibration": self.size_calibration} if self.size_calibration else {}
+        if self.repeatability:
+            words["repeatability"] = self.repeatability
         if self.convergence:
             words["convergence"] = {name: dict(one) for name, one in self.convergence.items()}
         return {

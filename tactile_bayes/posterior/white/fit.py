@@ -38,7 +38,7 @@ CLOSE_IN_RADII = 0.6
 """Beside a rib 16 mm away a window of 12 mm holds more of the lump than of the rib."""
 PATIENCE = 16
 """Iterations: a clear lump takes 4 to 15."""
-OUTGROWN = "wider than the window"
+OUTGROWN, AT_RIM = "wider than the window", "at the rim of the map"
 FIT_TOLERANCE = 1e-8
 """Of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 PLACE_TOLERANCE = 1e-2
@@ -304,7 +304,7 @@ def lump_fault(result: BumpFit, options: FitOptions) -> str:
     if wide > WIDEST_IN_RADII * options.radius_mm:
         return f"{OUTGROWN} (sigma {wide:.3g} mm in a radius of {options.radius_mm:g} mm)"
     if result.covered_share < LEAST_COVERED_SHARE:
-        return f"at the rim of the map ({100 * result.covered_share:.0f} % of the bump is covered)"
+        return f"{AT_RIM} ({100 * result.covered_share:.0f} % of the bump is covered)"
     if wide / narrow > MOST_AXIS_RATIO:
         return f"a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
     return ""

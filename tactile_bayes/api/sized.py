@@ -1,0 +1,158 @@
+"""What all estimates of a size have in common, and the masses of a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tactile_bayes.api.draws import Draws
+from tactile_bayes.errors import UsageError
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.posterior import SIZES
+
+if TYPE_CHECKING:
+    import pandas
+
+    from tactile_bayes.posterior.result import Mass
+    from tactile_bayes.size.posterior import SizePosterior
+
+
+class Sized:
+    """Base of the estimates from one map, of one of its masses, and from several maps."""
+
+    name: str
+    probability: float
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        raise NotImplementedError
+
+    @property
+    def why(self) -> str:
+        """Why there is no size, or no estimate at all; empty where there is a size."""
+        raise NotImplementedError
+
+    def _of_size(self, name: str) -> Draws | None:
+        size = self._size
+        if size is None:
+            return None
+        return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
+
+    @property
+    def max_size_mm(self) -> Draws | None:
+        """Largest diameter; None without a size."""
+        return self._of_size("max_size_mm")
+
+    @property
+    def min_size_mm(self) -> Draws | None:
+        """Smallest diameter; None without a size."""
+        return self._of_size("min_size_mm")
+
+    @property
+    def max_size_another_exam_mm(self) -> Draws | None:
+        """Largest diameter if another exam of the mass may come out as far apart as the paper's maps.
+
+        None without a size, or where the spread between exams was stated or learned at the site: `max_size_mm` has it
+        then.
+        """
+        size = None if self._size is None else self._size.another_exam
+        if size is None:
+            return None
+        return Draws(np.atleast_2d(size.max_size_mm), "mm", self.probability, size.replicates)
+
+    def _columns(self) -> dict[str, Draws]:
+        found = {name: self._of_size(name) for name in SIZES}
+        return {name: draws for name, draws in found.items() if draws is not None}
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row for each draw: chain, draw and a column for each quantity; no rows without an estimate."""
+        import pandas
+
+        columns = self._columns()
+        shape = next(iter(columns.values())).values.shape if columns else (0, 0)
+        chain, draw = (index.ravel() for index in np.indices(shape))
+        values = {name: draws.values.ravel() for name, draws in columns.items()}
+        return pandas.DataFrame({"chain": chain, "draw": draw, **values})
+
+    def to_arviz(self) -> Any:
+        """The draws as arviz has them, one group ``posterior``.
+
+        Raises
+        ------
+        UsageError
+            Without an estimate: there are no draws.
+        """
+        from tactile_bayes.inference.arviz_data import inference_data
+
+        columns = self._columns()
+        if not columns:
+            raise UsageError(f"there are no draws: {self.why}")
+        return inference_data({name: draws.values for name, draws in columns.items()})
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self._words()}>"
+
+    def _words(self) -> str:
+        return f"no size: {self.why}" if self.max_size_mm is None else f"largest size {self.max_size_mm}"
+
+    def _repr_html_(self) -> str:
+        rows = [("largest size", self.max_size_mm), ("smallest size", self.min_size_mm)]
+        cells = [f"<tr><th>{name}</th><td>{escape(repr(draws))}</td></tr>" for name, draws in rows if draws is not None]
+        table = f"<table>{''.join(cells)}</table>" if cells else f"<p>No size: {escape(self.why)}</p>"
+        return f"{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MassEstimate(Sized):
+    """One of the masses on a map.
+
+    Parameters
+    ----------
+    number
+        By size, the largest first; those without a size come last.
+    mass
+        Its place and its own estimate.
+    patient_mm
+        x and y from the xiphoid, to the patient's right and up; None where the map has no landmarks.
+    probability
+        Of the intervals shown by default.
+    reason
+        Why it has no size; empty where it has one.
+    """
+
+    number: int
+    mass: Mass
+    patient_mm: tuple[float, float] | None
+    probability: float
+    reason: str
+
+    @property
+    def _size(self) -> SizePosterior | None:
+        return self.mass.estimate.size
+
+    @property
+    def why(self) -> str:
+        """Why there is no size; empty where there is one."""
+        return self.reason
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """x and y of its centre on the map."""
+        return self.mass.x_mm, self.mass.y_mm
+
+    @property
+    def detected_probability(self) -> float:
+        """Posterior probability that it is a lump."""
+        return self.mass.probability
+
+    @property
+    def reported(self) -> bool:
+        """Whether the estimate's own size is this mass's."""
+        return self.mass.reported
+
+    def _words(self) -> str:
+        x, y = self.centre_mm
+        return f"{self.number} at ({x:.1f}, {y:.1f}) mm: {super()._words()}"

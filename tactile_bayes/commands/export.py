@@ -1,0 +1,148 @@
+"""`export`: write maps and estimates as the files that other systems take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from tactile_bayes.commands.options import FORCE
+from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.errors import UsageError
+from tactile_bayes.presets import RESEARCH_USE
+
+if TYPE_CHECKING:
+    from tactile_bayes.export.run import Exported
+
+_FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
+# Name of the part of an identity, metavar, help.
+_IDENTITY: Final = (
+    ("patient_id", "ID", "Patient ID; in csv files the beginning of the record ID."),
+    ("patient_name", "FAMILY^GIVEN", "Patient's name."),
+    ("birth_date", "YYYY-MM-DD", "Patient's date of birth."),
+    ("sex", "F|M|O", "Patient's sex."),
+    ("issuer", "NAME", "Who issued the patient ID."),
+    ("accession", "NUMBER", "Accession number."),
+    ("referring_physician", "FAMILY^GIVEN", "Referring physician's name."),
+    ("study_id", "ID", "Study ID."),
+    ("study_description", "TEXT", "Study description."),
+    ("study_uid", "UID", "Study Instance UID. Default: one that follows from the maps."),
+    ("study_date", "DATE", "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone."),
+    ("content_date", "DATE", "Date at which the content was made. Default: the exam's."),
+)
+
+
+def _identity_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """One option for each part of an identity."""
+    for name, metavar, text in reversed(_IDENTITY):
+        command = click.option(f"--{name.replace('_', '-')}", metavar=metavar, help=text)(command)
+    return command
+
+
+@click.command("export")
+@click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
+@click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
+@click.option(
+    "-o", "--output", metavar="OUT", type=FilePath(), help="File to write; for dicom the folder of the files."
+)
+@click.option(
+    "--worklist",
+    metavar="ITEM",
+    type=FilePath(),
+    help="Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
+)
+@click.option("--patient-id-from-scan", is_flag=True, help="Use the scan's subject code as the patient ID.")
+@_identity_options
+@click.option(
+    "--dictionary", metavar="DICT.csv", type=FilePath(), help="With csv: write the data dictionary of the REDCap form."
+)
+@FORCE
+def command(
+    *,
+    files: tuple[Path, ...],
+    to: Any,
+    output: Path | None,
+    worklist: Path | None,
+    patient_id_from_scan: bool,
+    dictionary: Path | None,
+    force: bool,
+    **identity: str | None,
+) -> None:
+    """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap).
+
+    dicom takes a map, or a map and its estimate: values, picture and report, into a folder. fhir takes an estimate
+    (what `estimate --json` prints), nrrd a map, csv one or more estimates. Files are told apart by their content; an
+    estimate of another map is refused. Who was examined comes from options or a worklist and is never invented.
+
+    Example: tactile-bayes export map.nc estimate.json --to dicom --study-date 2026-11-24T10:30 -o exam
+    """
+    from tactile_bayes.export.run import export, refuse_untaken
+    from tactile_bayes.files.atomic import refuse_existing
+
+    if not files and dictionary is None:
+        raise UsageError("no file was given to export; give a map, an estimate or both")
+    if files and output is None:
+        raise UsageError("there is nowhere to write to; give -o OUT")
+    if dictionary is not None and to != "csv":
+        raise UsageError("--dictionary is REDCap's; give it with --to csv")
+    given = {name: value for name, value in identity.items() if value is not None}
+    refuse_untaken(to, given)
+    for path in (dictionary, None if to == "dicom" else output):
+        if path is not None:
+            refuse_existing(path, force=force)
+    if files and output is not None:
+        exported = export(files, to=to, identity=_identity(worklist, given), id_from_scan=patient_id_from_scan)
+        _write(exported, output, force=force)
+    if dictionary is not None:
+        _write_dictionary(dictionary, force=force)
+    click.echo(RESEARCH_USE)
+
+
+def _identity(worklist: Path | None, given: dict[str, str]) -> Any:
+    from tactile_bayes.export.identity import Identity
+
+    if worklist is None:
+        return Identity(**given)
+    from tactile_bayes.export.worklist import read_worklist
+
+    return read_worklist(worklist).with_options(given)
+
+
+def _write(exported: Exported, output: Path, *, force: bool) -> None:
+    from tactile_bayes.files.atomic import write_bytes
+
+    if "" not in exported.files:
+        _prepare_folder(output, set(exported.files), force=force)
+    for name, data in exported.files.items():
+        path = output / name if name else output
+        write_bytes(path, data, force=force)
+        click.echo(f"{path}: {len(data)} bytes")
+    for note in exported.notes:
+        click.echo(f"note: {note}", err=True)
+
+
+def _prepare_folder(folder: Path, names: set[str], *, force: bool) -> None:
+    """Make the folder, and refuse one in which the files would stand beside those of another export."""
+    from tactile_bayes.files.atomic import refuse_existing, unwritable
+
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        others = sorted({path.name for path in folder.glob("*.dcm")} - names)
+    except FileExistsError:
+        raise UsageError(f"{folder} is no folder; give the name of one for the DICOM files") from None
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    if others:
+        raise UsageError(f"{folder} holds {others[0]} of another export; give another folder")
+    for name in sorted(names):
+        refuse_existing(folder / name, force=force)
+
+
+def _write_dictionary(path: Path, *, force: bool) -> None:
+    from tactile_bayes.export.redcap import dictionary_csv
+    from tactile_bayes.files.atomic import write_text
+
+    write_text(path, dictionary_csv(), force=force)
+    click.echo(f"{path}: data dictionary for REDCap")

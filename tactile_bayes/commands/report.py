@@ -1,0 +1,107 @@
+"""`report`: one page of an exam, to read and to print."""
+
+from __future__ import annotations
+
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
+from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.errors import UsageError
+from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+
+_FILE = FilePath()
+_LONGEST = {"title": 60, "name": 50}
+
+
+def _one_line(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
+    """A short text of printable letters."""
+    del ctx
+    longest = _LONGEST[str(param.name)]
+    if value is not None and (not value.isprintable() or len(value) > longest):
+        raise UsageError(f"--{param.name} is of {len(value)} letters or not printable; give up to {longest} letters")
+    return value or ""
+
+
+def _day(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
+    """A date, written as YEAR-MONTH-DAY."""
+    del ctx, param
+    if value is None:
+        return ""
+    try:
+        return date.fromisoformat(value).isoformat()
+    except ValueError:
+        raise UsageError(f"--date {value!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01") from None
+
+
+@click.command("report")
+@click.argument("files", metavar="MAP.nc... [ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--output", metavar="EXAM.html", required=True, type=_FILE, help="Page to write.")
+@click.option(
+    "--pdf", metavar="EXAM.pdf", type=_FILE, help="Also print it to PDF, by an installed Chromium or WeasyPrint."
+)
+@click.option("--title", callback=_one_line, help="Title of the page. Default: Tactile exam.")
+@click.option("--name", callback=_one_line, help="Name to print on the page. Default: none.")
+@click.option("--date", "day", callback=_day, metavar="YYYY-MM-DD", help="Date to print on the page. Default: none.")
+@click.option(
+    "--size-calibration",
+    metavar="solid|eq6|solid-mean|plane-strain|SIZE.json",
+    help="Calibration from widths to sizes, as of `estimate`. Default: the one that fits the maps.",
+)
+@click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Settings, as of `estimate`.")
+@seed_option(1)
+@click.option(
+    "--interval",
+    type=FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True),
+    default=INTERVAL,
+    show_default=True,
+    help="Probability of the intervals.",
+)
+@FORCE
+def command(
+    *,
+    files: tuple[Path, ...],
+    output: Path,
+    pdf: Path | None,
+    title: str,
+    name: str,
+    day: str,
+    size_calibration: str | None,
+    settings_file: Path | None,
+    seed: int,
+    interval: float,
+    force: bool,
+) -> None:
+    """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.
+
+    The page is one HTML file that loads nothing and prints to one side of A4. Several maps are repeats of one mass:
+    they are pooled into one size. With the JSON that `estimate --json` printed for a map nothing is computed again.
+    The page names the codes of the scan's session, and a name or a date only where they are given.
+
+    Example: tactile-bayes report map.nc -o exam.html
+    """
+    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.files.atomic import refuse_existing, write_bytes, write_text
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.pipeline.exam_report import Given, read_exam
+    from tactile_bayes.report.exam_page import exam_page
+    from tactile_bayes.report.exam_words import headline
+    from tactile_bayes.report.printed import find_printer
+
+    for path in (output, pdf):
+        if path is not None:
+            refuse_existing(path, force=force)
+    printer = None if pdf is None else find_printer()
+    options: dict[str, Any] = {"calibration": size_calibration, "seed": seed, "interval": interval}
+    settings = settings_of(settings_file, **options)
+    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
+    exam = read_exam(files, settings, Given(title, name, day), notice=lambda line: click.echo(line, err=True))
+    page = exam_page(exam)
+    write_text(output, page, force=force)
+    if pdf is not None and printer is not None:
+        write_bytes(pdf, printer(page), force=force)
+    click.echo(f"{output}: {headline(exam)}")
+    click.echo(RESEARCH_USE)

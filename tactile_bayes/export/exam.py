@@ -1,0 +1,327 @@
+"""What an export is made from: a map's file, and what an estimate's file says of each mass."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.export.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
+from tactile_bayes.files.atomic import sha256
+from tactile_bayes.files.documents import load_json, parse_json
+from tactile_bayes.files.kinds import HDF5_MAGIC
+from tactile_bayes.files.netcdf import open_netcdf
+from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
+from tactile_bayes.files.reading import open_input
+from tactile_bayes.files.schema import check_document
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.tactile_map import TactileMap
+
+_WAY_OUT: Final = "give a map (.nc), a posterior (.nc), or the JSON of `estimate --json`"
+_SCHEMAS: Final = {"tactile-bayes/estimate/1": "estimate.schema.json", "tactile-bayes/pooled/1": "pooled.schema.json"}
+_MOST_TEXT: Final = 2000
+_SIZES: Final = ("max_size_mm", "min_size_mm")
+Facts = Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapFile:
+    """A map with its file's digest and the facts of its scans.
+
+    Parameters
+    ----------
+    digest
+        SHA-256 of the file.
+    facts
+        What all of its scans say alike of the exam; see `EXAM_FACTS`.
+    """
+
+    path: Path
+    digest: str
+    tactile_map: TactileMap
+    facts: Facts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """One mass of an estimate.
+
+    Parameters
+    ----------
+    number
+        From 1, in the order of the estimate.
+    largest, smallest
+        Quantities in mm as the estimate's JSON has them; None without a size.
+    code
+        Reason code of the estimate where there is no number; empty with a size.
+    reason
+        Why there is no number, or no size.
+    probability
+        That there is a lump; None where the file does not tell.
+    centre_mm, centre_patient_mm
+        Medians of x and y in `plane` and in `patient`; None where the file does not tell.
+    another_exam
+        The interval if exams of the mass differ more, in words; empty where the file does not tell.
+    """
+
+    number: int
+    largest: Mapping[str, Any] | None
+    smallest: Mapping[str, Any] | None
+    code: str = ""
+    reason: str = ""
+    probability: float | None = None
+    centre_mm: tuple[float, float] | None = None
+    centre_patient_mm: tuple[float, float] | None = None
+    another_exam: str = ""
+
+    @property
+    def outcome(self) -> Code:
+        """Whether the mass has a size, and if not, whether a lump was detected."""
+        if self.largest is not None:
+            return SIZED
+        return NOT_DETECTED if self.code in ("undetected", "empty") else NOT_SIZED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimateFile:
+    """An estimate: of one map, pooled from several, or the draws of either.
+
+    Parameters
+    ----------
+    kind
+        ``"estimate"``, ``"pooled"`` or ``"posterior"``.
+    digest
+        SHA-256 of the estimate's content.
+    maps
+        SHA-256 of the maps that it was made from; empty where the file does not tell.
+    cautions
+        What may put the size outside its interval, as the report's first lines say it.
+    """
+
+    path: Path
+    kind: str
+    digest: str
+    document: Mapping[str, Any]
+    findings: tuple[Finding, ...]
+    maps: tuple[str, ...]
+    facts: Facts
+    cautions: tuple[str, ...] = ()
+
+    @property
+    def sized(self) -> bool:
+        """Whether any mass has a size."""
+        return any(one.largest is not None for one in self.findings)
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Origin of the estimate."""
+        found: Mapping[str, Any] = self.document["provenance"]
+        return found
+
+    @property
+    def method_words(self) -> str:
+        """Method and calibration in a phrase."""
+        settings = self.provenance.get("settings")
+        said = settings if isinstance(settings, Mapping) else {}
+        calibration = said.get("size_calibration") or said.get("calibration") or "as shipped"
+        return plain_line(f"method {said.get('method') or 'unknown'}, size calibration {calibration}")
+
+    @property
+    def version(self) -> str:
+        """Version of the program that made it; empty where the file does not tell."""
+        return plain_line(str(self.provenance.get("version") or ""))
+
+
+def plain_line(text: str) -> str:
+    """A text from a file in one line of printable characters, of bounded length."""
+    line = " ".join("".join(one if one.isprintable() else " " for one in text).split())
+    return line if len(line) <= _MOST_TEXT else f"{line[:_MOST_TEXT]}..."
+
+
+def read_exam(path: Path) -> MapFile | list[EstimateFile]:
+    """Read a file of this program, whichever kind it is; a list of estimates gives several.
+
+    Raises
+    ------
+    BadDataError
+        When it is neither a map nor an estimate nor a posterior, or is damaged.
+    """
+    with open_input(path) as file:
+        head = file.read(8)
+    if head.startswith(HDF5_MAGIC):
+        with open_netcdf(path, way_out=_WAY_OUT) as file:
+            group = file.group("posterior")
+            attributes = None if group is None else group.attributes()
+        return _read_map(path) if attributes is None else [_read_posterior(path, attributes)]
+    if not head.lstrip().startswith((b"{", b"[")):
+        from tactile_bayes.files.kinds import kind_of
+
+        kind = kind_of(path) or ("none of these" if head else "empty")
+        raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
+    document = load_json(path, way_out=_WAY_OUT)
+    listed = document if isinstance(document, list) else [document]
+    if not listed:
+        raise BadDataError("is an empty list", way_out=_WAY_OUT, path=str(path))
+    return [_of_document(one, path) for one in listed]
+
+
+def _read_map(path: Path) -> MapFile:
+    from tactile_bayes.files.map_nc import read_map_and_scans
+
+    tactile_map, scans = read_map_and_scans(path)
+    return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
+
+
+def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """What all scans say alike of the exam; where they differ or one is silent, nothing is said."""
+    listed = list(scans)
+    if not listed:
+        return {}
+    first = listed[0]
+    return {
+        name: first[name]
+        for name in EXAM_FACTS
+        if name in first and all(one.get(name) == first[name] for one in listed)
+    }
+
+
+def _of_document(document: object, path: Path) -> EstimateFile:
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if not isinstance(document, dict) or not isinstance(schema, str) or schema not in _SCHEMAS:
+        from tactile_bayes.files.kinds import schema_kind
+
+        raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
+    check_document(document, _SCHEMAS[schema], path=path)
+    kind = schema.split("/")[1]
+    text = json.dumps(document, sort_keys=True)
+    return EstimateFile(
+        path,
+        kind,
+        hashlib.sha256(text.encode()).hexdigest(),
+        document,
+        findings_of(document),
+        _map_digests(document["provenance"]),
+        shared_facts(scans_of(document["provenance"])),
+        tuple(_cautions(document)),
+    )
+
+
+def findings_of(document: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """The masses of an estimate's JSON object: those that it lists, or the one that it is of."""
+    listed = document.get("masses") or ({"number": 1, **document},)
+    return tuple(_finding(one) for one in listed)
+
+
+def _finding(mass: Mapping[str, Any]) -> Finding:
+    code = "" if mass["max_size_mm"] else mass.get("reason_code") or "no size"
+    return Finding(
+        int(mass["number"]),
+        mass["max_size_mm"],
+        mass["min_size_mm"],
+        code,
+        plain_line(mass["reason"]) if code else "",
+        mass.get("detected_probability"),
+        _point(mass.get("centre_mm")),
+        _point(mass.get("centre_patient_mm")),
+        _another_exam(mass.get("another_exam")),
+    )
+
+
+def _point(point: Mapping[str, Any] | None) -> tuple[float, float] | None:
+    """x and y in mm; of a quantity its median."""
+    if point is None or point["x"] is None or point["y"] is None:
+        return None
+    x, y = (point[axis]["median"] if isinstance(point[axis], Mapping) else point[axis] for axis in "xy")
+    return float(x), float(y)
+
+
+def _another_exam(another: Mapping[str, Any] | None) -> str:
+    size = another["max_size_mm"] if another else None
+    if another is None or size is None:
+        return ""
+    ends = "{probability:.0%} interval {low:.1f} to {high:.1f} mm".format(**size)
+    return f"If exams differ by {100 * another['between_map_sd']:.0f} %: largest size {size['median']:.1f} mm, {ends}"
+
+
+def _cautions(document: Mapping[str, Any]) -> Iterable[str]:
+    """The report's cautions, which go wherever the size goes."""
+    diagnostics = document.get("diagnostics", {})
+    for text in (*_texts(document.get("outside_calibration")), *_texts(diagnostics.get("outside_calibration"))):
+        yield f"outside the calibration's range: {text}"
+    yield from _texts(diagnostics.get("broken_assumptions"))
+    for i, one in enumerate(document.get("maps", ()), start=1):
+        yield from (f"map {i}: {text}" for text in _texts(one["broken_assumptions"]))
+        if one["outlying"]:
+            yield f"map {i} lies apart from the others"
+    if document.get("fat_apart_mm"):
+        yield "the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(
+            *document["fat_apart_mm"]
+        )
+
+
+def _texts(value: object) -> list[str]:
+    return [plain_line(text) for text in value if isinstance(text, str)] if isinstance(value, list) else []
+
+
+def _map_digests(provenance: object) -> tuple[str, ...]:
+    inputs = provenance.get("inputs") if isinstance(provenance, dict) else None
+    if not isinstance(inputs, list):
+        return ()
+    known = [one for one in inputs if isinstance(one, dict) and isinstance(one.get("sha256"), str)]
+    return tuple(one["sha256"] for one in known if str(one.get("role", "")).startswith("map"))
+
+
+def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
+    """Sizes of a posterior's draws, with the interval of the estimate that wrote them."""
+    from tactile_bayes.files.posterior_nc import read_posterior
+    from tactile_bayes.inference.summary import summarise
+
+    held = read_posterior(path)
+    provenance = parse_json(attributes.get("provenance", "{}"), name="provenance")
+    if not isinstance(provenance, dict):
+        raise BadDataError("has no provenance", way_out=_WAY_OUT, path=str(path))
+    settings = provenance.get("settings")
+    probability = settings.get("interval", 0.95) if isinstance(settings, dict) else 0.95
+    if not isinstance(probability, float) or not 0 < probability < 1:
+        raise BadDataError(f"its interval is {probability!r}", way_out=_WAY_OUT, path=str(path))
+    sizes: dict[str, Any] = dict.fromkeys(_SIZES)
+    if all(name in held.draws for name in _SIZES):
+        sizes = {name: summarise(held.draws[name], probability=probability).as_dict() for name in _SIZES}
+    reason = "" if sizes["max_size_mm"] else "the draws are of widths only"
+    document = {"provenance": provenance, **sizes, "diagnostics": held.diagnostics}
+    finding = Finding(1, sizes["max_size_mm"], sizes["min_size_mm"], "no size" if reason else "", reason)
+    facts = shared_facts(scans_of(provenance))
+    maps = _map_digests(provenance)
+    return EstimateFile(path, "posterior", sha256(path), document, (finding,), maps, facts, tuple(_cautions(document)))
+
+
+def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> None:
+    """Refuse maps and estimates of which one was not made from the other.
+
+    Raises
+    ------
+    UsageError
+        Naming both files.
+    """
+    for estimate in estimates:
+        for one in maps:
+            if not estimate.maps:
+                raise UsageError(
+                    f"{estimate.path} does not say which map it is of; estimate the file: "
+                    f"`tactile-bayes estimate {one.path} --json`"
+                )
+            if one.digest not in estimate.maps:
+                raise UsageError(
+                    f"{estimate.path} is not an estimate of {one.path} (the SHA-256 of its map differs); "
+                    f"make it again: `tactile-bayes estimate {one.path} --json`"
+                )
+        missing = len(set(estimate.maps) - {one.digest for one in maps})
+        if maps and missing:
+            raise UsageError(
+                f"{estimate.path} is of {len(estimate.maps)} maps, and {missing} of them are not given; give all"
+            )

@@ -1,0 +1,228 @@
+"""An estimate as a FHIR R4 Bundle: a DiagnosticReport with an Observation for each size of each mass."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from typing import Any, Final
+
+from tactile_bayes import __version__
+from tactile_bayes.export import codes
+from tactile_bayes.export.codes import FHIR_SYSTEMS, Code
+from tactile_bayes.export.exam import EstimateFile, Finding
+from tactile_bayes.export.extras import required
+from tactile_bayes.export.identity import Identity
+from tactile_bayes.export.uids import content_uuid
+from tactile_bayes.files.schema import dump_json
+from tactile_bayes.presets import RESEARCH_USE
+
+UCUM: Final = "http://unitsofmeasure.org"
+CONFIDENCE_INTERVAL: Final = "http://hl7.org/fhir/StructureDefinition/quantity-confidenceInterval"
+ABSENT: Final = "http://terminology.hl7.org/CodeSystem/data-absent-reason"
+_CATEGORY: Final = "http://terminology.hl7.org/CodeSystem/observation-category"
+_GENDERS: Final = {"F": "female", "M": "male", "O": "other"}
+_STATUS: Final = "preliminary"
+"""Nobody has verified what the program found."""
+_XHTML: Final = "http://www.w3.org/1999/xhtml"
+
+
+def bundle_json(estimate: EstimateFile, identity: Identity) -> str:
+    """The Bundle as JSON, checked by the models of fhir.resources.
+
+    Raises
+    ------
+    UsageError
+        When the extra is not installed.
+    """
+    bundle = bundle_of(estimate, identity)
+    # R4B has all resources used here as R4 has them; the package's R4 ended with its version 6
+    required("fhir.resources.R4B.bundle").Bundle.model_validate(bundle)
+    return dump_json(bundle)
+
+
+def bundle_of(estimate: EstimateFile, identity: Identity) -> dict[str, Any]:
+    """The Bundle as plain data: patient (if any is named), device, observations, report."""
+    exam = _Exam(estimate, identity)
+    observations = [one for finding in estimate.findings for one in exam.observations(finding)]
+    patient = [exam.patient()] if exam.patient_url else []
+    resources = [*patient, exam.device(), *observations, exam.report(observations)]
+    entries = [{"fullUrl": exam.url_of(one), "resource": one} for one in resources]
+    identifier = {"system": "urn:ietf:rfc:3986", "value": exam.url("bundle")}
+    head = {"resourceType": "Bundle", "id": exam.id("bundle"), "identifier": identifier, "type": "collection"}
+    return {**head, "entry": entries}
+
+
+class _Exam:
+    """One estimate of one patient, whose resources refer to each other by identifiers from their content."""
+
+    def __init__(self, estimate: EstimateFile, identity: Identity) -> None:
+        self.estimate, self.identity = estimate, identity
+        self.key = (__version__, estimate.digest, *(f"{k}={v}" for k, v in sorted(identity.given.items())))
+        person = ("patient_id", "issuer", "patient_name", "birth_date", "sex")
+        self.patient_url = self.url("patient") if any(name in identity.given for name in person) else ""
+
+    def id(self, role: str) -> str:
+        """Logical identifier of a resource."""
+        return str(content_uuid(role, *self.key))
+
+    def url(self, role: str) -> str:
+        """Reference to a resource of the bundle."""
+        return f"urn:uuid:{self.id(role)}"
+
+    @staticmethod
+    def url_of(resource: Mapping[str, Any]) -> str:
+        """The full URL of a resource."""
+        return f"urn:uuid:{resource['id']}"
+
+    def patient(self) -> dict[str, Any]:
+        """The patient, by what was given."""
+        given = self.identity
+        found: dict[str, Any] = {"resourceType": "Patient", "id": self.id("patient")}
+        if given.patient_id:
+            issuer = {"assigner": {"display": given.issuer}} if given.issuer else {}
+            found["identifier"] = [{"value": given.patient_id} | issuer]
+        if given.patient_name:
+            found["name"] = [_human_name(given.patient_name)]
+        if given.sex:
+            found["gender"] = _GENDERS[given.sex]
+        if given.birth_date:
+            found["birthDate"] = given.birth_date
+        return found
+
+    def device(self) -> dict[str, Any]:
+        """The program."""
+        return {
+            "resourceType": "Device",
+            "id": self.id("device"),
+            "deviceName": [{"name": "tactile-bayes", "type": "model-name"}],
+            "version": [{"value": __version__}],
+            "note": [{"text": RESEARCH_USE}],
+        }
+
+    def _common(self) -> dict[str, Any]:
+        """What report and observations share."""
+        found: dict[str, Any] = {"status": _STATUS}
+        if self.patient_url:
+            found["subject"] = {"reference": self.patient_url}
+        if self.identity.study:
+            found["effectiveDateTime"] = self.identity.study.fhir
+        return found
+
+    def observations(self, finding: Finding) -> Iterator[dict[str, Any]]:
+        """Largest and smallest size of a mass, and the probability of a lump."""
+        n = finding.number
+        sizes = (("largest", codes.LONG_AXIS, finding.largest), ("smallest", codes.SHORT_AXIS, finding.smallest))
+        for word, code, size in sizes:
+            text = f"{word.capitalize()} size of the lump"
+            value = _size(size) if size is not None else _absent(finding)
+            yield self._observation(f"{word} {n}", _concept(code, text=text), finding) | value
+        if finding.probability is not None:
+            percent = _quantity(float(f"{100 * finding.probability:.9g}"), "%", "%")
+            concept = _concept(codes.CERTAINTY, text="Probability of a lump")
+            yield self._observation(f"probability {n}", concept, finding) | {"valueQuantity": percent}
+
+    def _observation(self, role: str, code: dict[str, Any], finding: Finding) -> dict[str, Any]:
+        site = codes.BREASTS.get(self.estimate.facts.get("side", ""))
+        notes = [RESEARCH_USE, *(f"CAUTION: {text}" for text in self.estimate.cautions)]
+        notes += [finding.another_exam] if finding.another_exam else []
+        if len(self.estimate.findings) > 1:
+            notes.append(f"Mass {finding.number} of {len(self.estimate.findings)}")
+        return {
+            "resourceType": "Observation",
+            "id": self.id(role),
+            **self._common(),
+            "category": [{"coding": [{"system": _CATEGORY, "code": "imaging", "display": "Imaging"}]}],
+            "code": code,
+            **({"bodySite": _concept(site)} if site else {}),
+            "method": _concept(codes.METHOD, text=self.estimate.method_words),
+            "device": {"reference": self.url("device")},
+            "note": [{"text": text} for text in notes],
+        }
+
+    def report(self, observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """The report, with the same facts as text for people."""
+        lines = list(_lines(self.estimate))
+        accession = self.identity.accession
+        division = "".join(f"<p>{escape(line)}</p>" for line in lines)
+        return {
+            "resourceType": "DiagnosticReport",
+            "id": self.id("report"),
+            "text": {"status": "generated", "div": f'<div xmlns="{_XHTML}">{division}</div>'},
+            "identifier": [{"system": "urn:ietf:rfc:3986", "value": self.url("report")}],
+            **({"basedOn": [_accession(accession)]} if accession else {}),
+            **self._common(),
+            "code": _concept(codes.EXAM),
+            "result": [{"reference": self.url_of(one)} for one in observations],
+            "conclusion": " ".join(lines),
+            "conclusionCode": [_concept(one.outcome) for one in self.estimate.findings],
+        }
+
+
+def _lines(estimate: EstimateFile) -> Iterator[str]:
+    """The report in sentences."""
+    for one in estimate.findings:
+        mass = f"Mass {one.number}: " if len(estimate.findings) > 1 else ""
+        if one.largest is None or one.smallest is None:
+            yield f"{mass}{one.outcome.meaning}. Reason: {one.reason or one.code}."
+            continue
+        ends = "{probability:.0%} credible interval {low:.1f} to {high:.1f} mm"
+        yield f"{mass}Largest size {one.largest['median']:.1f} mm, {ends.format(**one.largest)}."
+        yield f"{mass}Smallest size {one.smallest['median']:.1f} mm, {ends.format(**one.smallest)}."
+        if one.another_exam:
+            yield f"{mass}{one.another_exam}."
+    yield from (f"CAUTION: {text}." for text in estimate.cautions)
+    yield RESEARCH_USE
+
+
+def _concept(code: Code, *, text: str = "") -> dict[str, Any]:
+    coding = {"system": FHIR_SYSTEMS[code.scheme], "code": code.value, "display": code.meaning}
+    return {"coding": [coding], "text": text or code.meaning}
+
+
+def _quantity(value: float, unit: str, code: str) -> dict[str, Any]:
+    return {"value": value, "unit": unit, "system": UCUM, "code": code}
+
+
+def _size(size: Mapping[str, Any]) -> dict[str, Any]:
+    """The median as the value, with its interval by HL7's extension and, for readers without it, as components."""
+    low, high = (_quantity(size[end], "mm", "mm") for end in ("low", "high"))
+    percent = float(f"{100 * size['probability']:.9g}")
+    parts = [
+        {"url": "confidence", "valueDecimal": percent},
+        {"url": "interval", "valueRange": {"low": low, "high": high}},
+    ]
+    extension = [{"url": CONFIDENCE_INTERVAL, "extension": parts}]
+    probability = _quantity(percent, "%", "%")
+    components = (
+        (codes.INTERVAL_LOW, low),
+        (codes.INTERVAL_HIGH, high),
+        (codes.INTERVAL_PROBABILITY, probability),
+    )
+    return {
+        "valueQuantity": {"extension": extension, **_quantity(size["median"], "mm", "mm")},
+        "component": [{"code": _concept(code), "valueQuantity": value} for code, value in components],
+    }
+
+
+def _absent(finding: Finding) -> dict[str, Any]:
+    """Why there is no value."""
+    unknown = finding.outcome is codes.NOT_SIZED
+    code = ("unknown", "Unknown") if unknown else ("not-applicable", "Not Applicable")
+    coding = {"system": ABSENT, "code": code[0], "display": code[1]}
+    return {"dataAbsentReason": {"coding": [coding], "text": finding.reason or finding.outcome.meaning}}
+
+
+def _accession(number: str) -> dict[str, Any]:
+    """Reference to the order by its accession number."""
+    coding = {"system": "http://terminology.hl7.org/CodeSystem/v2-0203", "code": "ACSN", "display": "Accession ID"}
+    return {"identifier": {"type": {"coding": [coding]}, "value": number}}
+
+
+def _human_name(name: str) -> dict[str, Any]:
+    """A name of DICOM, FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, as FHIR has it; of its first group."""
+    family, given, middle, prefix, suffix = (*name.split("=")[0].split("^"), "", "", "", "", "")[:5]
+    found: dict[str, Any] = {"family": family} if family else {}
+    for key, words in (("given", (given, middle)), ("prefix", (prefix,)), ("suffix", (suffix,))):
+        if any(words):
+            found[key] = [word for word in words if word]
+    return found

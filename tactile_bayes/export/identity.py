@@ -1,0 +1,180 @@
+"""Who was examined, and when: only what the user or a worklist says, checked against what the formats can hold."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Final
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.records import dataclass
+
+SEXES: Final = ("F", "M", "O")
+_MOMENT: Final = re.compile(
+    r"(\d{4})-(\d{2})-(\d{2})(?:[T ](\d{2}):(\d{2})(?::(\d{2}))?(Z|[+-]\d{2}:\d{2})?)?", re.ASCII
+)
+_UID: Final = re.compile(r"(0|[1-9]\d*)(\.(0|[1-9]\d*))+", re.ASCII)
+# Most characters of a value (PS3.5 6.2: LO, SH); a name's is of each of its groups.
+_LONGEST: Final = {"patient_id": 64, "issuer": 64, "accession": 16, "study_id": 16, "study_description": 64}
+_NAMES: Final = ("patient_name", "referring_physician")
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A date, with the time of day and its zone where they are known.
+
+    Parameters
+    ----------
+    date
+        ``YYYYMMDD``.
+    time
+        ``HHMM`` or ``HHMMSS``; empty where unknown.
+    zone
+        ``+HHMM`` or ``-HHMM``; empty where unknown.
+    """
+
+    date: str
+    time: str = ""
+    zone: str = ""
+
+    @classmethod
+    def of(cls, text: str, *, name: str) -> Moment:
+        """Read ``YYYY-MM-DD``, or ``YYYY-MM-DDTHH:MM[:SS]`` with ``Z`` or ``+HH:MM`` behind it if it is known.
+
+        Raises
+        ------
+        UsageError
+            Naming what the text was given for.
+        """
+        found = _MOMENT.fullmatch(text)
+        way_out = "give YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if you know it"
+        if found is None:
+            raise UsageError(f"{name} is {_short(text)}; {way_out}")
+        year, month, day, hour, minute, second, zone = found.groups()
+        try:
+            datetime.datetime(int(year), int(month), int(day), int(hour or 0), int(minute or 0), int(second or 0))
+        except ValueError as error:
+            raise UsageError(f"{name} is {_short(text)}: {error}; {way_out}") from None
+        zone = "+00:00" if zone == "Z" else zone or ""
+        if zone and not (int(zone[1:3]) <= 14 and int(zone[4:]) < 60):
+            raise UsageError(f"{name} is {_short(text)}: no time zone is {zone} from UTC; {way_out}")
+        return cls(f"{year}{month}{day}", f"{hour or ''}{minute or ''}{second or ''}", zone.replace(":", ""))
+
+    @property
+    def iso_date(self) -> str:
+        """``YYYY-MM-DD``."""
+        return f"{self.date[:4]}-{self.date[4:6]}-{self.date[6:]}"
+
+    @property
+    def fhir(self) -> str:
+        """Date and time of FHIR, which takes a time of day only with its zone and its seconds; otherwise the date."""
+        if not (self.time and self.zone):
+            return self.iso_date
+        seconds = self.time[4:] or "00"
+        return f"{self.iso_date}T{self.time[:2]}:{self.time[2:4]}:{seconds}{self.zone[:3]}:{self.zone[3:]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Identity of patient and study; empty where nobody gave it.
+
+    Parameters
+    ----------
+    patient_id, issuer
+        Patient ID and who issued it.
+    patient_name, referring_physician
+        As ``FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX``.
+    birth_date
+        ``YYYY-MM-DD``.
+    sex
+        ``F``, ``M`` or ``O``.
+    accession, study_id, study_description, study_uid
+        Of the study.
+    study_date, content_date
+        When the exam was, and when its content was made (as the exam where it is not given); see `Moment.of`.
+    """
+
+    patient_id: str = ""
+    patient_name: str = ""
+    birth_date: str = ""
+    sex: str = ""
+    issuer: str = ""
+    accession: str = ""
+    referring_physician: str = ""
+    study_id: str = ""
+    study_description: str = ""
+    study_uid: str = ""
+    study_date: str = ""
+    content_date: str = ""
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            _check_text(one.name, getattr(self, one.name))
+        for name in _NAMES:
+            _check_name(name, getattr(self, name))
+        if self.sex not in ("", *SEXES):
+            raise UsageError(f"sex is {_short(self.sex)}; give one of {', '.join(SEXES)}, or nothing")
+        if self.study_uid and (len(self.study_uid) > 64 or not _UID.fullmatch(self.study_uid)):
+            raise UsageError(
+                f"study_uid is {_short(self.study_uid)}; give numbers with points between, at most 64 characters"
+            )
+        for name in ("birth_date", "study_date", "content_date"):
+            if text := getattr(self, name):
+                moment = Moment.of(text, name=name)
+                if name == "birth_date" and moment.time:
+                    raise UsageError(f"birth_date is {_short(text)}; give YYYY-MM-DD")
+
+    @property
+    def given(self) -> dict[str, str]:
+        """What was given, by name."""
+        return {one.name: value for one in fields(self) if (value := getattr(self, one.name))}
+
+    @property
+    def study(self) -> Moment | None:
+        """When the exam was."""
+        return Moment.of(self.study_date, name="study_date") if self.study_date else None
+
+    @property
+    def content(self) -> Moment | None:
+        """When the content was made: by default when the exam was."""
+        return Moment.of(self.content_date, name="content_date") if self.content_date else self.study
+
+    def with_options(self, options: Mapping[str, str]) -> Identity:
+        """The identity with what the command line gives besides.
+
+        Raises
+        ------
+        UsageError
+            When an option contradicts the worklist.
+        """
+        for name, value in options.items():
+            known = getattr(self, name)
+            if known and known != value:
+                raise UsageError(
+                    f"{name} is {_short(value)} by the option and {_short(known)} in the worklist; leave one out"
+                )
+        return replace(self, **dict(options))
+
+
+def _check_text(name: str, value: str) -> None:
+    if not value.isprintable() or "\\" in value:
+        raise UsageError(
+            f"{name} is {_short(value)}; leave out backslashes, line ends and other characters that cannot be printed"
+        )
+    if value != value.strip():
+        raise UsageError(f"{name} is {_short(value)}; leave out the blanks around it")
+    longest = _LONGEST.get(name)
+    if longest is not None and len(value) > longest:
+        raise UsageError(f"{name} has {len(value)} characters; at most {longest} fit")
+
+
+def _check_name(name: str, value: str) -> None:
+    groups = value.split("=")
+    if len(groups) > 3 or any(len(group) > 64 or group.count("^") > 4 for group in groups):
+        raise UsageError(f"{name} is {_short(value)}; give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters")
+
+
+def _short(value: str) -> str:
+    return repr(value if len(value) <= 60 else value[:57] + "...")

@@ -1,0 +1,70 @@
+"""Place of a map in the coordinate system of DICOM and 3D Slicer: L, P, S in mm from the xiphoid.
+
+The program's `patient` frame has x to the patient's right, y from the xiphoid to the sternal notch and z into the body.
+L, P, S are -x, z, y. Two landmarks and the normal of the scanned skin define it, no scanner: its origin is the xiphoid,
+and its turn about the long axis of the body follows the skin, so that on the side of the breast P leans towards it.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray, apply
+from tactile_bayes.mapping.orientation import orientation_of
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.records import dataclass
+
+LPS_FROM_PATIENT: Final[FloatArray] = np.array(
+    [[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+def lps_from_plane(tactile_map: TactileMap) -> FloatArray | None:
+    """(4, 4) transform from the map's plane to L, P, S in mm; None without landmarks."""
+    if tactile_map.patient_from_plane is None:
+        return None
+    transform: FloatArray = LPS_FROM_PATIENT @ tactile_map.patient_from_plane
+    return transform
+
+
+def on_plane(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray:
+    """(3,) place of a point of the map's plane."""
+    return apply(transform, np.array([*point_mm, 0.0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImagePlane:
+    """A map's values as the rows of an image that faces the viewer as every picture of the program does.
+
+    Parameters
+    ----------
+    values : (rows, columns) array
+        Row 0 on top; NaN without data.
+    row_direction, column_direction : (3,) arrays
+        Unit vectors in L, P, S: along a row, and down a column.
+    corner_mm : (3,) array
+        Centre of the first value of the first row.
+    """
+
+    values: FloatArray
+    row_direction: FloatArray
+    column_direction: FloatArray
+    corner_mm: FloatArray
+
+
+def image_plane(tactile_map: TactileMap, transform: FloatArray) -> ImagePlane:
+    """Image of a map's means, placed by a (4, 4) transform from its plane."""
+    view = orientation_of(tactile_map)
+    values = np.where(tactile_map.covered, tactile_map.mean, np.nan)
+    axes = {"x": (tactile_map.x_mm, transform[:3, 0]), "y": (tactile_map.y_mm, transform[:3, 1])}
+    corner, directions = dict[str, float](), list[FloatArray]()
+    for towards, sign in ((view.right, 1.0), (view.up, -1.0)):
+        centres, axis = axes[towards[1]]
+        step = sign if towards[0] == "+" else -sign
+        corner[towards[1]] = float(centres[0] if step > 0 else centres[-1])
+        directions.append(step * axis)
+    shown = np.ascontiguousarray(view.screen(values))
+    along, down = directions
+    return ImagePlane(shown, along, down, on_plane(transform, (corner["x"], corner["y"])))

@@ -1,0 +1,190 @@
+"""What is exported from which files: inputs are told apart by their content, and one line says what does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.export.exam import EstimateFile, MapFile, check_pairs, read_exam
+from tactile_bayes.export.identity import Identity
+from tactile_bayes.records import dataclass
+
+Format = Literal["dicom", "fhir", "nrrd", "csv"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+_EVERYTHING: Final = tuple(Identity().__dataclass_fields__)
+TAKES: Final[dict[Format, tuple[str, ...]]] = {
+    "dicom": _EVERYTHING,
+    "fhir": ("patient_id", "patient_name", "birth_date", "sex", "issuer", "accession", "study_date"),
+    "nrrd": (),
+    "csv": ("patient_id", "study_date"),
+}
+"""Which parts of an identity each format holds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exported:
+    """Files of an export.
+
+    Parameters
+    ----------
+    files
+        Bytes by file name, for a folder; one file has the empty name.
+    notes
+        What a user should know of them, one line each.
+    """
+
+    files: dict[str, bytes]
+    notes: tuple[str, ...] = ()
+
+
+def refuse_untaken(to: Format, options: Iterable[str]) -> None:
+    """Refuse parts of an identity that a format does not hold, rather than drop them.
+
+    Raises
+    ------
+    UsageError
+        Naming the first one's option.
+    """
+    for name in options:
+        if name not in TAKES[to]:
+            taken = ", ".join(_option(one) for one in TAKES[to]) or "nothing of a patient or study"
+            raise UsageError(f"{_option(name)} has no place in {to} files; they hold {taken}")
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def export(paths: Sequence[Path], *, to: Format, identity: Identity, id_from_scan: bool = False) -> Exported:
+    """Export maps and estimates.
+
+    Parameters
+    ----------
+    paths
+        Maps, estimates (JSON) and posteriors, in any order.
+    identity
+        Of patient and study; what the format does not hold is left out.
+    id_from_scan
+        Take the subject code of the scans for the patient ID where none is given.
+
+    Raises
+    ------
+    UsageError
+        When the files do not fit the format or each other, or something that the format needs is missing.
+    BadDataError
+        When a file is damaged or of another kind.
+    """
+    maps, estimates = _sorted(paths)
+    check_pairs(maps, estimates)
+    given = {name: value for name, value in identity.given.items() if name in TAKES[to]}
+    if to == "csv":
+        return _csv(maps, estimates, Identity(**given), id_from_scan=id_from_scan)
+    if to == "nrrd":
+        return _nrrd(maps, estimates, id_from_scan=id_from_scan)
+    who = Identity(**given)
+    who = _with_subject(who, [*maps, *estimates]) if id_from_scan else who
+    return _dicom(maps, estimates, who) if to == "dicom" else _fhir(maps, estimates, who)
+
+
+def _sorted(paths: Sequence[Path]) -> tuple[list[MapFile], list[EstimateFile]]:
+    maps, estimates = list[MapFile](), list[EstimateFile]()
+    for path in paths:
+        found = read_exam(path)
+        if isinstance(found, MapFile):
+            maps.append(found)
+        else:
+            estimates.extend(found)
+    _refuse_twice([(one.path, one.digest) for one in maps])
+    _refuse_twice([(one.path, one.digest) for one in estimates])
+    return maps, estimates
+
+
+def _refuse_twice(files: Sequence[tuple[Path, str]]) -> None:
+    seen = dict[str, Path]()
+    for path, digest in files:
+        if digest in seen:
+            raise UsageError(f"{path} holds what {seen[digest]} holds; give each once")
+        seen[digest] = path
+
+
+def _with_subject(identity: Identity, files: Sequence[MapFile | EstimateFile]) -> Identity:
+    if identity.patient_id:
+        return identity
+    subjects = {one.facts.get("subject", "") for one in files}
+    if len(subjects) != 1 or "" in subjects:
+        raise UsageError("the scans name no subject, or several; give --patient-id instead of --patient-id-from-scan")
+    return replace(identity, patient_id=subjects.pop())
+
+
+def _no_patient(identity: Identity) -> list[str]:
+    if identity.patient_id:
+        return []
+    return ["the patient ID is empty; --patient-id, --worklist or --patient-id-from-scan gives one"]
+
+
+def _one_estimate(estimates: Sequence[EstimateFile], to: Format) -> EstimateFile:
+    if len(estimates) > 1:
+        where = f"{estimates[0].path} holds" if len({one.path for one in estimates}) == 1 else "the files hold"
+        raise UsageError(f"{where} {len(estimates)} estimates; {to} takes one exam at a time (csv takes several)")
+    return estimates[0]
+
+
+def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
+    from tactile_bayes.export.dicom import VALUES, dicom_files
+
+    if not maps:
+        raise UsageError(f"a DICOM report refers to its map; give it too: export MAP.nc {estimates[0].path} --to dicom")
+    estimate = _one_estimate(estimates, "dicom") if estimates else None
+    if estimate is None and len(maps) > 1:
+        raise UsageError("several maps without an estimate may be of several exams; give one map, or their pooled size")
+    files = dicom_files(maps, estimate, identity=identity)
+    notes = _no_patient(identity)
+    if estimate is None:
+        one = maps[0].path
+        notes.append(f"no estimate was given, so there is no report; `tactile-bayes estimate {one} --json` makes one")
+    if not any(name.startswith(VALUES) for name in files):
+        why = "no landmarks" if maps[0].tactile_map.patient_from_plane is None else "no posture of a person"
+        notes.append(f"the map has {why}, so its values have no place in a patient: there is its picture only")
+    return Exported(files, tuple(notes))
+
+
+def _fhir(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
+    from tactile_bayes.export.fhir import bundle_json
+
+    _refuse_maps(maps, estimates, "fhir")
+    text = bundle_json(_one_estimate(estimates, "fhir"), identity)
+    return Exported({"": text.encode()}, tuple(_no_patient(identity)))
+
+
+def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to: Format) -> None:
+    if maps and not estimates:
+        one = maps[0].path
+        raise UsageError(
+            f"{to} files hold sizes, and {one} is a map; give what `tactile-bayes estimate {one} --json` prints"
+        )
+    if maps:
+        raise UsageError(f"{to} files hold no map; leave out {maps[0].path}")
+
+
+def _nrrd(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], *, id_from_scan: bool) -> Exported:
+    from tactile_bayes.export.nrrd_map import nrrd_bytes
+
+    if id_from_scan:
+        raise UsageError("nrrd files hold no patient; leave out --patient-id-from-scan")
+    if estimates:
+        raise UsageError(f"nrrd files hold a map; {estimates[0].path} is none")
+    if len(maps) > 1:
+        raise UsageError("a nrrd file holds one map; give one")
+    return Exported({"": nrrd_bytes(maps[0])})
+
+
+def _csv(
+    maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity, *, id_from_scan: bool
+) -> Exported:
+    from tactile_bayes.export.redcap import records_csv
+
+    _refuse_maps(maps, estimates, "csv")
+    return Exported({"": records_csv(estimates, identity, id_from_scan=id_from_scan).encode()})

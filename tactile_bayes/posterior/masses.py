@@ -1,0 +1,185 @@
+"""All masses of a map: each with its place, its probability and its size, or the reason for none.
+
+The lump that a search finds is estimated first. What else rises on the map, and a second lump in that lump's window,
+is then estimated as if its place had been given: with the other lump in its scene where it lies in the window. Where
+that finds no lump there, the map less the first lump decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.lump.cells import SMOOTHING_MM
+from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.other_rises import other_rises, without
+from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
+
+OF_A_LUMP = ("seat", "depth_mm", "stiffness_ratio")
+"""Known properties that are of one lump, not of the whole body."""
+FLANK_IN_WIDTHS = 2.5
+LEAST_SHARE = 0.15
+"""Of the first lump's amplitude, for a size from the map less the first lump: of two with less, 21 mm from a lump 13
+times as high, one came out twice as large as it was, and what a lump leaves of itself is some per cent of it."""
+BOTH = "scan again with more lines over both"
+Estimator = Callable[[TactileMap, EstimateOptions], Estimate]
+
+
+def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptions, estimator: Estimator) -> Estimate:
+    """Find and size all masses of a map; returns the estimate of the largest one, with all in `masses`.
+
+    The estimate of the place that was given is kept where one was, and of the first lump where properties of a lump are
+    known: they are of that lump.
+
+    Parameters
+    ----------
+    first
+        What `estimator` gives for the map and the options.
+    estimator
+        `estimate_map` with its calibration and random numbers.
+    """
+    found = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
+    others = _others_options(options)
+    rises = [*other_rises(tactile_map, first, options)]
+    for rise in [*_in_scene(first), *rises]:
+        mass = _sized_at(tactile_map, rise, first, others, estimator)
+        if mass is None and rise not in rises:
+            mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _hidden(rise))
+        if mass is not None and all(_apart(mass, one) for one in found):
+            found.append(mass)
+    found.sort(key=lambda one: (-(one.largest_mm or 0.0), -_amplitude(one.estimate)))
+    kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
+    reported = first if kept or not found or found[0].largest_mm is None else found[0].estimate
+    masses = tuple(replace(one, reported=one.estimate is reported) for one in found)
+    beside = tuple(_rise(one, masses) for one in masses if not one.reported)
+    return replace(reported, candidates=first.candidates, masses=masses, other_rises=beside)
+
+
+def _apart(one: Mass, other: Mass) -> bool:
+    """Whether two masses are not the same, found twice."""
+    return bool(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm) > 2 * SMOOTHING_MM)
+
+
+def _probability(estimate: Estimate) -> float:
+    return 0.0 if estimate.detection is None else estimate.detection.probability
+
+
+def _place(estimate: Estimate) -> tuple[float, float]:
+    """Centre in `plane`: of the posterior where there is one."""
+    posterior = estimate.map_posterior
+    if posterior is not None:
+        return float(np.median(posterior.x_mm)), float(np.median(posterior.y_mm))
+    assert estimate.bump is not None
+    return estimate.bump.x_mm, estimate.bump.y_mm
+
+
+def _amplitude(estimate: Estimate) -> float:
+    assert estimate.bump is not None
+    return estimate.bump.amplitude
+
+
+def _others_options(options: EstimateOptions) -> EstimateOptions:
+    """Options for the masses besides the first: what is known of a lump is of the first, and so is a checkpoint."""
+    known = {name: value for name, value in options.size_priors.known.items() if name not in OF_A_LUMP}
+    return replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
+
+
+def _in_scene(first: Estimate) -> list[Rise]:
+    """The second lump of the first one's scene, if the evidence put it there."""
+    choice = first.scene
+    if choice is None or choice.fit.scene.extra != "second lump":
+        return []
+    (asked,) = (one for one in choice.structures if one.name == "second lump")
+    if not asked.supported:
+        return []
+    x, y, log_width = (float(value) for value in choice.fit.mode[-3:])
+    width = float(np.exp(log_width))
+    return [Rise(x, y, None, 0.0, width, width, asked.odds / (1.0 + asked.odds))]
+
+
+def _sized_at(
+    tactile_map: TactileMap, rise: Rise, first: Estimate, options: EstimateOptions, estimator: Estimator
+) -> Mass | None:
+    """The mass at a rise: by the whole map if it shows a lump there, else by the map less the first lump.
+
+    None where neither shows a lump.
+    """
+    given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
+    found = _estimated(tactile_map, given, estimator)
+    near = first.map_posterior is not None and _reaches(first, rise, options)
+    if first.map_posterior is not None and near and not _stays(found, rise, first):
+        # frames felt both lumps, whatever is taken off the cells
+        less = _estimated(replace(without(tactile_map, first.map_posterior), frames=None), given, estimator)
+        found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
+    if found.code == "undetected":
+        return None
+    if _stays(found, rise, first):
+        return Mass(*_place(found), max(rise.probability, _probability(found)), found)
+    return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(_no_size(found), bump=_bump_of(rise)))
+
+
+def _estimated(tactile_map: TactileMap, options: EstimateOptions, estimator: Estimator) -> Estimate:
+    """An estimate; where the method asked for does not converge the reason for none, for the first lump has its own."""
+    try:
+        return estimator(tactile_map, options)
+    except NotConvergedError as error:
+        return Estimate("no_estimate", f"no method converged: {error}", code="method")
+
+
+def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
+    """Whether an estimate is of the lump at a rise, and did not move towards the first lump."""
+    if found.map_posterior is None or first.bump is None:
+        return found.map_posterior is not None
+    moved, apart = ((np.hypot(x - rise.x_mm, y - rise.y_mm)) for x, y in (_place(found), _place(first)))
+    return bool(moved < apart / 2.0)
+
+
+def _reaches(first: Estimate, rise: Rise, options: EstimateOptions) -> bool:
+    """Whether the first lump bears on the window of a rise: by its flank, or by the residuals of independent errors."""
+    if not options.fit.correlated:
+        return True
+    assert first.bump is not None
+    away = np.hypot(rise.x_mm - first.bump.x_mm, rise.y_mm - first.bump.y_mm)
+    wide = max(first.bump.sigma_x_mm, first.bump.sigma_y_mm)
+    return bool(away < options.fit.radius_mm + FLANK_IN_WIDTHS * wide)
+
+
+def _stands(found: Estimate, first: Estimate) -> bool:
+    """Whether what is left after the first lump is subtracted is high enough to be sized."""
+    return _amplitude(found) >= LEAST_SHARE * _amplitude(first)
+
+
+def _in_the_flank(found: Estimate) -> Estimate:
+    reason = f"it stands in the flank of a lump more than {1 / LEAST_SHARE:.0f} times as high, which hides its shape"
+    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH)
+
+
+def _no_size(found: Estimate) -> Estimate:
+    """The reason for no size of a mass that is not told from the first lump."""
+    if found.status == "no_estimate":
+        return found
+    reason = "its fit moves to the lump beside it: the map does not tell them apart"
+    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH)
+
+
+def _hidden(rise: Rise) -> Estimate:
+    """A second lump of a scene that is none without that scene."""
+    reason = "the map shows it beside the first lump only, not by itself"
+    return Estimate("no_estimate", reason, code="unresolved", advice=BOTH, bump=_bump_of(rise))
+
+
+def _bump_of(rise: Rise) -> ModalBump:
+    return ModalBump(rise.amplitude, rise.x_mm, rise.y_mm, rise.sigma_x_mm, rise.sigma_y_mm)
+
+
+def _rise(mass: Mass, masses: Sequence[Mass]) -> Rise:
+    """A mass as a rise beside the one that is reported."""
+    bump = mass.estimate.bump
+    assert bump is not None
+    here = next((one for one in masses if one.reported and one.estimate.status == "estimate"), None)
+    away = None if here is None else float(np.hypot(mass.x_mm - here.x_mm, mass.y_mm - here.y_mm))
+    return Rise(mass.x_mm, mass.y_mm, away, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, mass.probability)

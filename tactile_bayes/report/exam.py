@@ -1,0 +1,199 @@
+"""What the page of an exam shows: its maps, the masses on them, and what the scans say of the exam."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.geometry import apply
+from tactile_bayes.mapping.clock_face import ClockPosition, clock_position
+from tactile_bayes.mapping.tactile_map import TactileMap
+
+NOT_SIZED = "not sized"
+Quantity = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExamMass:
+    """One mass on a map.
+
+    Parameters
+    ----------
+    number
+        On the map, from 1.
+    centre_mm
+        x and y in `plane`.
+    axes_mm, angle_deg
+        Diameters of the ellipse along its own axes, and the angle from x to the first; None without a size.
+    largest, smallest, another
+        Largest and smallest size, and the largest if exams differ more, as the estimate's JSON has them; None without.
+    another_sd
+        By how much exams differ for `another`, a share of the size.
+    probability
+        That it is a lump; None where it is not told.
+    place
+        About the nipple; None where that is not known.
+    patient_mm
+        From the xiphoid to the patient's right and up; None without landmarks.
+    why
+        Why there is no size; empty where there is one.
+    """
+
+    number: int
+    centre_mm: tuple[float, float]
+    axes_mm: tuple[float, float] | None = None
+    angle_deg: float = 0.0
+    largest: Quantity | None = None
+    smallest: Quantity | None = None
+    another: Quantity | None = None
+    another_sd: float | None = None
+    probability: float | None = None
+    place: ClockPosition | None = None
+    patient_mm: tuple[float, float] | None = None
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExamMap:
+    """One map of an exam, with the estimate's JSON object and its masses, the reported one first."""
+
+    tactile_map: TactileMap
+    document: Mapping[str, Any]
+    masses: tuple[ExamMass, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exam:
+    """What one page shows.
+
+    Parameters
+    ----------
+    maps
+        The first is drawn large; the others are repeats of it.
+    pooled
+        The JSON object of the size from all maps; None with one map.
+    scans
+        The scans at the beginning, as `Provenance.scans` has them.
+    title, name, day
+        Given for the page; empty where they were not.
+    """
+
+    maps: tuple[ExamMap, ...]
+    pooled: Mapping[str, Any] | None = None
+    scans: Sequence[Mapping[str, str]] = ()
+    title: str = ""
+    name: str = ""
+    day: str = ""
+
+    @property
+    def main(self) -> ExamMap:
+        """The map that is drawn large."""
+        return self.maps[0]
+
+    @property
+    def drawn(self) -> ExamMap:
+        """The map that is drawn large; of several maps its first mass has the pooled size, in its own shape."""
+        if self.pooled is None or self.pooled["max_size_mm"] is None or not self.main.masses:
+            return self.main
+        first, *others = self.main.masses
+        if first.axes_mm is None or first.largest is None:
+            return self.main
+        size = self.pooled["max_size_mm"]
+        along, across = (axis * size["median"] / first.largest["median"] for axis in first.axes_mm)
+        return replace(self.main, masses=(replace(first, axes_mm=(along, across), largest=size), *others))
+
+    @property
+    def figures(self) -> Mapping[str, Any]:
+        """Figures of the size: spread between exams, whether the lump is oval."""
+        document = self.main.document if self.pooled is None else self.pooled
+        found: Mapping[str, Any] = document["diagnostics" if self.pooled is None else "figures"]
+        return found
+
+
+def exam_map(tactile_map: TactileMap, document: Mapping[str, Any], *, side: str) -> ExamMap:
+    """A map with its masses, from what `estimate --json` says of it.
+
+    Parameters
+    ----------
+    side
+        Which breast, as the scans have it.
+    """
+    return ExamMap(tactile_map, document, tuple(_masses(tactile_map, document, side)))
+
+
+def _masses(tactile_map: TactileMap, document: Mapping[str, Any], side: str) -> Iterator[ExamMass]:
+    """The reported mass first, then the others in the JSON's order."""
+    listed = document.get("masses")
+    number = 1
+    if listed:
+        number = next((one["number"] for one in listed if one["reported"]), 1)
+    if document["centre_mm"] is not None:
+        yield _reported(number, tactile_map, document, side)
+    for one in listed or []:
+        if not one["reported"]:
+            yield _listed(one, tactile_map, side)
+    if listed is None:
+        for i, rise in enumerate(document.get("other_rises", []), start=2):
+            centre = (rise["x_mm"], rise["y_mm"])
+            words = {"probability": rise["probability"], "why": NOT_SIZED}
+            yield _placed(i, centre, tactile_map, side, **words)
+
+
+def _reported(number: int, tactile_map: TactileMap, document: Mapping[str, Any], side: str) -> ExamMass:
+    point, angle = document["centre_mm"], document["angle_deg"]
+    sized = document["max_size_mm"] is not None
+    another = document.get("another_exam")
+    return _placed(
+        number,
+        (point["x"]["median"], point["y"]["median"]),
+        tactile_map,
+        side,
+        centre_sd_mm=(point["x"]["sd"], point["y"]["sd"]),
+        axes_mm=(document["d_x_mm"]["median"], document["d_y_mm"]["median"]) if sized else None,
+        angle_deg=0.0 if angle is None else angle["median"],
+        largest=document["max_size_mm"],
+        smallest=document["min_size_mm"],
+        another=None if another is None else another["max_size_mm"],
+        another_sd=None if another is None else another["between_map_sd"],
+        probability=document["detected_probability"],
+        why="" if sized else document["reason"],
+    )
+
+
+def _listed(one: Mapping[str, Any], tactile_map: TactileMap, side: str) -> ExamMass:
+    """A mass besides the reported one; its ellipse's axes are not told, so it is drawn as a circle of its size."""
+    largest, another = one["max_size_mm"], one["another_exam"]
+    return _placed(
+        one["number"],
+        (one["centre_mm"]["x"], one["centre_mm"]["y"]),
+        tactile_map,
+        side,
+        axes_mm=None if largest is None else (largest["median"], largest["median"]),
+        largest=largest,
+        smallest=one["min_size_mm"],
+        another=None if another is None else another["max_size_mm"],
+        another_sd=None if another is None else another["between_map_sd"],
+        probability=one["detected_probability"],
+        why=one["reason"],
+    )
+
+
+def _placed(
+    number: int,
+    centre_mm: tuple[float, float],
+    tactile_map: TactileMap,
+    side: str,
+    *,
+    centre_sd_mm: tuple[float, float] = (0.0, 0.0),
+    **facts: Any,
+) -> ExamMass:
+    patient = None
+    if tactile_map.patient_from_plane is not None:
+        x, y, _ = apply(tactile_map.patient_from_plane, np.array([*centre_mm, 0.0]))
+        patient = (float(x), float(y))
+    covariance = np.diag(np.square(centre_sd_mm))
+    place = clock_position(tactile_map, centre_mm, side=side, covariance_mm2=covariance)
+    return ExamMass(number, centre_mm, place=place, patient_mm=patient, **facts)

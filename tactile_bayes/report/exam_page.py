@@ -1,0 +1,234 @@
+"""An exam as one self-contained page that prints to one side of A4: no script, nothing loaded, every text escaped."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator
+from typing import Final
+
+from tactile_bayes import __version__
+from tactile_bayes.mapping.orientation import orientation_of
+from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.report.exam import Exam, Quantity
+from tactile_bayes.report.exam_dial import breast_dial
+from tactile_bayes.report.exam_picture import Frame, colour_bar, exam_picture, small_pictures
+from tactile_bayes.report.exam_ruler import size_ruler
+from tactile_bayes.report.exam_words import (
+    caution_sentences,
+    detail_sentence,
+    facts,
+    headline,
+    largest,
+    mass_row,
+    narrowing_sentences,
+    nothing_sentences,
+    place_sentence,
+    quality_rows,
+    size_sentences,
+    why_no_clock,
+)
+
+TITLE: Final = "Tactile exam"
+MOST_REPEATS: Final = 5
+MOST_MASSES: Final = 4
+_LONGEST: Final = 400
+_LONGEST_CAUTION: Final = 200
+_PICTURE_MM: Final = (108.0, 96.0)
+_LOWER_MM: Final = 54.0
+"""Height of the picture on a crowded page: one that has both repeats and several masses below it."""
+_REPEAT_MM: Final = (30.0, 19.0)
+_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_STYLE: Final = """
+@page{size:A4 portrait;margin:10mm}
+*{box-sizing:border-box}
+body{font:15px/1.4 system-ui,"Liberation Sans",Arial,sans-serif;color:#111;background:#fff;margin:1rem auto;
+max-width:56rem;padding:0 1rem;overflow-wrap:anywhere}
+h1{font-size:1.05rem;font-weight:600;margin:0}h2{font-size:.95rem;margin:.7rem 0 .2rem;border-bottom:1px solid #bbb}
+p{margin:.2rem 0}.finding{font-size:1.5rem;font-weight:700;line-height:1.25;
+margin:.4rem 0 .3rem}.place{display:flex;flex-wrap:wrap;gap:0 1rem;align-items:center}.place>div{flex:1 1 12rem}
+.facts{display:flex;flex-wrap:wrap;gap:0 1.1rem;margin:.1rem 0}.facts span b{font-weight:600}
+.mark{border:1.5px solid #111;padding:.2rem .5rem;font-weight:600;display:inline-block;margin:.3rem 0}
+.caution{border-left:4px solid #111;padding:.15rem .5rem;margin:.25rem 0;background:#eee}
+.columns{display:flex;flex-wrap:wrap;gap:0 1.2rem}.columns>div{flex:1 1 20rem;min-width:0}
+.picture{text-align:center}.picture svg.map{max-width:100%;height:auto}.small{font-size:.8rem;color:#333}
+table{border-collapse:collapse;width:100%;font-size:.87rem}th{text-align:left;font-weight:600;padding-right:.7rem;
+vertical-align:top;white-space:nowrap}td,th{border-bottom:1px solid #ddd;padding-top:.08rem;padding-bottom:.08rem}
+.masses td{padding-right:.7rem;vertical-align:top}.masses td:last-child{width:42%}
+.repeats{display:flex;flex-wrap:wrap;gap:.4rem .8rem}.repeats figure{margin:0;font-size:.8rem;text-align:center}
+.ruler,.bar,.dial{max-width:100%}svg text{font-family:system-ui,"Liberation Sans",Arial,sans-serif}
+svg image{image-rendering:pixelated}
+@media print{html{font-size:9.2pt}body{font-size:1rem;line-height:1.28;margin:0;padding:0;max-width:none}
+.crowded{font-size:.85rem;line-height:1.2}.crowded h2{margin:.25rem 0 .05rem}.crowded p{margin:.1rem 0}
+.crowded .dial{height:27mm}.crowded .small{font-size:.72rem}
+.columns{flex-wrap:nowrap;gap:0 4mm}.columns>div.figure{flex:0 0 108mm}h2{margin:.45rem 0 .1rem}
+.caution,.mark{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
+"""
+
+
+def exam_page(exam: Exam) -> str:
+    """Full HTML page of an exam; equal exams give equal text."""
+    title = _cut(exam.title, 60) or TITLE
+    parts = [
+        "<!doctype html>",
+        '<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>",
+        '<body class="crowded">' if _crowded(exam) else "<body>",
+        f"<h1>{html.escape(title)}</h1>",
+        *_facts(exam),
+        f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
+        f'<p class="finding">{html.escape(headline(exam))}</p>',
+        *_paragraphs([_cut(text, _LONGEST_CAUTION) for text in caution_sentences(exam)], kind="caution"),
+        '<div class="columns"><div class="figure">',
+        *_picture(exam),
+        *_place(exam),
+        "</div><div>",
+        *_findings(exam),
+        "</div></div>",
+        *_several_masses(exam),
+        *_repeats(exam),
+        *_quality(exam),
+        *_foot(exam),
+        "</body></html>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _cut(text: str, longest: int = _LONGEST) -> str:
+    """A text in one line of at most so many letters."""
+    line = " ".join(text.split())
+    return line if len(line) <= longest else f"{line[: longest - 1]}…"
+
+
+def _paragraphs(sentences: list[str], *, kind: str = "") -> Iterator[str]:
+    named = f' class="{kind}"' if kind else ""
+    for text in sentences:
+        yield f"<p{named}>{html.escape(_cut(text))}</p>"
+
+
+def _facts(exam: Exam) -> Iterator[str]:
+    found = [f"<span><b>{name}</b> {html.escape(_cut(text, 50))}</span>" for name, text in facts(exam)]
+    if found:
+        yield f'<p class="facts">{"".join(found)}</p>'
+
+
+def _crowded(exam: Exam) -> bool:
+    return len(exam.maps) > 1 and len(exam.main.masses) > 1
+
+
+def _picture(exam: Exam) -> Iterator[str]:
+    """The map, as large as it is where the page has room, with its colours and what the lines are."""
+    tactile_map = exam.main.tactile_map
+    height_mm = _LOWER_MM if _crowded(exam) else _PICTURE_MM[1]
+    frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
+    yield f'<div class="picture">{exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")}</div>'
+    yield colour_bar(exam.main)
+    lines = ["Full line: the estimated size; dashed: the ends of its interval."] if largest(exam) is not None else []
+    if not exam.main.masses:
+        lines.append("Crosses: the highest rises, none of which was taken for a lump.")
+    view = orientation_of(tactile_map)
+    sides = "; R, L: the patient's right and left; H: head, F: feet" if view.notch is not None else ""
+    lines.append(f"{view.words[0].upper()}{view.words[1:]}{sides}.")
+    lines += ["Striped: few readings; grey: none."] if tactile_map.counts_known else []
+    size = "Life size" if frame.scale == 1.0 else f"{frame.scale:.2f} of life size"
+    lines.append(f"{size} when printed at 100 %.")
+    yield f'<p class="small">{html.escape(" ".join(lines))}</p>'
+
+
+def _findings(exam: Exam) -> Iterator[str]:
+    size = largest(exam)
+    if size is None:
+        yield from _paragraphs(list(nothing_sentences(exam)))
+        yield from (f'<p class="small">{html.escape(_cut(text))}</p>' for text in [detail_sentence(exam)] if text)
+    else:
+        yield f"<h2>Size{_of_mass(exam)}</h2>"
+        yield size_ruler(_intervals(exam, size))
+        yield from _paragraphs(list(size_sentences(exam)))
+    narrowing = narrowing_sentences(exam)
+    if narrowing:
+        yield "<h2>How sure</h2>"
+        yield from _paragraphs(narrowing)
+
+
+def _of_mass(exam: Exam) -> str:
+    """Which of several masses a section is about."""
+    masses = exam.main.masses
+    return f" of mass {masses[0].number}" if len(masses) > 1 else ""
+
+
+def _place(exam: Exam) -> Iterator[str]:
+    """Where the lump lies, beside a clock face of the breast."""
+    if not exam.main.masses:
+        return
+    mass, size = exam.main.masses[0], largest(exam)
+    yield f'<h2>Place{_of_mass(exam)}</h2><div class="place">{breast_dial(exam.main.masses)}<div>'
+    yield from _paragraphs([place_sentence(mass, INTERVAL if size is None else size["probability"])])
+    if mass.probability is not None:
+        yield from _paragraphs([f"Probability that it is a lump, by this map: {_chance(mass.probability)}."])
+    yield from (f'<p class="small">{html.escape(text)}</p>' for text in [why_no_clock(exam)] if text)
+    yield "</div></div>"
+
+
+def _chance(probability: float) -> str:
+    return "above 0.999" if probability > 0.999 else f"{probability:.3f}"
+
+
+def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
+    """Both intervals of the largest size, with what they suppose."""
+    another = (exam.main.document if exam.pooled is None else exam.pooled).get("another_exam")
+    found = [("this exam" if exam.pooled is None else "these exams", size)]
+    if another is not None:
+        found.append((f"exams differ by {100 * another['between_map_sd']:.0f} %", another["max_size_mm"]))
+    return found
+
+
+def _several_masses(exam: Exam) -> Iterator[str]:
+    masses = sorted(exam.main.masses, key=lambda one: one.number)
+    if len(masses) < 2:
+        return
+    yield '<h2>All masses on the map</h2><table class="masses">'
+    yield "<tr><th>No.</th><th>Largest diameter (interval)</th><th>Place</th></tr>"
+    for mass in masses[:MOST_MASSES]:
+        longest = 62 if _crowded(exam) else 160
+        cells = "".join(f"<td>{html.escape(_cut(text, longest))}</td>" for text in mass_row(mass))
+        yield f"<tr>{cells}</tr>"
+    yield "</table>"
+    if len(masses) > MOST_MASSES:
+        yield from _paragraphs([f"And {len(masses) - MOST_MASSES} more."])
+
+
+def _repeats(exam: Exam) -> Iterator[str]:
+    """Repeat maps, small, each with its own size."""
+    if len(exam.maps) < 2:
+        return
+    assert exam.pooled is not None
+    yield f"<h2>The {len(exam.maps)} maps of this mass</h2>"
+    shown = exam.maps[:MOST_REPEATS]
+    yield '<div class="repeats">'
+    small = small_pictures(shown, room_mm=_REPEAT_MM)
+    for number, (one, picture) in enumerate(zip(shown, small, strict=True), start=1):
+        size = one.document["max_size_mm"]
+        alone = "no size" if size is None else f"{size['median']:.1f} mm ({size['low']:.1f} to {size['high']:.1f})"
+        yield f"<figure>{picture}<figcaption>{number}: {alone}</figcaption></figure>"
+    yield "</div>"
+    if len(exam.maps) > MOST_REPEATS:
+        yield from _paragraphs([f"And {len(exam.maps) - MOST_REPEATS} more maps, pooled too."])
+
+
+def _quality(exam: Exam) -> Iterator[str]:
+    first = " (of the first map)" if len(exam.maps) > 1 else ""
+    yield f"<h2>How good the exam was{first}</h2><table>"
+    for name, text in quality_rows(exam):
+        yield f"<tr><th>{html.escape(name)}</th><td>{html.escape(_cut(text, 240))}</td></tr>"
+    yield "</table>"
+
+
+def _foot(exam: Exam) -> Iterator[str]:
+    digests = [scan["sha256"][:12] for scan in exam.scans if scan.get("sha256")][:MOST_REPEATS]
+    settings = exam.main.document["provenance"]
+    parts = [f"tactile-bayes {__version__}", f"method {settings['settings'].get('method', 'unknown')}"]
+    parts += [f"seed {settings['seed']}"] if settings.get("seed") is not None else []
+    parts += [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
+    text = f"{'; '.join(parts)}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
+    yield f'<p class="small">{html.escape(text)}</p>'

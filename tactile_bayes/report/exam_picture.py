@@ -1,0 +1,297 @@
+"""A map as inline SVG: its values, the size ellipse and its interval to scale, sides, nipple, scale bar."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.orientation import Orientation, orientation_of
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.report.exam import ExamMap, ExamMass
+
+# From low to high: five colours of viridis (van der Walt & Smith 2015), which also read in grey.
+COLOURS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+MARGIN_MM: Final = 5.0
+"""Round the map, for the names of its sides."""
+_MOST_PIXELS: Final = 1200
+_CELL_PX: Final = 4
+_STRIPES_PX: Final = 8
+_NO_DATA: Final = (222, 222, 222)
+# The colours' ends: shares of the well-read cells outside, the least span of the level, amplitudes shown of a lump.
+_ENDS: Final = (0.01, 0.995)
+_LEAST_SPAN: Final = 0.35
+_AMPLITUDES_SHOWN: Final = 1.25
+_POINTS: Final = 72
+_SCALE_BARS_MM: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0)
+_LEAST_BAR_MM: Final = 8.0
+_BAR_MM: Final = 40.0
+_BAR_STEPS: Final = 40
+_BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """Where the map's points lie on the page, in mm from the picture's upper left corner without its margin.
+
+    Parameters
+    ----------
+    tactile_map
+        The map that is drawn.
+    scale
+        Of life size.
+    """
+
+    tactile_map: TactileMap
+    scale: float
+
+    @classmethod
+    def within(cls, tactile_map: TactileMap, *, width_mm: float, height_mm: float) -> Frame:
+        """Life size, or the largest that fits with its margin."""
+        rows, columns = orientation_of(tactile_map).screen(tactile_map.count).shape
+        cell = tactile_map.recipe.cell_mm
+        room = (width_mm - 2 * MARGIN_MM) / (columns * cell), (height_mm - 2 * MARGIN_MM) / (rows * cell)
+        return cls(tactile_map, min(1.0, *room))
+
+    @property
+    def view(self) -> Orientation:
+        """Which way up the map is drawn."""
+        return orientation_of(self.tactile_map)
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height of the map on the page."""
+        rows, columns = self.view.screen(self.tactile_map.count).shape
+        cell = self.scale * self.tactile_map.recipe.cell_mm
+        return columns * cell, rows * cell
+
+    def at(self, centre_mm: tuple[float, float]) -> tuple[float, float]:
+        """Place on the page of a point of the map's plane."""
+        across, down = self.view.place(self.tactile_map, centre_mm)
+        cell = self.scale * self.tactile_map.recipe.cell_mm
+        return cell * across, cell * down
+
+
+def colour_limits(exam: ExamMap) -> tuple[float, float]:
+    """Values at the ends of the colours: a rib beside the lump does not take them all, noise alone is no lump."""
+    tactile_map, document = exam.tactile_map, exam.document
+    well = tactile_map.covered & ~tactile_map.few
+    values = tactile_map.mean[well if well.any() else tactile_map.covered]
+    if not values.size:
+        return 0.0, 1.0
+    low, high = (float(end) for end in np.quantile(values, _ENDS))
+    if document["amplitude"] is not None and document["background"] is not None:
+        level, amplitude = document["background"]["median"], document["amplitude"]["median"]
+        high = min(high, level + _AMPLITUDES_SHOWN * amplitude)
+    return low, max(high, low + _LEAST_SPAN * abs(float(np.median(values))), low + 1e-9)
+
+
+def exam_picture(exam: ExamMap, frame: Frame, *, label: str, small: bool = False) -> str:
+    """Inline SVG of a map, one unit a mm on the page.
+
+    Parameters
+    ----------
+    label
+        What it shows, for those who cannot see it.
+    small
+        Only the values, the ellipse and the sides.
+    """
+    (width, height), margin = frame.size_mm, 0.5 if small else MARGIN_MM
+    whole = f"{width + 2 * margin:.2f}", f"{height + 2 * margin:.2f}"
+    parts = [
+        f'<svg class="map" role="img" aria-label="{html.escape(label)}" viewBox="{-margin:g} {-margin:g} {whole[0]} '
+        f'{whole[1]}" width="{whole[0]}mm" height="{whole[1]}mm">',
+        _cells(exam, frame),
+        *_edges(frame, small=small),
+        *(part for mass in exam.masses for part in _mass(mass, exam, frame, small=small)),
+        *(() if small else _marks(exam, frame)),
+        "</svg>",
+    ]
+    return "".join(parts)
+
+
+def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> list[str]:
+    """Small pictures of repeat maps, all to one scale, by which each has room in a width and a height."""
+    sizes = [Frame(one.tactile_map, 1.0).size_mm for one in maps]
+    scale = min(1.0, *(room / size for one in sizes for room, size in zip(room_mm, one, strict=True)))
+    frames = [Frame(one.tactile_map, scale) for one in maps]
+    return [
+        exam_picture(one, frame, label=f"Repeat map {number}", small=True)
+        for number, (one, frame) in enumerate(zip(maps, frames, strict=True), start=1)
+    ]
+
+
+def colour_bar(exam: ExamMap) -> str:
+    """Inline SVG of the colours with the values at their ends."""
+    low, high = colour_limits(exam)
+    covered = exam.tactile_map.covered
+    more = " or more" if covered.any() and float(exam.tactile_map.mean[covered].max()) > high else ""
+    steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0))[0]
+    width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
+    boxes = "".join(
+        f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
+        for i, colour in enumerate(steps)
+    )
+    words = html.escape(exam.tactile_map.recipe.value_words)
+    return (
+        '<svg class="bar" role="img" aria-label="Colours of the map" viewBox="0 0 80 8.5" width="80mm" height="8.5mm">'
+        f'{boxes}<rect x="14" y="0.5" width="{_BAR_MM:g}" height="3" fill="none" stroke="#333" stroke-width="0.15"/>'
+        f'<text x="13" y="3.2" text-anchor="end" font-size="3">{_value(low)}</text>'
+        f'<text x="55" y="3.2" font-size="3">{_value(high)}{more}</text>'
+        f'<text x="14" y="7.4" font-size="3">{words}</text></svg>'
+    )
+
+
+def _value(value: float) -> str:
+    return f"{value:.2f}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def _cells(exam: ExamMap, frame: Frame) -> str:
+    """The map's values as an embedded PNG; cells with few readings are striped, those without any are grey."""
+    tactile_map, (width, height) = exam.tactile_map, frame.size_mm
+    values = frame.view.screen(np.where(tactile_map.covered, tactile_map.mean, np.nan))
+    step = -(-max(values.shape) // _MOST_PIXELS)
+    pixels = _coloured(values[::step, ::step], colour_limits(exam))
+    times = max(1, min(_CELL_PX, _MOST_PIXELS // max(pixels.shape[:2])))
+    pixels = pixels.repeat(times, axis=0).repeat(times, axis=1)
+    few = frame.view.screen(tactile_map.few)[::step, ::step].repeat(times, axis=0).repeat(times, axis=1)
+    rows, columns = np.indices(few.shape)
+    pixels[few & ((rows + columns) % _STRIPES_PX < _STRIPES_PX // 4)] = 255
+    data = base64.b64encode(_png(pixels)).decode("ascii")
+    box = f'x="0" y="0" width="{width:.2f}" height="{height:.2f}"'
+    return (
+        f'<image {box} preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
+        f'<rect {box} fill="none" stroke="#333" stroke-width="0.3"/>'
+    )
+
+
+def _coloured(values: FloatArray, limits: tuple[float, float]) -> NDArray[np.uint8]:
+    """(n, m, 3) colours of values; cells without data are grey."""
+    low, high = limits
+    covered, colours = np.isfinite(values), np.array(COLOURS, dtype=float)
+    at = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
+    mixed = np.stack([np.interp(at, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
+    return np.where(covered[..., None], np.rint(mixed), np.array(_NO_DATA)).astype(np.uint8)
+
+
+def _png(pixels: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(pixels).quantize(128, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
+def _edges(frame: Frame, *, small: bool) -> Iterator[str]:
+    """Names of the picture's sides: the patient's, or the plane's axes; within it on a small picture."""
+    (width, height), out = frame.size_mm, -1.7 if small else MARGIN_MM / 2
+    places = {
+        "left": (-out, height / 2),
+        "right": (width + out, height / 2),
+        "top": (width / 2, -out),
+        "bottom": (width / 2, height + out),
+    }
+    for side, name in frame.view.edges.items():
+        x, y = places[side]
+        if small:
+            yield _text(x, y + 0.9, name, size=2.5)
+            continue
+        yield (
+            f'<text class="edge" data-side="{side}" x="{x:.2f}" y="{y + 1.5:.2f}" text-anchor="middle" '
+            f'font-size="4.2" font-weight="600">{html.escape(name)}</text>'
+        )
+
+
+def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
+    """The ellipse of the size, those of its interval's ends, a cross at the centre; numbers where there are several."""
+    (x, y), arm = frame.at(mass.centre_mm), 0.6 if small else 1.6
+    if mass.axes_mm is not None and mass.largest is not None:
+        for end in () if small else ("low", "high"):
+            outline = _ellipse(mass, mass.largest[end] / mass.largest["median"], frame)
+            yield _stroked(outline, 0.3, kind=f"size-{end}", dash="1.2 0.9")
+        yield _stroked(_ellipse(mass, 1.0, frame), 0.3 if small else 0.55, kind="size")
+    yield _stroked(f"M{x - arm:.2f} {y:.2f}h{2 * arm:g}M{x:.2f} {y - arm:.2f}v{2 * arm:g}", 0.25 * arm, kind="centre")
+    if not small and len(exam.masses) > 1:
+        above = 0.0 if mass.largest is None else frame.scale * mass.largest["high"] / 2
+        yield _text(x, y - above - 1.5, f"{mass.number}", size=4.2)
+
+
+def _ellipse(mass: ExamMass, times: float, frame: Frame) -> str:
+    """Path of the mass's ellipse, its diameters multiplied."""
+    assert mass.axes_mm is not None
+    t, angle = np.linspace(0.0, 2 * np.pi, _POINTS, endpoint=False), np.radians(mass.angle_deg)
+    along, across = (0.5 * times * axis for axis in mass.axes_mm)
+    u, v = along * np.cos(t), across * np.sin(t)
+    xs = mass.centre_mm[0] + u * np.cos(angle) - v * np.sin(angle)
+    ys = mass.centre_mm[1] + u * np.sin(angle) + v * np.cos(angle)
+    places = [frame.at((float(a), float(b))) for a, b in zip(xs, ys, strict=True)]
+    return "M" + "L".join(f"{a:.2f} {b:.2f}" for a, b in places) + "Z"
+
+
+def _stroked(path: str, width: float, *, kind: str, dash: str = "") -> str:
+    """A white line with a black edge, visible on every colour and in grey."""
+    dashed = f' stroke-dasharray="{dash}"' if dash else ""
+    under = f'<path d="{path}" fill="none" stroke="#000" stroke-width="{width + min(0.5, width):g}"/>'
+    return f'{under}<path class="{kind}" d="{path}" fill="none" stroke="#fff" stroke-width="{width:g}"{dashed}/>'
+
+
+def _text(x: float, y: float, text: str, *, size: float, anchor: str = "middle") -> str:
+    """White text with a black edge."""
+    place = f'x="{x:.2f}" y="{y:.2f}" text-anchor="{anchor}" font-size="{size:g}" font-weight="600"'
+    words = html.escape(text)
+    under = f'<text {place} fill="none" stroke="#000" stroke-width="{0.2 * size:g}" aria-hidden="true">{words}</text>'
+    return f'{under}<text {place} fill="#fff">{words}</text>'
+
+
+def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
+    """Scale bar, nipple, direction of the sternal notch, and the places looked at in vain."""
+    width, height = frame.size_mm
+    length = next((one for one in _SCALE_BARS_MM if frame.scale * one >= _LEAST_BAR_MM), _SCALE_BARS_MM[-1])
+    yield _stroked(f"M4 {height - 4:.2f}h{frame.scale * length:.2f}", 0.9, kind="scale")
+    yield _text(4 + frame.scale * length / 2, height - 5.6, f"{length:g} mm", size=3.2)
+    if not exam.masses:
+        for one in exam.document["candidates"]:
+            x, y = frame.at((one["x_mm"], one["y_mm"]))
+            yield _stroked(f"M{x - 1:.2f} {y - 1:.2f}l2 2m0 -2l-2 2", 0.3, kind="looked-at")
+    nipple = exam.tactile_map.nipple_mm
+    if nipple is not None:
+        yield from _nipple((float(nipple[0]), float(nipple[1])), frame)
+    if frame.view.notch is not None:
+        right, up = frame.view.notch
+        x, y = width - 8.0, height - 4.0
+        tip = (x + 7 * right, y - 7 * up)
+        head = [(tip[0] - 2.2 * (right * c - up * s), tip[1] + 2.2 * (up * c + right * s)) for c, s in _BARBS]
+        barbs = "".join(f"M{tip[0]:.2f} {tip[1]:.2f}L{a:.2f} {b:.2f}" for a, b in head)
+        yield _stroked(f"M{x:.2f} {y:.2f}L{tip[0]:.2f} {tip[1]:.2f}{barbs}", 0.5, kind="notch")
+        yield _text(x, y - 9.0, "to notch", size=3.0)
+
+
+def _nipple(centre_mm: tuple[float, float], frame: Frame) -> Iterator[str]:
+    """A ring at the nipple; where it lies off the map, a wedge at the edge that points to it."""
+    (x, y), (width, height) = frame.at(centre_mm), frame.size_mm
+    if 0 <= x <= width and 0 <= y <= height:
+        yield _stroked(_ring(x, y, 2.6) + _ring(x, y, 0.7), 0.45, kind="nipple")
+        yield _text(x, y + 6.2, "nipple", size=3.0)
+        return
+    edge = (min(max(x, 2.5), width - 2.5), min(max(y, 2.5), height - 2.5))
+    away = float(np.hypot(x - edge[0], y - edge[1]))
+    right, down = (x - edge[0]) / away, (y - edge[1]) / away
+    tip = (edge[0] + 2 * right, edge[1] + 2 * down)
+    base = [(edge[0] - 1.4 * s * down, edge[1] + 1.4 * s * right) for s in (1, -1)]
+    corners = "L".join(f"{a:.2f} {b:.2f}" for a, b in (tip, *base))
+    yield _stroked(f"M{corners}Z", 0.45, kind="nipple-off")
+    anchor = "start" if right < -0.5 else "end" if right > 0.5 else "middle"
+    words = f"nipple, {away / frame.scale:.0f} mm"
+    yield _text(edge[0] - 3.2 * right, edge[1] - 4.2 * down + 1.0, words, size=3.0, anchor=anchor)
+
+
+def _ring(x: float, y: float, radius: float) -> str:
+    arc = f"a{radius:g} {radius:g} 0 1 0"
+    return f"M{x - radius:.2f} {y:.2f}{arc} {2 * radius:g} 0{arc} {-2 * radius:g} 0"

@@ -1,0 +1,274 @@
+"""Sentences of an exam's page, in plain words: the size and its intervals, what was covered, how good the exam was."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.geometry import apply
+from tactile_bayes.mapping.clock_face import clock_text
+from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
+from tactile_bayes.posterior.abstention import chance_text
+from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
+from tactile_bayes.report.narrowing import width_lines
+from tactile_bayes.report.size_text import shape_text
+
+UNDETECTED: Final = ("undetected", "empty")
+MOST_CAUTIONS: Final = 2
+_OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
+_LEFT_OUT: Final = (
+    ("dropped_low", "pressed too lightly"),
+    ("dropped_high", "pressed too hard"),
+    ("dropped_no_pose", "without a tracker pose"),
+    ("dropped_elements", "with too few working taxels"),
+)
+
+
+def headline(exam: Exam) -> str:
+    """The finding in a few words."""
+    size, masses = largest(exam), exam.main.masses
+    if size is not None:
+        what = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
+        interval = f"{_percent(size)} interval {size['low']:.1f} to {size['high']:.1f} mm"
+        return f"{what} about {size['median']:.1f} mm, {interval}"
+    if masses:
+        return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
+    return "No lump found in the area covered" if exam.main.document["reason_code"] in UNDETECTED else "No size"
+
+
+def largest(exam: Exam) -> Quantity | None:
+    """The largest size that the page reports: the pooled one of several maps."""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    size: Quantity | None = document["max_size_mm"]
+    return size
+
+
+def size_sentences(exam: Exam) -> Iterator[str]:
+    """The largest size with both intervals and the smallest size."""
+    document, size = exam.main.document if exam.pooled is None else exam.pooled, largest(exam)
+    if size is None:
+        return
+    spread, share = exam.figures.get("between_map_sd"), _percent(size)
+    yield f"The largest diameter is about {size['median']:.1f} mm (the middle of its probable values)."
+    alike = ""
+    if spread is not None:
+        alike = f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
+        if exam.pooled is not None:
+            alike = f"; exams of a lump are taken to differ by {100 * spread:.0f} %, learned from these maps"
+    yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{alike}."
+    if document.get("another_exam") is not None:
+        other, sd = document["another_exam"]["max_size_mm"], document["another_exam"]["between_map_sd"]
+        apart = f"If exams of a lump differ by {100 * sd:.0f} %, as those of patients did in the published trial"
+        if exam.pooled is not None:
+            apart = (
+                "If exams of a lump may differ as much as those of patients did in the published trial "
+                f"({100 * sd:.0f} % after these maps)"
+            )
+        yield f"{apart}, it lies between {other['low']:.1f} and {other['high']:.1f} mm ({share})."
+    least = document["min_size_mm"]
+    if least is not None:
+        ends = f"{share}: {least['low']:.1f} to {least['high']:.1f} mm"
+        yield f"The smallest diameter is about {least['median']:.1f} mm ({ends})."
+    if "oval_probability" in exam.figures:
+        yield shape_text(exam.figures)
+
+
+def nothing_sentences(exam: Exam) -> Iterator[str]:
+    """Why there is no size, what would help, and what was covered."""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    if exam.main.document["reason_code"] in UNDETECTED:
+        yield f"No lump was found in the area that was covered: {covered_text(exam.main.tactile_map)}."
+        chance = exam.main.document["detected_probability"]
+        if chance is not None:
+            yield f"Probability that the likeliest rise on the map is a lump: {chance_text(chance)}."
+    if document.get("advice"):
+        yield f"What would help: {document['advice']}."
+    if not exam.main.masses:
+        yield "A lump may lie outside the area that was covered, or be too small, too deep or too soft to show."
+        yield "The program does not say from one map how small a lump it would have found."
+
+
+def detail_sentence(exam: Exam) -> str:
+    """Why there is no size, as the program's other reports give it; empty where there is one."""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    reason = document["reason"] if largest(exam) is None else ""
+    return f"In detail: {reason}." if reason else ""
+
+
+def place_sentence(mass: ExamMass, probability: float) -> str:
+    """Where a mass lies: by the clock, else from the xiphoid, else on the map."""
+    if mass.place is not None:
+        hours, (near, far) = mass.place.hours_between(probability), mass.place.distance_between(probability)
+        clock = "" if hours is None else f"{clock_text(hours[0])} to {clock_text(hours[1])} o'clock, "
+        return f"{short_place(mass)}; {100 * probability:g} %: {clock}{near:.0f} to {far:.0f} mm."
+    return f"{short_place(mass)}{'' if mass.patient_mm is not None else '; the scan names no landmarks'}."
+
+
+def short_place(mass: ExamMass) -> str:
+    """Where a mass lies, without intervals."""
+    if mass.place is not None:
+        return _capital(mass.place.text())
+    if mass.patient_mm is not None:
+        return _capital(_from_xiphoid(*mass.patient_mm))
+    return "At ({:.0f}, {:.0f}) mm on the map".format(*mass.centre_mm)
+
+
+def why_no_clock(exam: Exam) -> str:
+    """Why the page tells no place by the clock, where a patient was scanned; empty where it does."""
+    tactile_map = exam.main.tactile_map
+    if tactile_map.patient_from_plane is None or any(mass.place is not None for mass in exam.main.masses):
+        return ""
+    lacks = ["nipple"] if tactile_map.nipple_mm is None else []
+    lacks += [] if any(scan.get("side") in ("left", "right") for scan in exam.scans) else ["side"]
+    return f"No clock position: the scan names no {' and no '.join(lacks)}." if lacks else ""
+
+
+def narrowing_sentences(exam: Exam) -> list[str]:
+    """What makes the interval wide and what would narrow it, without the program's options."""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    share = document["variance_share"]
+    return [] if share is None else [_OPTIONS.sub("", line) for line in width_lines(share)]
+
+
+def caution_sentences(exam: Exam) -> list[str]:
+    """What puts the size in doubt, the gravest first; long lists end with their number."""
+    found = []
+    for one in exam.maps:
+        diagnostics = one.document["diagnostics"]
+        found += [f"Caution: {text}." for text in diagnostics.get("broken_assumptions", [])]
+        outside = diagnostics.get("outside_calibration", [])
+        found += [f"Caution: outside the calibration's range: {text.rstrip('.')}." for text in outside]
+        found += [f"To check: {text}." for text in diagnostics.get("assumptions_to_check", [])]
+    if exam.pooled is not None:
+        if exam.pooled["fat_apart_mm"]:
+            depths = " and ".join(f"{depth:.1f}" for depth in exam.pooled["fat_apart_mm"])
+            found.insert(0, f"Caution: the fat under the head is {depths} mm deep on two maps: are they of one mass?")
+        apart = [one["map"] for one in exam.pooled["maps"] if one["outlying"]]
+        found += [f"To check: apart from the others: {', '.join(apart)}."] if apart else []
+    told = list(dict.fromkeys(found))
+    more = len(told) - MOST_CAUTIONS
+    return [*told[:MOST_CAUTIONS], f"And {more} more: see `estimate -v`."] if more > 0 else told
+
+
+def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
+    """Rows of the table on how good the exam was."""
+    tactile_map = exam.main.tactile_map
+    quality = tactile_map.quality
+    yield "covered", covered_text(tactile_map)
+    if reach := reach_text(tactile_map):
+        yield "reaches", reach
+    if "mean_pressure_kpa" in quality:
+        window = tactile_map.recipe.pressure_window_kpa
+        asked = "" if window is None else f" (wanted {window[0]:g} to {window[1]:g})"
+        ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
+        yield "pressure", f"mean {quality['mean_pressure_kpa']:.1f} kPa, nine frames in ten {ends}{asked}"
+    if "frames_total" in quality:
+        used = f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f} used"
+        out = [f"{quality[name]:.0f} {words}" for name, words in _LEFT_OUT if quality.get(name)]
+        yield "frames", f"{used}{'; left out: ' if out else ''}{', '.join(out)}"
+    if tactile_map.masked_taxels:
+        yield "taxels", f"{len(tactile_map.masked_taxels)} left out as faulty"
+    yield "landmarks", _landmarks(tactile_map)
+    yield "array calibration", _age(exam)
+    calibration = exam.main.document["provenance"]["settings"].get("size_calibration")
+    if calibration:
+        yield "size calibration", str(calibration)[:60]
+
+
+def covered_text(tactile_map: TactileMap) -> str:
+    """Area with enough readings, holes in it, and the typical number of readings."""
+    cell2 = tactile_map.recipe.cell_mm**2 / 100.0
+    if not tactile_map.counts_known:
+        return f"{tactile_map.covered.sum() * cell2:.0f} cm² (readings per cell unknown)"
+    well = tactile_map.covered & (tactile_map.count >= FEW_READINGS)
+    text = f"{well.sum() * cell2:.0f} cm² with {FEW_READINGS} readings a cell or more"
+    holes = _holes(well)
+    text += f"; {holes * cell2:.1f} cm² of gaps inside it" if holes * cell2 >= 0.05 else "; no gaps inside it"
+    median = float(np.median(tactile_map.count[well])) if well.any() else 0.0
+    return f"{text}; typically {median:.0f} readings"
+
+
+def _holes(well: Any) -> int:
+    """Cells not covered that have covered ones on all four sides."""
+    sides = [np.logical_or.accumulate(well, axis=axis) for axis in (0, 1)]
+    sides += [np.flip(np.logical_or.accumulate(np.flip(well, axis), axis=axis), axis) for axis in (0, 1)]
+    return int((np.logical_and.reduce(sides) & ~well).sum())
+
+
+def reach_text(tactile_map: TactileMap) -> str:
+    """How far the covered area reaches, from the xiphoid; empty without landmarks."""
+    if tactile_map.patient_from_plane is None:
+        return ""
+    rows, columns = np.nonzero(tactile_map.covered & ~tactile_map.few)
+    if not len(rows):
+        return ""
+    points = np.stack([tactile_map.x_mm[columns], tactile_map.y_mm[rows], np.zeros(len(rows))], axis=1)
+    x, y, _ = apply(tactile_map.patient_from_plane, points).T
+    across = _between(float(x.min()), float(x.max()), ("left", "right"))
+    up = _between(float(y.min()), float(y.max()), ("below", "above"))
+    return f"{across} of and {up} the xiphoid"
+
+
+def _between(low: float, high: float, words: tuple[str, str]) -> str:
+    if low >= 0:
+        return f"{low:.0f} to {high:.0f} mm {words[1]}"
+    if high <= 0:
+        return f"{-high:.0f} to {-low:.0f} mm {words[0]}"
+    return f"{-low:.0f} mm {words[0]} to {high:.0f} mm {words[1]}"
+
+
+def _from_xiphoid(x_mm: float, y_mm: float) -> str:
+    across = f"{abs(x_mm):.0f} mm to the patient's {'right' if x_mm >= 0 else 'left'}"
+    return f"{across} of the xiphoid and {abs(y_mm):.0f} mm {'above' if y_mm >= 0 else 'below'} it"
+
+
+def _landmarks(tactile_map: TactileMap) -> str:
+    if tactile_map.patient_from_plane is None:
+        return "none touched"
+    named = "sternal notch, xiphoid" + (", nipple" if tactile_map.nipple_mm is not None else "; no nipple")
+    repeats = tactile_map.quality.get("landmark_spread_mm")
+    return named if repeats is None else f"{named}; repeats within {repeats:.1f} mm"
+
+
+def _age(exam: Exam) -> str:
+    """Age of the array calibration at the exam; the oldest of several scans."""
+    days = [scan["array_calibration_days"] for scan in exam.scans if "array_calibration_days" in scan]
+    known = [int(text) for text in days if re.fullmatch(r"-?[0-9]{1,6}", text)]
+    if not known:
+        return "age not stated in the scan"
+    return f"{max(known)} day{'s' if max(known) != 1 else ''} old at the exam"
+
+
+def mass_row(mass: ExamMass) -> tuple[str, str, str]:
+    """Number, size with its interval, and place of a mass, for a table of several."""
+    if mass.largest is None:
+        chance = "" if mass.probability is None else f" (probability of a lump {mass.probability:.2f})"
+        size = NOT_SIZED + chance if mass.why == NOT_SIZED else f"no size{chance}: {mass.why}"
+    else:
+        size = f"{mass.largest['median']:.1f} mm ({mass.largest['low']:.1f} to {mass.largest['high']:.1f})"
+    return str(mass.number), size, short_place(mass)
+
+
+def facts(exam: Exam) -> Iterator[tuple[str, str]]:
+    """What the scans say of the exam, with what was given for the page."""
+    if exam.name:
+        yield "Name", exam.name
+    for key, words in (("subject", "Subject"), ("side", "Side"), ("mass", "Mass"), ("visit", "Visit"),
+                       ("posture", "Posture"), ("examiner", "Examiner")):  # fmt: skip
+        values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
+        if values:
+            more = f" and {len(values) - 2} more" if len(values) > 2 else ""
+            yield words, ", ".join(value[:24] for value in values[:2]) + more
+    if exam.day:
+        yield "Date", exam.day
+
+
+def _percent(quantity: Mapping[str, Any]) -> str:
+    return f"{100 * quantity['probability']:g} %"
+
+
+def _capital(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"

@@ -1,0 +1,42 @@
+"""Place of a lump in the breast, by clock and distance from the nipple, of an estimate and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tactile_bayes.mapping.clock_face import ClockPosition, clock_position, clock_text
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.posterior.lump.posterior import MapPosterior
+
+
+def side_of(scans: Sequence[Mapping[str, str]]) -> str:
+    """Which breast the scans say they are of, as `Provenance.scans` has them; empty where they do not agree."""
+    sides = {scan.get("side", "") for scan in scans}
+    return sides.pop() if len(sides) == 1 else ""
+
+
+def lump_place(
+    posterior: MapPosterior | None, tactile_map: TactileMap, scans: Sequence[Mapping[str, str]]
+) -> ClockPosition | None:
+    """Place of the measured lump about the nipple; None without a lump, landmarks, a nipple or a breast's side."""
+    if posterior is None:
+        return None
+    x_mm, y_mm = posterior.x_mm.ravel(), posterior.y_mm.ravel()
+    return clock_position(
+        tactile_map,
+        (float(np.median(x_mm)), float(np.median(y_mm))),
+        side=side_of(scans),
+        covariance_mm2=np.cov(x_mm, y_mm),
+    )
+
+
+def place_line(place: ClockPosition, probability: float) -> str:
+    """The place with its intervals, as a line of a full report."""
+    hours, (near, far) = place.hours_between(probability), place.distance_between(probability)
+    clock = "" if hours is None else f" {clock_text(hours[0])} to {clock_text(hours[1])} o'clock and"
+    return f"Place: {place.text()}; {100 * probability:g} % interval{clock} {near:.0f} to {far:.0f} mm."

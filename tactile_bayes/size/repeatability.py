@@ -1,0 +1,102 @@
+"""A site's repeatability: how far sizes of one mass lie apart between its exams, learned from repeated exams there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import field
+from typing import Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.between_maps import BetweenMaps
+from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, corrected_log_size, pooled_size
+from tactile_bayes.size.posterior import SizePosterior
+
+PROBABILITY: Final = 0.95
+"""Of the interval of a learned spread."""
+
+
+@dataclass(frozen=True, slots=True)
+class Repeatability:
+    """Spread of ln d between exams of one mass at a site, beyond the maps' own errors.
+
+    Parameters
+    ----------
+    sd, log_sd
+        As of `BetweenMaps`: root mean square of the posterior, and the log-SD of the log-normal that has the same mean
+        of tau^2 and of tau^4.
+    median, low, high
+        Of the posterior, with its equal-tailed interval of `PROBABILITY`.
+    masses, maps
+        Masses with repeated exams, and the maps of these exams.
+    calibration, calibration_sha256
+        Name and digest of the calibration that the maps were sized by.
+    normalise
+        How their frames were normalised.
+    outlying
+        Masses whose exams lie further apart than those of the other masses lead one to expect.
+    sha256
+        Digest of the file that it was read from; empty where it is in none.
+    """
+
+    sd: float
+    log_sd: float
+    median: float
+    low: float
+    high: float
+    masses: int
+    maps: int
+    calibration: str = ""
+    calibration_sha256: str = ""
+    normalise: str = ""
+    outlying: tuple[str, ...] = field(default=())
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.low <= self.median <= self.high):
+            what = f"the spread has the median {self.median:g} and the interval {self.low:g} to {self.high:g}"
+            raise BadDataError(what, way_out="learn it again: `calibrate repeatability`")
+
+    @property
+    def between_maps(self) -> BetweenMaps:
+        """The spread as a prior of a mass's maps."""
+        return BetweenMaps(self.sd, self.log_sd)
+
+    def as_dict(self) -> dict[str, float]:
+        """What a size used of it, as plain data."""
+        return {"between_map_sd": self.sd, "log_sd": self.log_sd, "masses": self.masses, "maps": self.maps}
+
+    def words(self) -> str:
+        """The spread with its interval, and what it was learned from."""
+        spread = f"{_percent(self.median)} % (95 %: {_percent(self.low)} to {_percent(self.high)})"
+        return f"exams of one mass differ by {spread} at this site, by {self.masses} masses and {self.maps} exams"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}" if share < 0.0995 else f"{100 * share:.0f}"
+
+
+def for_shape(calibration: BodyCalibration, shape: ShapeDraws) -> BodyCalibration:
+    """The calibration at a single map's depth of fat and figures by place."""
+    at_depth = calibration.at_fat([shape.profile]).fitting(*shape.middle)
+    return at_depth.at_places([shape.by_place])
+
+
+def log_size_alone(calibration: BodyCalibration, shape: ShapeDraws) -> tuple[float, float]:
+    """Mean and variance of ln d by a map alone, without what no map shows."""
+    log_size = corrected_log_size(for_shape(calibration, shape), shape)
+    return float(np.nanmean(log_size)), float(np.nanvar(log_size))
+
+
+def size_alone(
+    shape: ShapeDraws, *, calibration: BodyCalibration, priors: SizePriors, rng: np.random.Generator
+) -> SizePosterior:
+    """Size by a map alone from the draws that pooling keeps of it, without fitting the map again.
+
+    It has the draws of the map one by one, as `estimate_map` gives them, paired with other random points.
+    """
+    used: Sequence[ShapeDraws] = [shape]
+    return pooled_size(used, calibration=for_shape(calibration, shape), priors=priors, rng=rng)

@@ -1,0 +1,122 @@
+"""CSV for REDCap: data and dictionary by the rules that REDCap's own help gives for uploads."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from export_files import exported
+
+from tactile_bayes.export.redcap import COMPLETE
+
+# REDCap's help: 18 columns; names of lower-case letters, digits and underscores that begin with a letter, at most 26
+# characters advised; field types; validation types; a choice is "CODE, LABEL", parted by " | ".
+NAME = re.compile(r"[a-z](?:[a-z0-9]|_(?!_))*[a-z0-9]")
+VALIDATION = {
+    "": re.compile(r".*", re.DOTALL),
+    "number": re.compile(r"[-+]?[0-9]*\.?[0-9]+([eE][-+]?[0-9]+)?"),
+    "integer": re.compile(r"[-+]?\b\d+\b"),
+    "date_ymd": re.compile(r"\d{4}-\d{2}-\d{2}"),
+}
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def tables(exam: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
+    """Records of three estimates, and the dictionary."""
+    folder = tmp_path_factory.mktemp("redcap")
+    words = ("map.json", "empty.json", "phantom_post.nc", "--study-date", "2026-11-24T10:30")
+    exported(exam, *words, "--to", "csv", "-o", folder / "d.csv", "--dictionary", folder / "dict.csv")
+    return rows_of(folder / "d.csv"), rows_of(folder / "dict.csv")
+
+
+def test_the_dictionary_keeps_redcaps_rules(tables: Any) -> None:
+    _, fields = tables
+    assert len(fields[0]) == 18
+    names = [one["Variable / Field Name"] for one in fields]
+    assert names[0] == "record_id"
+    assert len(set(names)) == len(names)
+    for one in fields:
+        name = one["Variable / Field Name"]
+        assert NAME.fullmatch(name), name
+        assert len(name) <= 26
+        assert NAME.fullmatch(one["Form Name"])
+        assert one["Field Type"] in ("text", "notes", "radio")
+        assert one["Field Label"]
+        kind = one["Text Validation Type OR Show Slider Number"]
+        assert kind in VALIDATION
+        assert not kind or one["Field Type"] == "text"
+        assert bool(one["Choices, Calculations, OR Slider Labels"]) == (one["Field Type"] == "radio")
+
+
+def test_every_value_is_one_that_the_dictionary_allows(tables: Any) -> None:
+    records, fields = tables
+    names = [one["Variable / Field Name"] for one in fields]
+    assert list(records[0]) == [*names, COMPLETE]
+    assert len({one["record_id"] for one in records}) == len(records) == 3
+    for record in records:
+        assert record[COMPLETE] in ("0", "1", "2")
+        for field in fields:
+            value = record[field["Variable / Field Name"]]
+            if not value:
+                continue
+            kind = field["Text Validation Type OR Show Slider Number"]
+            assert VALIDATION[kind].fullmatch(value), (field, value)
+            if field["Text Validation Min"]:
+                assert float(field["Text Validation Min"]) <= float(value) <= float(field["Text Validation Max"])
+            if field["Field Type"] == "radio":
+                choices = field["Choices, Calculations, OR Slider Labels"].split(" | ")
+                assert value in [choice.split(", ")[0] for choice in choices]
+
+
+def test_sizes_are_read_back_equal(tables: Any, estimate: dict[str, Any], exam: Path) -> None:
+    first, empty, draws = tables[0]
+    for name in ("max", "min"):
+        size = estimate[f"{name}_size_mm"]
+        assert [float(first[f"tb_{name}{end}_mm"]) for end in ("", "_low", "_high")] == [
+            size["median"],
+            size["low"],
+            size["high"],
+        ]
+    assert (first["tb_status"], first["tb_side"], first["tb_visit"], first["tb_exam_date"]) == (
+        "1",
+        "1",
+        "2",
+        "2026-11-24",
+    )
+    assert float(first["tb_right_mm"]) == estimate["centre_patient_mm"]["x"]["median"]
+    assert empty["tb_status"] == "3"
+    assert empty["tb_max_mm"] == empty["tb_max_low_mm"] == ""
+    assert empty["tb_reason"] == json.loads((exam / "empty.json").read_text())["reason"]
+    phantom = json.loads((exam / "phantom.json").read_text())
+    assert float(draws["tb_max_high_mm"]) == pytest.approx(phantom["max_size_mm"]["high"])
+    assert (draws["tb_side"], draws["tb_lump_prob"]) == ("3", "")
+
+
+def test_a_record_is_named_by_content_or_by_what_was_told(tables: Any, exam: Path, tmp_path: Path) -> None:
+    assert all(re.fullmatch(r"tb-[0-9a-f]{16}", one["record_id"]) for one in tables[0])
+    assert "S01" not in str(tables[0])
+    exported(exam, "map.json", "--to", "csv", "--patient-id-from-scan", "-o", tmp_path / "a.csv")
+    assert rows_of(tmp_path / "a.csv")[0]["record_id"] == "S01-left-2-1"
+    exported(exam, "map.json", "--to", "csv", "--patient-id", "K7", "-o", tmp_path / "b.csv")
+    assert rows_of(tmp_path / "b.csv")[0]["record_id"] == "K7-left-2-1"
+
+
+def test_no_cell_is_a_formula_or_breaks_the_line(estimate: dict[str, Any], tmp_path: Path) -> None:
+    scans = [{"sha256": "0" * 64, "visit": "-1", "mass": "=1"}]
+    hostile = estimate | {"provenance": estimate["provenance"] | {"scans": scans, "version": "=cmd|' /C calc'!A0"}}
+    (tmp_path / "h.json").write_text(json.dumps(hostile))
+    exported(tmp_path, "h.json", "--to", "csv", "-o", tmp_path / "h.csv")
+    (row,) = rows_of(tmp_path / "h.csv")
+    assert row["tb_version"].startswith("'=")
+    assert row["tb_mass"] == "'=1"
+    assert row["tb_visit"] == "-1"
+    assert len((tmp_path / "h.csv").read_text().splitlines()) == 2

@@ -1,0 +1,140 @@
+"""All masses of a map are listed with their sizes, the largest first; no other where there is one lump."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from in_process import run_here
+from posterior_maps import bump_values, correlated_field, grid_map
+
+import tactile_bayes as tb
+from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.schema import check_document
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.pipeline.one_map import Outcome, estimate_one
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.posterior.masses import with_masses
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.result import Estimate, Mass
+
+WIDE, NARROW = (-17.0, 2.0), (16.0, 2.0)
+
+
+def scene(*, narrow: float, away: float = 33.0, seed: int = 1, half_mm: float = 35.0) -> TactileMap:
+    """A wide bump, and a narrow one of some amplitude so far to its right."""
+    rng = np.random.default_rng(seed)
+    values = bump_values(half_mm=half_mm, x=WIDE[0], y=WIDE[1], sigma_x=6.0, sigma_y=6.0, amplitude=0.3)
+    values += bump_values(
+        half_mm=half_mm, x=WIDE[0] + away, y=WIDE[1], sigma_x=3.5, sigma_y=3.5, amplitude=narrow, level=0.0
+    )
+    values += 0.005 * correlated_field(rng, len(values), length_cells=3.0)
+    return grid_map(values + 0.005 * rng.standard_normal(values.shape), normalise="gain")
+
+
+def found_on(tactile_map: TactileMap, **settings: object) -> Outcome:
+    return estimate_one(tactile_map, Settings(method="laplace", **settings))
+
+
+def places(masses: tuple[Mass, ...]) -> list[tuple[float, float]]:
+    return [(round(one.x_mm), round(one.y_mm)) for one in masses]
+
+
+def test_the_largest_is_reported_though_another_is_higher() -> None:
+    estimate = found_on(scene(narrow=0.6)).estimate
+    assert places(estimate.masses) == [WIDE, NARROW]
+    assert [one.reported for one in estimate.masses] == [True, False]
+    larger, smaller = (one.largest_mm for one in estimate.masses)
+    assert larger is not None
+    assert smaller is not None
+    assert larger > 1.2 * smaller
+    assert estimate.map_posterior is not None
+    assert float(np.median(estimate.map_posterior.x_mm)) == pytest.approx(WIDE[0], abs=0.5)
+    assert [round(one.x_mm) for one in estimate.other_rises] == [NARROW[0]]
+    # the control: the search itself takes the higher one
+    highest = found_on(scene(narrow=0.6), centre_mm=NARROW).estimate
+    assert highest.masses[1].reported
+    assert highest.masses[1].largest_mm == pytest.approx(smaller, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_lump_is_one_mass(seed: int) -> None:
+    """`benchmarks.masses` has the share over 200 simulated exams."""
+    estimate = found_on(scene(narrow=0.0, seed=seed)).estimate
+    assert places(estimate.masses) == [WIDE]
+    assert estimate.masses[0].reported
+
+
+def test_a_second_lump_in_the_window_is_listed_and_sized() -> None:
+    estimate = found_on(scene(narrow=0.25, away=18.0)).estimate
+    assert estimate.scene is not None
+    assert estimate.scene.fit.scene.extra == "second lump"
+    assert places(estimate.masses) == [WIDE, (1, 2)]
+    alone = found_on(scene(narrow=0.25)).estimate.masses[1]
+    assert alone.largest_mm is not None
+    assert estimate.masses[1].largest_mm == pytest.approx(alone.largest_mm, rel=0.25)
+
+
+def test_a_mass_has_the_size_that_its_place_alone_gives() -> None:
+    two = scene(narrow=0.2)
+    listed = found_on(two).estimate.masses[1]
+    given = found_on(two, centre_mm=NARROW).estimate
+    assert given.size is not None
+    assert listed.largest_mm == pytest.approx(float(np.nanmedian(given.size.max_size_mm)), rel=0.01)
+    # the control: the other mass's size is another
+    assert found_on(two).estimate.masses[0].largest_mm != pytest.approx(listed.largest_mm, rel=0.1)
+
+
+def test_what_is_known_of_a_lump_is_used_for_the_first_alone() -> None:
+    two = scene(narrow=0.6)
+    known = found_on(two, known=(("seat", 1.2),)).estimate
+    plain = found_on(two).estimate
+    assert [one.reported for one in known.masses] == [False, True]  # the higher one, as without other masses
+    assert known.masses[0].largest_mm == pytest.approx(plain.masses[0].largest_mm, rel=0.01)
+    assert known.masses[1].largest_mm != pytest.approx(plain.masses[1].largest_mm, rel=0.01)
+
+
+def test_a_fit_that_moves_to_the_first_lump_gives_no_size() -> None:
+    two = scene(narrow=0.2)
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    first = found_on(two).estimate
+
+    def always_first(_: TactileMap, __: EstimateOptions) -> Estimate:
+        return replace(first, masses=(), other_rises=())
+
+    masses = with_masses(two, first, options, always_first).masses
+    assert places(masses) == [WIDE, NARROW]
+    assert masses[1].largest_mm is None
+    assert "does not tell them apart" in masses[1].estimate.reason
+
+
+def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
+    write_map(tmp_path / "two.nc", scene(narrow=0.6), provenance=Provenance("import", {}))
+    words = ("estimate", "two.nc", "--method", "laplace")
+    document = json.loads(run_here(*words, "--json", cwd=tmp_path).stdout)
+    check_document(document, "estimate.schema.json", path=tmp_path / "two.json")
+    masses = document["masses"]
+    assert [(one["number"], one["reported"]) for one in masses] == [(1, True), (2, False)]
+    assert masses[0]["max_size_mm"] == document["max_size_mm"]
+    assert masses[0]["another_exam"] == document["another_exam"]
+    assert masses[1]["max_size_mm"]["median"] < masses[0]["max_size_mm"]["median"]
+    assert masses[1]["centre_mm"]["x"] == pytest.approx(NARROW[0], abs=0.5)
+    assert masses[1]["centre_patient_mm"] is None
+    text = run_here(*words, cwd=tmp_path).stdout
+    assert "Mass 1 of 2: probability of a lump 1.000" in text
+    assert "Mass 2 at (16.0, 2.0) mm, 33 mm from mass 1: largest size " in text
+    assert "a second lump within 20 mm" in text
+    bare = json.loads(run_here(*words, "--json", "--size-calibration", "none", cwd=tmp_path).stdout)["masses"]
+    assert [one["max_size_mm"] for one in bare] == [None, None]
+    assert all(one["reason"] == "no size calibration was given: widths only" for one in bare)
+    found = tb.estimate(tmp_path / "two.nc", method="laplace")
+    assert [one.number for one in found.masses] == [1, 2]
+    assert found.masses[1].max_size_mm is not None
+    assert found.masses[1].max_size_mm.median == pytest.approx(masses[1]["max_size_mm"]["median"], abs=1e-6)
+    assert found.masses[0].reported
+    assert "mass 2" in [text.get_text() for text in found.plot_map().axes[0].texts]
+    assert "mass 1" not in [text.get_text() for text in tb.estimate(tb.demo_map()).plot_map().axes[0].texts]

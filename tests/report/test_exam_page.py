@@ -1,0 +1,341 @@
+"""The page of an exam: self-contained, every text escaped, drawn as the examiner sees it, honest without a lump."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mapping_scans import gaussian, make_scan, strokes
+
+import tactile_bayes as tb
+from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.exam import Exam, exam_map
+from tactile_bayes.report.exam_page import exam_page
+from tactile_bayes.report.exam_words import headline
+from tactile_bayes.report.printed import BROWSERS, find_printer
+from tactile_bayes.scan import Landmarks
+
+HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></svg></body>"
+VOID = {"meta", "img", "br", "image", "rect", "circle", "path", "stop"}
+SCANS = ({"sha256": "ab" * 32, "subject": "P07", "side": "left", "posture": "supine"},)
+
+
+class Page(HTMLParser):
+    """Tags, attributes and text of a page; every element must be closed in its turn."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self._open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert [tag for tag in self._open if tag != "p"] == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+    @property
+    def words(self) -> str:
+        return " ".join(" ".join(self.text).split())
+
+    def named(self, tag: str, **wanted: str) -> list[dict[str, str | None]]:
+        return [a for name, a in self.tags if name == tag and all(a.get(k) == v for k, v in wanted.items())]
+
+
+@cache
+def demo() -> tuple[TactileMap, dict[str, Any]]:
+    """The demo's map with a nipple 30 mm below and 25 mm to the patient's right of its lump, and its estimate."""
+    found = tb.estimate(tb.demo_map())
+    document = found.answer.document
+    assert document is not None
+    tactile_map = found.outcome.tactile_map
+    patient = tactile_map.patient_from_plane
+    assert patient is not None
+    lump = np.array([document["centre_mm"]["x"]["median"], document["centre_mm"]["y"]["median"], 0.0])
+    nipple = lump + patient[:3, :3].T @ np.array([25.0, -30.0, 0.0])
+    return replace(tactile_map, nipple_mm=nipple), document
+
+
+def exam(scans: tuple[Mapping[str, str], ...] = SCANS, **more: Any) -> Exam:
+    tactile_map, document = demo()
+    side = scans[0].get("side", "") if scans else ""
+    return Exam((exam_map(tactile_map, document, side=side),), None, scans, **more)
+
+
+def without_lump(reason_code: str = "undetected") -> Exam:
+    tactile_map, document = demo()
+    nothing = dict.fromkeys(
+        ("max_size_mm", "min_size_mm", "another_exam", "centre_mm", "amplitude", "background", "variance_share")
+    )
+    told = {"reason": "no lump found on the 50 cm2 that the map covers", "reason_code": reason_code}
+    gone = {**document, **nothing, **told, "status": "no_estimate", "masses": [], "detected_probability": 0.03}
+    return Exam((exam_map(tactile_map, gone, side="left"),), None, SCANS)
+
+
+def test_the_page_says_size_both_intervals_place_and_use() -> None:
+    _, document = demo()
+    size, other = document["max_size_mm"], document["another_exam"]["max_size_mm"]
+    page = Page(exam_page(exam()))
+    for text in (
+        f"Lump of about {size['median']:.1f} mm, 95 % interval {size['low']:.1f} to {size['high']:.1f} mm",
+        f"it lies between {size['low']:.1f} and {size['high']:.1f} mm, if exams of a lump differ by",
+        f"in the published trial, it lies between {other['low']:.1f} and {other['high']:.1f} mm",
+        "What would narrow it:",
+        "Left breast, 1:30 o'clock, 39 mm from the nipple (upper outer)",
+        "Subject P07",
+        "abababababab",
+        "age not stated in the scan",
+        RESEARCH_USE,
+    ):
+        assert text in page.words, text
+    assert "--" not in page.words  # no option of the program
+
+
+def test_nothing_is_loaded_and_no_script_may_run() -> None:
+    text = exam_page(exam())
+    page = Page(text)
+    policy = page.named("meta", **{"http-equiv": "Content-Security-Policy"})
+    assert policy[0]["content"] == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    assert page.named("script") == page.named("link") == page.named("iframe") == []
+    targets = [value for _, attrs in page.tags for name, value in attrs.items() if name in ("src", "href", "srcset")]
+    assert targets
+    assert all(str(value).startswith("data:image/png;base64,") for value in targets)
+    assert "http:" not in text
+    assert "https:" not in text
+    assert "@import" not in text
+    assert "url(" not in text
+
+
+def test_equal_exams_give_equal_pages_and_nothing_of_today() -> None:
+    assert exam_page(exam()) == exam_page(exam())
+    assert "Date" not in Page(exam_page(exam())).words
+    assert "Date 2026-03-01" in Page(exam_page(exam(day="2026-03-01"))).words
+
+
+def test_a_name_is_there_only_if_given() -> None:
+    assert "Name" not in Page(exam_page(exam())).words
+    assert "Name A. B." in Page(exam_page(exam(name="A. B."))).words
+
+
+def test_hostile_and_endless_texts_add_no_tag_and_stay_short() -> None:
+    plain = Page(exam_page(exam(title="t", name="n")))
+    for text in (HOSTILE, HOSTILE * 120, "a" * 10_000):
+        facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass", "sha256"), text)
+        page = exam_page(exam(({**facts, "side": "left"},), title=text, name=text))
+        found = Page(page)
+        assert found.named("script") == found.named("img") == []
+        names = {name for _, attrs in found.tags for name in attrs}
+        assert not {name for name in names if name.startswith("on")}
+        assert len(found.words) < len(plain.words) + 1500
+        if text is HOSTILE:
+            assert HOSTILE in found.text
+
+
+def centre_of(path: str) -> tuple[float, float]:
+    points = np.array([[float(n) for n in pair.split()] for pair in path.strip("MZ").split("L")])
+    return tuple(points.mean(axis=0))
+
+
+@pytest.mark.parametrize("head_deg", [70, 270, 0, 180])
+def test_a_lump_at_the_upper_outer_left_is_drawn_at_the_upper_right_and_told_so(head_deg: float) -> None:
+    """The nipple lies at the scan's middle, the lump 8 mm up and 10 mm to the patient's left of it."""
+    angle = np.radians(head_deg)
+    up = np.array([np.cos(angle), np.sin(angle), 0.0])
+    left = np.cross([0.0, 0.0, 1.0], up)  # z into the body: posterior cross superior is the patient's left
+    lump = 8.0 * up + 10.0 * left
+    marks = Landmarks(200 * up, -100 * up, nipple_mm=np.zeros(3))
+    field = gaussian(x=lump[0], y=lump[1], sigma_x=3.0, sigma_y=3.0)
+    tactile_map = build_map([make_scan(strokes(lines=7), field=field, landmarks=marks)], normalise="mean")
+    _, document = demo()
+    row, column = np.unravel_index(np.nanargmax(tactile_map.mean), tactile_map.mean.shape)
+    x, y = float(tactile_map.x_mm[column]), float(tactile_map.y_mm[row])
+    placed = {**document, "centre_mm": {"x": {"median": x, "sd": 0.1}, "y": {"median": y, "sd": 0.1}}}
+    text = exam_page(Exam((exam_map(tactile_map, placed, side="left"),), None, SCANS))
+    page = Page(text)
+    (drawn,) = page.named("svg", **{"class": "map"})
+    width, height = (float(n) for n in drawn["viewbox"].split()[2:])
+    across, down = centre_of(page.named("path", **{"class": "size"})[0]["d"])
+    assert across > 0.55 * (width - 10)
+    assert down < 0.45 * (height - 10)
+    corner = {one["data-side"]: one for one in page.named("text", **{"class": "edge"})}
+    assert float(corner["right"]["x"]) > float(corner["left"]["x"])
+    letters = re.findall(r'data-side="(\w+)"[^>]*>(\w)<', text)
+    assert dict(letters) == {"left": "R", "right": "L", "top": "H", "bottom": "F"}
+    assert _brightest(page) == ("upper", "right")
+    assert "Left breast, 1:30 o'clock, 13 mm from the nipple (upper outer)" in page.words
+    (dot,) = page.named("circle", **{"class": "lump"})
+    assert float(dot["cx"]) > 0 > float(dot["cy"])
+
+
+def _brightest(page: Page) -> tuple[str, str]:
+    """Where the embedded picture is brightest; a control that a mirrored picture would fail the test."""
+    from PIL import Image
+
+    data = base64.b64decode(page.named("image")[0]["href"].split(",", 1)[1])
+    pixels = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), dtype=float)
+    yellow = (pixels[..., 0] > 180) & (pixels[..., 1] > 180) & (pixels[..., 2] < 100)
+    rows, columns = np.nonzero(yellow)
+    across = "left" if columns.mean() < pixels.shape[1] / 2 else "right"
+    mirrored = "left" if np.nonzero(yellow[:, ::-1])[1].mean() < pixels.shape[1] / 2 else "right"
+    assert across != mirrored
+    return ("upper" if rows.mean() < pixels.shape[0] / 2 else "lower"), across
+
+
+def test_the_ellipses_are_drawn_to_scale() -> None:
+    _, document = demo()
+    page = Page(exam_page(exam()))
+    (drawn,) = page.named("svg", **{"class": "map"})
+    tactile_map = demo()[0]
+    scale = (float(drawn["viewbox"].split()[2]) - 10) / (tactile_map.mean.shape[1] * tactile_map.recipe.cell_mm)
+
+    def width(kind: str) -> float:
+        (one,) = page.named("path", **{"class": kind})
+        points = np.array([[float(n) for n in pair.split()] for pair in one["d"].strip("MZ").split("L")])
+        return float(np.ptp(points[:, 0]))
+
+    largest = document["max_size_mm"]
+    assert width("size") == pytest.approx(scale * document["d_x_mm"]["median"], rel=0.01)
+    assert width("size-high") / width("size") == pytest.approx(largest["high"] / largest["median"], rel=0.01)
+    assert width("size-low") / width("size") == pytest.approx(largest["low"] / largest["median"], rel=0.01)
+    (bar,) = page.named("path", **{"class": "scale"})
+    assert float(bar["d"].split("h")[1]) == pytest.approx(10 * scale, rel=0.01)
+
+
+def test_no_lump_found_is_told_with_what_was_covered() -> None:
+    page = Page(exam_page(without_lump()))
+    for text in (
+        "No lump found in the area covered",
+        "No lump was found in the area that was covered: ",
+        "cm² with 10 readings a cell or more",
+        "Probability that the likeliest rise on the map is a lump: 0.03.",
+        "A lump may lie outside the area that was covered, or be too small, too deep or too soft to show.",
+        "The program does not say from one map how small a lump it would have found.",
+        RESEARCH_USE,
+    ):
+        assert text in page.words, text
+    assert page.named("path", **{"class": "size"}) == []
+    assert "about" not in headline(without_lump())
+    assert headline(without_lump("window")) == "No size"  # a rise that cannot be measured is not "no lump"
+
+
+def test_several_masses_are_numbered_with_a_place_each() -> None:
+    tactile_map, document = demo()
+    second = {
+        "number": 2,
+        "reported": False,
+        "centre_mm": {"x": 15.0, "y": 8.0},
+        "centre_patient_mm": None,
+        "detected_probability": 0.99,
+        "amplitude": None,
+        "max_size_mm": None,
+        "min_size_mm": None,
+        "another_exam": None,
+        "reason": "its window reaches beyond the map",
+        "reason_code": "window",
+        "advice": "",
+    }
+    first = {**second, "number": 1, "reported": True, "reason": ""}
+    both = {**document, "masses": [first, second]}
+    page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
+    assert "2 masses, mass 1 about" in page.words
+    assert "Size of mass 1" in page.words
+    assert "no size (probability of a lump 0.99): its window reaches beyond the map" in page.words
+    assert len(page.named("path", **{"class": "centre"})) == 2
+
+
+def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() -> None:
+    tactile_map, document = demo()
+    page = Page(exam_page(Exam((exam_map(replace(tactile_map, nipple_mm=None), document, side=""),), None, ())))
+    assert "of the xiphoid and" in page.words
+    assert "No clock position: the scan names no nipple and no side." in page.words
+    assert page.named("svg", **{"class": "dial"}) == []
+
+
+def test_a_nipple_off_the_map_is_pointed_to() -> None:
+    tactile_map, document = demo()
+    far = replace(tactile_map, nipple_mm=tactile_map.nipple_mm + np.array([200.0, 0.0, 0.0]))
+    page = Page(exam_page(Exam((exam_map(far, document, side="left"),), None, SCANS)))
+    assert len(page.named("path", **{"class": "nipple-off"})) == 1
+    assert page.named("path", **{"class": "nipple"}) == []
+
+
+def test_the_age_of_the_array_calibration_is_told() -> None:
+    aged = ({**SCANS[0], "array_calibration_days": "12"},)
+    assert "12 days old at the exam" in Page(exam_page(exam(aged))).words
+    assert "age not stated" in Page(exam_page(exam(({**SCANS[0], "array_calibration_days": "<b>"},)))).words
+
+
+def test_a_page_from_python_is_the_same_and_private(tmp_path: Path) -> None:
+    found = tb.estimate(tb.demo_map())
+    found.report(tmp_path / "a.html")
+    found.report(tmp_path / "b.html", title="Demo")
+    assert (tmp_path / "a.html").stat().st_mode & 0o777 == 0o600
+    assert "<h1>Demo</h1>" in (tmp_path / "b.html").read_text()
+    assert (tmp_path / "a.html").read_text().replace("Tactile exam", "Demo") == (tmp_path / "b.html").read_text()
+    with pytest.raises(tb.errors.UsageError, match="exists"):
+        found.report(tmp_path / "a.html")
+
+
+def full() -> Exam:
+    """As much as a page can hold: repeats, masses, cautions, long texts, a tall map."""
+    tactile_map, document = demo()
+    mass = {
+        "number": 2,
+        "reported": False,
+        "centre_mm": {"x": 15.0, "y": 8.0},
+        "centre_patient_mm": None,
+        "detected_probability": 0.99,
+        "amplitude": None,
+        "max_size_mm": None,
+        "min_size_mm": None,
+        "another_exam": None,
+        "reason": "a reason that is long " * 20,
+        "reason_code": "window",
+        "advice": "",
+    }
+    masses = [{**mass, "number": 1, "reported": True}, *({**mass, "number": n} for n in range(2, 12))]
+    diagnostics = {**document["diagnostics"], "broken_assumptions": [f"caution {n} " * 80 for n in range(9)]}
+    told = {**document, "masses": masses, "diagnostics": diagnostics}
+    tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
+    size = {name: document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
+    pooled = {**size, "reason": "", "figures": document["diagnostics"], "fat_apart_mm": [5.0, 20.0]}
+    pooled["maps"] = [{"map": f"map {n}", "outlying": True} for n in range(12)]
+    facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
+    scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
+    maps = (exam_map(tall, told, side="left"),) * 12
+    return Exam(maps, pooled, scans, title="W" * 120, name="W" * 80, day="2026-03-01")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, BROWSERS)), reason="no Chromium is installed")
+@pytest.mark.parametrize("made", [exam, without_lump, full])
+def test_a_page_prints_to_one_side_and_to_the_same_bytes(made: Any) -> None:
+    page = exam_page(made())
+    first, second = (find_printer()(page) for _ in range(2))
+    assert first.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type ?/Page\b", first)) == 1
+    assert first == second

@@ -1,0 +1,81 @@
+"""Data, fit and residual of a window, and the titles of figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from posterior_maps import bump_map
+
+import tactile_bayes as tb
+from tactile_bayes.api.estimates import SizeEstimate
+from tactile_bayes.api.maps import Map
+from tactile_bayes.posterior.fitted import fitted_cells
+from tactile_bayes.report.figure_title import named_exam
+
+NOISE_SD = 0.004
+SLOPE = 0.003
+
+
+def truth(x_mm: np.ndarray, y_mm: np.ndarray, *, amplitude: float, slope: float) -> np.ndarray:
+    """Eq 7 with a slope along x, as the maps here are made."""
+    return 1 + slope * x_mm + amplitude * np.exp(-(x_mm**2 + y_mm**2) / (2 * 5.0**2))
+
+
+def estimated(noise: str, *, slope: float) -> SizeEstimate:
+    plain = bump_map(amplitude=0.0)
+    x, y = np.meshgrid(plain.x_mm, plain.y_mm)
+    mean = truth(x, y, amplitude=0.4, slope=slope) - 1
+    mean += NOISE_SD * np.random.default_rng(117).standard_normal(mean.shape)
+    made = Map(bump_map(amplitude=0.0, noise=mean))
+    background = {"background": "free"} if noise == "independent" else {}
+    return tb.estimate(made, size_calibration="none", method="laplace", noise=noise, **background)
+
+
+@pytest.mark.parametrize(("noise", "slope"), [("field", SLOPE), ("field", 0.0), ("independent", 0.0)])
+def test_the_fit_is_the_truth_to_within_its_noise_and_the_residual_is_the_noise(noise: str, slope: float) -> None:
+    fitted = fitted_cells(estimated(noise, slope=slope).outcome.estimate)
+    assert fitted is not None
+    off = fitted.fit - truth(fitted.x_mm, fitted.y_mm, amplitude=0.4, slope=slope)
+    assert np.abs(off).max() < NOISE_SD  # some ten parameters from over a thousand cells
+    assert fitted.residual.std() == pytest.approx(NOISE_SD, rel=0.06)
+    # the control: the bump alone is no fit of a sloping map
+    flat = fitted.value - truth(fitted.x_mm, fitted.y_mm, amplitude=0.4, slope=0.0)
+    assert bool(flat.std() > 2 * NOISE_SD) is bool(slope)
+
+
+def test_the_figure_is_what_its_name_says_and_the_map_stands_in_without_an_estimate(tmp_path: Path) -> None:
+    found = estimated("independent", slope=0.0)
+    for suffix, magic in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")):
+        found.plot_fit(tmp_path / f"fit{suffix}")
+        assert (tmp_path / f"fit{suffix}").read_bytes().startswith(magic)
+    drawn = found.plot_fit()
+    assert [axes.get_title(loc="left") for axes in drawn.axes[:2]] == ["Data", "Fit"]
+    assert drawn.axes[2].get_title(loc="left").startswith("Residual, SD 0.00")
+    noise = 0.02 * np.random.default_rng(3).standard_normal((51, 51))
+    nothing = tb.estimate(Map(bump_map(amplitude=0.0, noise=noise)), size_calibration="none")
+    assert nothing.plot_fit().axes[0].get_title(loc="left").startswith("Tactile map")
+
+
+@pytest.mark.parametrize(
+    ("name", "scans", "title"),
+    [
+        ("exam", [], "exam"),
+        ("exam", [{"sha256": "0123456789ab", "subject": "P07"}], "exam (P07, scan 01234567)"),
+        ("", [{"sha256": "0123456789ab"}], "scan 01234567"),
+        ("a", [{"sha256": f"{n}" * 64, "subject": "P"} for n in range(5)],
+         "a (P, scans 00000000, 11111111, 22222222 and 2 more)"),
+        (r"a$\frac$", [{"sha256": "$x^", "subject": "<b>$"}], r"a\$\frac\$"),
+    ],
+)  # fmt: skip
+def test_titles_carry_the_subjects_code_and_the_scans_digest(
+    name: str, scans: list[dict[str, str]], title: str
+) -> None:
+    assert named_exam(name, scans) == title
+
+
+def test_a_dollar_in_a_name_starts_no_formula(tmp_path: Path) -> None:
+    found = SizeEstimate(estimated("independent", slope=0.0).outcome, r"a$\frac$")
+    found.plot_map(tmp_path / "map.png")
+    assert (tmp_path / "map.png").exists()
