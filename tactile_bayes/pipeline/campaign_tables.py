@@ -135,7 +135,7 @@ def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
 def estimate_facts(document: Any) -> dict[str, Any]:
     """What tables and pages need of an estimate's JSON object."""
     diagnostics = {name: document["diagnostics"].get(name, []) for name in _OF_DIAGNOSTICS}
-    masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document["masses"]]
+    masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document.get("masses", [])]
     return {name: document[name] for name in _OF_ESTIMATE} | {"diagnostics": diagnostics, "masses": masses}
 
 
