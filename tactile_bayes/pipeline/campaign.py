@@ -288,7 +288,7 @@ class Campaign:
         if self._sizes_unknown:
             self._stages.run("size", [], without=len(sound))
         elif self.repeatability is not None:
-            self._stages.total += len(estimated)
+            self._stages.total += len(estimated) * (2 if self.settings.copy_to else 1)
             for block in _blocks(estimated, self._block):
                 tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
                 self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
