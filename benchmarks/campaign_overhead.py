@@ -29,9 +29,10 @@ from tactile_bayes.batch import run_batch
 from tactile_bayes.executors import open_executor
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline import campaign as campaigns
-from tactile_bayes.pipeline import campaign_report, campaign_tables
+from tactile_bayes.pipeline import campaign_report, campaign_stages, campaign_tables
 from tactile_bayes.pipeline.campaign_folder import EXAMS, open_campaign
 from tactile_bayes.pipeline.campaign_inputs import Sources
+from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 from tactile_bayes.pipeline.campaign_steps import ESTIMATE, Task
 
 
@@ -61,9 +62,9 @@ def client(out: Path, exams: int) -> None:
         table = [_exam(number) for number in range(exams)]
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
         for module, name, fake in (
-            (campaigns, "run_step", step),
+            (campaign_stages, "run_step", step),
             (campaigns, "read_sources", sources),
-            (campaigns, "unchanged", lambda *_: True),
+            (campaign_stages, "unchanged", lambda *_: True),
             (campaign_tables, "load_json", lambda _path: json.loads(estimate.read_text())),
             (campaign_tables, "pooled_documents", lambda _campaign: {}),
         ):
@@ -71,12 +72,12 @@ def client(out: Path, exams: int) -> None:
         folder = Path(place) / "out"
         for what in ("steps that do nothing", "going on from the journal"):
             with measured(what, exams), open_campaign(folder) as store:
-                run = campaigns.Campaign(table, folder, campaigns.CampaignSettings(), store=store)
+                run = campaigns.Campaign(table, folder, CampaignSettings(), store=store)
                 run.run()
         size = (folder / JOURNAL).stat().st_size
         print(f"journal: {size / 1e6:.1f} MB, {size / exams:.0f} bytes each")
         with measured("tables and contact sheet", exams), open_campaign(folder) as store:
-            run = campaigns.Campaign(table, folder, campaigns.CampaignSettings(), store=store)
+            run = campaigns.Campaign(table, folder, CampaignSettings(), store=store)
             run.run()
             stack.enter_context(mock.patch.object(campaign_report, "_MOST_INLINE", 0))
             campaign_report.write_outputs(run, None)

@@ -106,7 +106,7 @@ class ClusterWorkers(Executor):
 
     def __init__(self, cluster: Executor, threads: int) -> None:
         self._cluster = cluster
-        self.ahead = max(64, 4 * threads)
+        self.ahead = max(16, 4 * threads)
         """Number of items to submit ahead: no worker waits, and the scheduler holds few at any time."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tactile_bayes.files.manifest_csv import Exam
     from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_report import Written
-    from tactile_bayes.pipeline.campaign_state import CampaignSettings
+    from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 
 _FILE = FilePath()
 _MOST_NAMED = 5
@@ -121,8 +121,9 @@ def run(
     """Map, estimate and pool the exams of a table, and report the trial.
 
     DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
-    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. An exam's fault is
-    its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
+    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. Where 5 masses have
+    several exams at one visit, the spread between exams is learned from them and every size is by it. An exam's fault
+    is its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
     what depends on a file or setting that changed, and what failed.
 
     Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
@@ -136,7 +137,7 @@ def run(
     from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
     from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, copy_outputs, write_outputs
-    from tactile_bayes.pipeline.campaign_state import CampaignSettings
+    from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
     also_read(given)
@@ -147,14 +148,15 @@ def run(
         settings,
         normalise,
         figures,
-        match_mm=match_mm,
+        match_mm,
         own_repeatability=repeatability is None,
         copy_to="" if copy_to is None else check_address(copy_to),
     )
     table = read_manifest(exams)
     _check_paths(table, output, of_all)
     refuse_same(
-        [output / name for name in WRITTEN], [path for path in (exams, excision, protocol, settings_file) if path]
+        [output / name for name in WRITTEN],
+        [path for path in (exams, excision, protocol, settings_file, given) if path],
     )
     check_inputs(excision, protocol)
     with (

@@ -14,15 +14,16 @@ from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result, stamp
+from tactile_bayes.pipeline.campaign_keys import stamp
+from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
 
 JOURNAL: Final = "campaign.journal"
 EXAMS, MASSES = "exams", "masses"
 _HEADER: Final = {"campaign": 1}
-_BESIDE: Final = ("repeatability",)
-"""Steps whose files lie beside the exams."""
 _LATEST: Final = 1000
 """So many results of a step tell how long it takes."""
+_BESIDE: Final = ("repeatability",)
+"""Steps whose files lie beside the exams."""
 
 
 @contextlib.contextmanager
@@ -121,12 +122,11 @@ def tidy(
     unread
         Exams whose file could not be read: a disk that is away costs nothing that is done.
     """
-    for step in _BESIDE:
-        kept = {name for result in results[step].values() for name in result["files"]}
-        for name in set(FILES[step]) - kept:
-            (folder / name).unlink(missing_ok=True)
     left = []
     spared = {*unread, *(exam.of_mass for exam in exams if exam.name in unread)}
+    for step in _BESIDE:
+        made = {file for result in results[step].values() for file in result["files"]}
+        _clear(folder, known=FILES[step], made=made)
     for kind, names, steps in (
         (EXAMS, {exam.name for exam in exams}, tuple(step for step in results if step not in ("pool", *_BESIDE))),
         (MASSES, {exam.of_mass for exam in exams}, ("pool",)),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -21,8 +21,8 @@ from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.remote import sha256_of, version_of
-from tactile_bayes.pipeline.campaign_match import named_exams, placed_exams
-from tactile_bayes.pipeline.campaign_steps import stamp
+from tactile_bayes.pipeline.campaign_keys import stamp
+from tactile_bayes.pipeline.campaign_match import Breasts
 from tactile_bayes.records import dataclass
 
 READ: Final = "read"
@@ -67,7 +67,7 @@ def read_sources(
     Parameters
     ----------
     keep
-        Whether new digests go into the journal.
+        Whether new digests go into the journal. Without, files in object stores that are not known are passed over.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def read_sources(
     values: Mapping[str, Any] = {} if store is None else store.values
     found = Sources({one.path: values[one.key]["sha256"] for one in settled if one.key in values}, {})
     for sources, kept in ((settled, store if keep else None), (fresh, None)):
-        waiting = [one for one in sources if one.path not in found.digests]
+        waiting = [one for one in sources if one.path not in found.digests and (keep or not one.address)]
         outcomes = run_batch(_read, waiting, key=_key, executor=executor, store=kept, progress=progress)
         for one, outcome in zip(waiting, outcomes, strict=True):
             if outcome.value is not None:
@@ -125,22 +125,19 @@ def _read(source: _Source) -> dict[str, Any]:
     return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
 
 
-def same_bytes(exams: Sequence[Exam], digests: Mapping[Path, str]) -> dict[str, str]:
+def same_bytes(exams: Iterable[Exam], digests: Mapping[Path, str], breasts: Breasts) -> dict[str, str]:
     """Reasons against exams of one file, by the exam's name; masses of one scan, each with its place, are sound."""
-    breasts_of = placed_exams(exams)
     same: dict[str, list[Exam]] = defaultdict(list)
     for exam in exams:
         if exam.path in digests:
             same[digests[exam.path]].append(exam)
     faults = {}
     for alike in same.values():
-        breasts = {(exam.patient, exam.visit, exam.side) for exam in alike}
-        placed = {
-            exam.mass
-            for exam in alike
-            if exam.centre_mm is not None or named_exams(exam, breasts_of.get((exam.patient, exam.side), ()))
-        }
-        if len(alike) == 1 or (len(breasts) == 1 and len(placed) == len(alike)):
+        if len(alike) == 1:
+            continue
+        one_visit = len({(exam.patient, exam.visit, exam.side) for exam in alike}) == 1
+        placed = {one.mass for one in alike if one.centre_mm is not None or breasts.named(one)}
+        if one_visit and len(placed) == len(alike):
             continue
         for exam in alike:
             others = [other for other in alike if other is not exam]

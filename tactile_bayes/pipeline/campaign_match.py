@@ -7,7 +7,8 @@ in the maps' own axes where a scan has no landmarks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -49,15 +50,6 @@ class NamedPlace:
     centre_mm: tuple[float, float]
 
 
-def placed_exams(exams: Sequence[Exam]) -> dict[tuple[str, str | None], list[Exam]]:
-    """Exams that name their mass by place, by patient and side."""
-    found: dict[tuple[str, str | None], list[Exam]] = {}
-    for exam in exams:
-        if exam.centre_mm is not None:
-            found.setdefault((exam.patient, exam.side), []).append(exam)
-    return found
-
-
 def named_exams(exam: Exam, exams: Sequence[Exam]) -> list[Exam]:
     """For an exam without a place the exams that name one: for each mass of the breast one, of its visit if possible.
 
@@ -71,6 +63,20 @@ def named_exams(exam: Exam, exams: Sequence[Exam]) -> list[Exam]:
         if one.centre_mm is not None:
             found.setdefault(one.mass, one)
     return list(found.values()) if exam.mass in found else []
+
+
+class Breasts:
+    """Exams of each breast, so that those of a large table are found without a walk through it."""
+
+    def __init__(self, exams: Sequence[Exam]) -> None:
+        self._exams: dict[tuple[str, str | None], list[Exam]] = defaultdict(list)
+        for exam in exams:
+            self._exams[exam.patient, exam.side].append(exam)
+
+    def named(self, exam: Exam, of: Container[str] | None = None) -> list[Exam]:
+        """As `named_exams`, over the exams of this breast; `of` holds the names of those that count."""
+        breast = self._exams[exam.patient, exam.side]
+        return named_exams(exam, breast if of is None else [one for one in breast if one.name in of])
 
 
 def matched_outcome(

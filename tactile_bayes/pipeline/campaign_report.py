@@ -35,14 +35,7 @@ _MOST_INLINE: Final = 300
 """With more exams the contact sheet names its thumbnails' files instead of holding them."""
 _MOST_CARDS: Final = 10_000
 """More exams than a browser shows at ease."""
-_LINKS: Final = {
-    "map.png": MAP_FIGURE,
-    "size.png": SIZE_FIGURE,
-    "sized.png": SIZED_FIGURE,
-    "estimate.json": ESTIMATE,
-    "sized.json": SIZED,
-    "map.nc": MAP,
-}
+_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,19 +192,10 @@ def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int],
         cards = [_self_contained(card, campaign.folder) for card in cards]
     masses = len(campaign.found.results["pool"])
     lines = [f"{len(rows)} exams: {counts_words(*counts)}."] + ([f"{masses} masses pooled."] if masses else [])
-    lines += [repeatability_words(campaign)] if campaign.repeatability else []
     if len(cards) < len(rows):
         lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
+    lines += [repeatability_words(campaign)] if campaign.repeatability else []
     return campaign_html(cards, lines=lines, links=links, version=__version__)
-
-
-def repeatability_words(campaign: Campaign) -> str:
-    """What the repeats say of the site, and that the sizes are by it; why they do not where they might have."""
-    found = campaign.repeatability
-    if found is None:
-        return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
-    words = found.words()
-    return f"{words[0].upper()}{words[1:]}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
 
 
 def _self_contained(card: Card, folder: Path) -> Card:
@@ -221,6 +205,15 @@ def _self_contained(card: Card, folder: Path) -> Card:
     if not isinstance(card.thumbnail, str):
         return card
     return replace(card, thumbnail=read_bytes(folder / card.thumbnail, most=IMAGE_BYTES))
+
+
+def repeatability_words(campaign: Campaign) -> str:
+    """What the repeats say of the site, and that the sizes are by it; why they do not where they might have."""
+    found = campaign.repeatability
+    if found is None:
+        return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
+    words = found.words()
+    return f"{words[0].upper()}{words[1:]}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
 
 
 def counts_words(sized: int, unsized: int, failed: int) -> str:
@@ -249,5 +242,5 @@ def _card(campaign: Campaign, row: Row) -> Card:
         cautions=tuple(row.cautions),
         checks=tuple(row.checks),
         thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
-        links={words: f"{EXAMS}/{exam.name}/{name}" for words, name in _LINKS.items() if name in made},
+        links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},
     )

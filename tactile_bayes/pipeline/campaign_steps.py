@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.pipeline.campaign_keys import stamp
 from tactile_bayes.pipeline.campaign_match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
@@ -75,12 +76,12 @@ class Task:
         exam is not matched.
     members
         pool: names and folders of the exams.
+    copies
+        copy: addresses in an object store, by the names of the files.
     repeats
         repeatability: the exams.
     figures
         size: whether to draw it.
-    copies
-        copy: addresses in an object store, by the names of the files.
     """
 
     step: str
@@ -96,10 +97,10 @@ class Task:
     places: tuple[NamedPlace, ...] = ()
     match_mm: float = 0.0
     members: tuple[tuple[str, Path], ...] = ()
-    repeats: tuple[ExamFolder, ...] = ()
-    figures: bool = False
     address: str = ""
     copies: Mapping[str, str] = field(default_factory=dict)
+    repeats: tuple[ExamFolder, ...] = ()
+    figures: bool = False
 
     @property
     def key(self) -> str:
@@ -137,12 +138,6 @@ def run_step(task: Task) -> Result:
 
 
 Writes = dict[str, Callable[[Path], object]]
-
-
-def stamp(path: Path) -> str:
-    """Size, times and inode of a file, which differ when it was written to or replaced."""
-    known = path.stat()
-    return f"{known.st_size} {known.st_mtime_ns} {known.st_ctime_ns} {known.st_ino}"
 
 
 def _digests(folder: Path, names: list[str]) -> tuple[dict[str, str], dict[str, str]]:
@@ -347,15 +342,9 @@ def _pool(task: Task) -> tuple[Result, Writes]:
 
 
 def _copy(task: Task) -> tuple[Result, Writes]:
-    """Copy files into an object store."""
-    from tactile_bayes.files.remote import put
+    from tactile_bayes.pipeline.campaign_copies import copy_step
 
-    try:
-        for name, address in task.copies.items():
-            put(task.folder / name, address)
-    except UsageError as error:
-        return {UNWRITTEN: str(error)}, {}
-    return {}, {}
+    return copy_step(task)
 
 
 def _answer(folder: Path) -> Answer:

@@ -31,7 +31,6 @@ _FAILURE_COLUMNS: Final = ("patient", "visit", "mass", "replicate", "file", "ste
 _OF_ESTIMATE: Final = (
     "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability",
 )  # fmt: skip
-_OF_MASS: Final = ("reported", "centre_mm")
 _OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
 _OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
 """What tables and pages show of a document: the rest of it is a hundred times as much."""
@@ -136,8 +135,8 @@ def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
 def estimate_facts(document: Any) -> dict[str, Any]:
     """What tables and pages need of an estimate's JSON object."""
     diagnostics = {name: document["diagnostics"].get(name, []) for name in _OF_DIAGNOSTICS}
-    masses = [{name: mass[name] for name in _OF_MASS} for mass in document["masses"]]
-    return {name: document[name] for name in _OF_ESTIMATE} | {"masses": masses, "diagnostics": diagnostics}
+    masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document.get("masses", [])]
+    return {name: document[name] for name in _OF_ESTIMATE} | {"diagnostics": diagnostics, "masses": masses}
 
 
 def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:

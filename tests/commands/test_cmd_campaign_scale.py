@@ -162,6 +162,9 @@ def test_exams_in_a_store_give_what_local_ones_give_and_are_copied_there(
     done = run_here("campaign", "init", "s3://trial/scans", "-o", "exams.csv", cwd=tmp_path)
     assert done.stdout.startswith("exams.csv: 6 exams of 4 patients\n"), done.stderr
     write_table(tmp_path / "exams.csv", [(f"s3://trial/{file}", *rest) for file, *rest in ROWS])
+    planned = campaign(tmp_path, "--copy-to", "s3://trial/out/", "--dry-run")
+    assert "map: 6 to do, 0 done\nestimate: 6 to do, 0 done\ncopy: 10 to do, 0 done" in planned.stdout, planned.stdout
+    assert not store.exists("/trial/out")
     done = campaign(tmp_path, "--copy-to", "s3://trial/out/")
     assert "3 sized, 1 without a size, 2 failed" in done.stdout, done.stderr
     there = {name.removeprefix("/trial/out/"): store.cat(name) for name in store.find("/trial/out")}
