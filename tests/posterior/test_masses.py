@@ -141,7 +141,7 @@ def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
 
 
 def test_both_masses_of_a_shared_scan_are_listed_and_hold(shared_data: Path, tmp_path: Path) -> None:
-    """Spheres of 15 and 10 mm, 34 mm apart, by an independent model (truth.csv); a rib was once fitted at the second."""
+    """Spheres of 15 and 10 mm, 34 mm apart, by an independent model (truth.csv); a rib was once fitted there."""
     run_here("import", shared_data / "scans" / "s05_two_masses.npz", "-o", "s05.mcap", cwd=tmp_path)
     run_here("map", "s05.mcap", "-o", "s05.nc", cwd=tmp_path)
     masses = json.loads(run_here("estimate", "s05.nc", "--json", cwd=tmp_path).stdout)["masses"]
