@@ -185,6 +185,9 @@ def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
         def widths_mm(self) -> tuple[float, float]:
             return widths
 
+        def bump(self) -> object:
+            return seen.bump()
+
         def draw(self, *given: object, **named: object) -> object:
             Odd.drawings += 1
             return seen.draw(*given, **named)  # type: ignore[arg-type]

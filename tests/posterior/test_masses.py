@@ -138,3 +138,18 @@ def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
     assert found.masses[0].reported
     assert "mass 2" in [text.get_text() for text in found.plot_map().axes[0].texts]
     assert "mass 1" not in [text.get_text() for text in tb.estimate(tb.demo_map()).plot_map().axes[0].texts]
+
+
+def test_both_masses_of_a_shared_scan_are_listed_and_hold(shared_data: Path, tmp_path: Path) -> None:
+    """Spheres of 15 and 10 mm, 34 mm apart, by an independent model (truth.csv); a rib was once fitted there."""
+    run_here("import", shared_data / "scans" / "s05_two_masses.npz", "-o", "s05.mcap", cwd=tmp_path)
+    run_here("map", "s05.mcap", "-o", "s05.nc", cwd=tmp_path)
+    masses = json.loads(run_here("estimate", "s05.nc", "--json", cwd=tmp_path).stdout)["masses"]
+    assert len(masses) == 2
+    for mass, d_mm, x_mm in zip(masses, (15.0, 10.0), (43.0, 77.0), strict=True):
+        assert mass["max_size_mm"]["low"] < d_mm < mass["max_size_mm"]["high"]
+        assert mass["centre_patient_mm"]["x"] == pytest.approx(x_mm, abs=1.0)
+    words = ("estimate", "s05.nc", "--centre-mm", 15, 2, "--json")
+    given = json.loads(run_here(*words, cwd=tmp_path).stdout)
+    assert given["scene"]["beside"] is None
+    assert [mass["reported"] for mass in given["masses"]] == [False, True]
