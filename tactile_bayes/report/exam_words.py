@@ -146,6 +146,8 @@ def caution_sentences(exam: Exam) -> list[str]:
         if exam.pooled["fat_apart_mm"]:
             depths = " and ".join(f"{depth:.1f}" for depth in exam.pooled["fat_apart_mm"])
             found.insert(0, f"Caution: the fat under the head is {depths} mm deep on two maps: are they of one mass?")
+        if any(len(one.masses) > 1 for one in exam.maps):
+            found.insert(0, "To check: a map shows several masses; was every map sized at the same one?")
         apart = [one["map"] for one in exam.pooled["maps"] if one["outlying"]]
         found += [f"To check: apart from the others: {', '.join(apart)}."] if apart else []
     told = list(dict.fromkeys(found))

@@ -152,7 +152,7 @@ def test_hostile_and_endless_texts_add_no_tag_and_stay_short() -> None:
         assert not {name for name in names if name.startswith("on")}
         assert len(found.words) < len(plain.words) + 1500
         if text is HOSTILE:
-            assert HOSTILE in found.text
+            assert any(one.startswith(HOSTILE[:45]) for one in found.text)  # as text, and cut to its room
 
 
 def centre_of(path: str) -> tuple[float, float]:
