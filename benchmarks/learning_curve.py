@@ -4,7 +4,8 @@
 
 POPULATION.csv is a table of `population`. From it, N bodies are drawn at random, each form learns from them, and the
 others are sized by the mean of their exams. Printed: mean absolute error and bias, share of 95 % intervals that hold,
-SD of standardised errors, median half width; then the same of the last form by classes of lumps.
+SD of standardised errors, median half width; then the same of the last form by classes of lumps. With `--known
+stiffness_ratio` sizes are given the true value of each held-out body, as `estimate --known` would be.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.pipeline.size_calibration import FORMS, population_learner, rows_of_one_way
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.hidden import LOGGED
 from tactile_bayes.size.learn.regression import PopulationTable
-from tactile_bayes.studies.population import population_table
+from tactile_bayes.size.supposed import known_body
+from tactile_bayes.studies.population import UNKNOWNS, population_table
 
 _STEP = 1e-3
 _NORMAL_95 = 1.959964
@@ -37,6 +40,7 @@ def main() -> None:
     parser.add_argument("--bodies", type=int, nargs="+", default=[250, 500, 1000, 2000])
     parser.add_argument("--forms", nargs="+", choices=FORMS, default=["log-quadratic", "gaussian-process"])
     parser.add_argument("--without-places", action="store_true", help="learn without the figures by place")
+    parser.add_argument("--known", nargs="+", choices=UNKNOWNS, default=[], help="properties told of each body")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
@@ -51,35 +55,52 @@ def main() -> None:
             continue
         for form in given.forms:
             learn = partial(population_learner(form), recipe=Recipe(way, "free", 20.0, noise="field"))
-            found = [_held_out(table, learn, number, given.seed + i) for i in range(given.repeats)]
+            sized = partial(size_error, known=given.known)
+            found = [_held_out(table, learn, sized, number, given.seed + i) for i in range(given.repeats)]
             error, variance, body = (np.concatenate([one[i] for one in found]) for i in range(3))
             print(f"{number:5d} {form:17s} {_figures(error, variance)}", flush=True)
     _by_class(table, error, variance, body)
 
 
 def _held_out(
-    table: PopulationTable, learn: Callable[..., BodyCalibration], number: int, seed: int
+    table: PopulationTable,
+    learn: Callable[..., BodyCalibration],
+    sized: Callable[[BodyCalibration, PopulationTable], tuple[float, float]],
+    number: int,
+    seed: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(b,) log errors, their variances and the bodies' numbers, of those that took no part."""
     bodies = np.unique(table.body)
     taught = np.random.default_rng(seed).permutation(bodies)[:number]
     calibration = learn(table.rows(np.isin(table.body, taught)))
     rest = np.setdiff1d(bodies, taught)
-    found = np.array([_sized(calibration, table.rows(table.body == one)) for one in rest])
+    found = np.array([sized(calibration, table.rows(table.body == one)) for one in rest])
     return found[:, 0], found[:, 1], rest
 
 
-def _sized(calibration: BodyCalibration, exams: PopulationTable) -> tuple[float, float]:
-    """Log error of one body by the mean of its exams, and the variance that the calibration states."""
+def size_error(
+    calibration: BodyCalibration, exams: PopulationTable, *, known: Sequence[str] = ()
+) -> tuple[float, float]:
+    """Log error of one body by the mean of its exams, and the variance that the calibration states.
+
+    Parameters
+    ----------
+    known
+        Properties of which the true value is told.
+    """
     at = calibration.at_fat(_known(exams.profile, len(exams))).at_places(_known(exams.by_place, len(exams)))
     a, p = exams.log_amplitude, exams.log_width
     size = at.log_size(a, p)
     slope = np.stack([(at.log_size(a + _STEP, p) - at.log_size(a - _STEP, p)) / (2 * _STEP), at.width_slope(a, p)])
-    own = np.einsum("in,nij,jn->n", slope, exams.covariance[:, :2, :2], slope).mean()
+    exam = np.einsum("in,nij,jn->n", slope, exams.covariance[:, :2, :2], slope).mean() + np.exp(2 * at.mean[-1])
     middle = a.mean(keepdims=True), p.mean(keepdims=True)
     body, _, error = at.body_and_error(at.terms(a, p).mean(axis=0, keepdims=True), *middle, np.zeros(1))
-    variance = float(body[0] ** 2 + error[0] + (own + np.exp(2 * at.mean[-1])) / len(exams))
-    return float(size.mean() - np.log(exams.d_mm[0])), variance
+    told = {name: float(exams.unknowns[name][0]) for name in known}
+    told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
+    expected, left = known_body(at, told, *middle)
+    own = np.sqrt(max(body[0] ** 2 - at.other_sd**2, 0.0))
+    variance = (left * own) ** 2 + at.other_sd**2 + float(error[0]) + exam / len(exams)
+    return float(size.mean() + expected[0] * own - np.log(exams.d_mm[0])), float(variance)
 
 
 def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...] | None]:

@@ -16,6 +16,7 @@ from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.scene_text import scene_document
+from tactile_bayes.report.supposed_text import supposed_document
 from tactile_bayes.size.posterior import EXTREMES, SIZES, SizePosterior
 
 SCHEMA = "tactile-bayes/estimate/1"
@@ -80,6 +81,7 @@ def estimate_document(
         "advice": estimate.advice,
         **{name: one(name) for name in (*SIZES, *WIDTHS)},
         ANOTHER_EXAM: another_exam(estimate.size, quantities),
+        "supposing": supposed_document(estimate.size, quantities.get("max_size_mm")),
         "centre_mm": point("centre_mm"),
         "centre_patient_mm": point("centre_patient_mm"),
         "angle_deg": one("angle_deg"),

@@ -26,6 +26,7 @@ from tactile_bayes.report.size_text import (
     table_row,
     two_intervals_text,
 )
+from tactile_bayes.report.supposed_text import supposed_document, supposed_lines
 from tactile_bayes.size.posterior import EXTREMES, SIZES
 
 ANOTHER_LARGEST = f"{ANOTHER_EXAM}.max_size_mm"
@@ -132,6 +133,9 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
         spread = exam_spread(estimate)
         lines += [] if spread is None else [two_intervals_text(estimate.size.figures.get("between_map_sd"), spread)]
         lines += width_lines(estimate.size.variance_share)
+        largest = quantities["max_size_mm"]
+        supposed, places = supposed_document(estimate.size, largest), size_decimals([largest])
+        lines += supposed_lines(supposed, largest.median, places=places)
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
         if found is not None and found.size_calibration:

@@ -219,7 +219,10 @@ class FatProcess(FatTerms):
         """The calibration at one depth for (3,) or (9,) standardised figures of the frames."""
         fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
         own = {"kernel": self._kernel, "profile": figures, "other_sd": self.other_sd, "with_places": self.with_places}
-        return ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own})
+        found = ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own})
+        if self.places is None or found.hidden is None:
+            return found
+        return replace(found, hidden=found.hidden.at_places(figures[len(HEAD_PROFILE) :]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -112,7 +112,8 @@ def test_what_decides_is_named_and_what_does_not_is_not(learned):
 def test_a_known_seat_moves_the_size_and_narrows_it(learned):
     assert learned.hidden is not None
     terms = learned.terms(np.array(-0.8), np.array(1.4))
-    low, high = (float(learned.hidden.expected_body({"seat": s}, terms)) for s in (0.0, 1.2))
+    body_sd = np.exp(learned.mean[6] + learned.mean[7] * terms[1])
+    low, high = (body_sd * float(learned.hidden.expected_body({"seat": s}, terms)) for s in (0.0, 1.2))
     assert low - high == pytest.approx(-SEAT_SLOPE * 1.2, rel=0.15)
     assert learned.hidden.share("seat", "fat_kpa") >= learned.hidden.share("seat") - 1e-12
 

@@ -254,7 +254,7 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     exam = used.between_exams.sd**2 / n
     noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
     return _Phantom(
-        residual=float(left.mean()) - expected,
+        residual=float(left.mean()) - expected * body_sd,
         width=float(log_width.mean()) - centre,
         spread_variance=alone * body_sd**2 + exam,
         map_variance=noise,
@@ -268,7 +268,7 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
 def _known(
     calibration: BodyCalibration, known: Mapping[str, float], log_amplitude: float, log_width: float
 ) -> tuple[float, float, float]:
-    """E[B] given known properties, and of the variance of B the shares that are the phantom's own and the set's."""
+    """E[B] over SD(B) given known properties, and of its variance the phantom's own and the set's shares."""
     hidden = calibration.hidden
     if hidden is None:
         return 0.0, 1.0, 0.0
