@@ -1,4 +1,4 @@
-"""How large a lump would be if it were soft, hard, centred or clear of the gland: as plain data and as text."""
+"""How large a lump would be if it were soft, hard, centred on the gland's surface or resting on it: data and text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LEAST_CHANGE = 0.02
 """Of the size, from which a pair of suppositions is worth a line."""
 PAIRS = (
     ("the lump soft", "soft", "hard", " ({:g} times as stiff as fat)", " ({:g} times)"),
-    ("it centred on the gland's surface", "centred", "clear", "", " of the gland"),
+    ("it centred on the gland's surface", "centred", "resting", "", " on the gland"),
 )
 """Of suppositions, with the words of the first, and what follows each, a value in it."""
 

@@ -20,10 +20,10 @@ SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
     "soft": ("stiffness_ratio", 11.0),
     "hard": ("stiffness_ratio", 70.0),
     "centred": ("seat", 0.0),
-    "clear": ("seat", 1.0),
+    "resting": ("seat", 1.0),
 }
 """A property and its value by name: lumps of 8 to 15 and 50 to 100 times the stiffness of fat, centred on the gland's
-surface and just clear of the gland."""
+surface and resting on it."""
 
 
 @dataclass(frozen=True, slots=True)
