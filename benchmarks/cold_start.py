@@ -73,6 +73,7 @@ MEASURED_ELSEWHERE = {
     "study": "benchmarks.forward: minutes of work",
     "tables": "benchmarks.forward: minutes of work",
     "head": "benchmarks.forward's model: `head design` is 2 s of work",
+    "campaign": "its steps are `map` and `estimate`, in processes that are warm",
     "compare-model": "it solves the scan's frames anew: seconds of work",
     "diagnose": "it needs a posterior that `estimate` wrote; the chains are the cost",
     "tradeoff": "it measures itself: a minute of work",

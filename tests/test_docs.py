@@ -203,7 +203,12 @@ def test_the_formats_page_has_the_arrays_of_a_scan():
 
 
 @pytest.mark.parametrize(
-    ("heading", "file", "group"), [("Maps (`.nc`)", "map.nc", "/"), ("Posteriors (`.nc`)", "posterior.nc", "posterior")]
+    ("heading", "file", "group"),
+    [
+        ("Maps (`.nc`)", "map.nc", "/"),
+        ("Frames of a map (`.nc`)", "map.nc", "frames"),
+        ("Posteriors (`.nc`)", "posterior.nc", "posterior"),
+    ],
 )
 def test_the_formats_page_has_the_variables_of_a_netcdf_file(heading, file, group, demos, tmp_path):
     page = tmp_path / "page.md"
@@ -211,8 +216,9 @@ def test_the_formats_page_has_the_variables_of_a_netcdf_file(heading, file, grou
     Reader(tmp_path, demos).follow(page)
     rows = table_under(heading, DOCS / "formats.md")
     with h5py.File(tmp_path / "demo" / file) as whole:
-        held = {name: len(values.shape) for name, values in whole[group].items() if "NAME" not in values.attrs}
-        scales = {name for name, values in whole[group].items() if "NAME" in values.attrs}
+        arrays = {name: values for name, values in whole[group].items() if isinstance(values, h5py.Dataset)}
+        held = {name: len(values.shape) for name, values in arrays.items() if "NAME" not in values.attrs}
+        scales = set(arrays) - set(held)
     if group == "/":  # the cells' centres were called x_mm and y_mm in the first maps
         held = {name.removesuffix("_mm"): length for name, length in held.items()} | dict.fromkeys(
             scales & {"x", "y"}, 1

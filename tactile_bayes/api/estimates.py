@@ -353,7 +353,9 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     """
     given = map_of(tactile_map)
     inputs = {} if given.path is None else {"map": given.path}
-    outcome = estimate_one(given.tactile_map, settings_of(settings), inputs=inputs, progress=progress)
+    outcome = estimate_one(
+        given.tactile_map, settings_of(settings), inputs=inputs, scans=given.scans, progress=progress
+    )
     return SizeEstimate(outcome, "" if given.path is None else given.path.stem)
 
 

@@ -39,11 +39,14 @@ class Map:
         The file that it was read from; None for a map that is in none.
     notes
         What the scans lost, or what else speaks against them.
+    scans
+        The scan files that it was made from, as `Provenance.scans` has them.
     """
 
     tactile_map: TactileMap
     path: Path | None = None
     notes: tuple[str, ...] = ()
+    scans: tuple[dict[str, str], ...] = ()
 
     @property
     def mean(self) -> FloatArray:
@@ -92,7 +95,7 @@ class Map:
         """
         from tactile_bayes.files.map_nc import write_map
 
-        write_map(path_of(path), self.tactile_map, provenance=_provenance("map", self.tactile_map), force=force)
+        write_map(path_of(path), self.tactile_map, provenance=_provenance(self), force=force)
 
     def __repr__(self) -> str:
         found = self.tactile_map
@@ -127,9 +130,10 @@ def read_map(path: PathLike) -> Map:
     BadDataError
         When the file is no map, or is damaged.
     """
-    from tactile_bayes.files.map_nc import read_map as read
+    from tactile_bayes.files.map_nc import read_map_and_scans
 
-    return Map(read(path_of(path)), path_of(path))
+    tactile_map, scans = read_map_and_scans(path_of(path))
+    return Map(tactile_map, path_of(path), scans=scans)
 
 
 def build_map(scans: Any, **options: Any) -> Map:
@@ -148,18 +152,21 @@ def build_map(scans: Any, **options: Any) -> Map:
         When a file is no scan, or no frame is left.
     """
     from tactile_bayes.mapping import build_map as build
-    from tactile_bayes.pipeline.scans import load_scans
+    from tactile_bayes.pipeline.scans import exam_facts, load_scans
 
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
-    loaded, notes = [], []
+    loaded: list[Scan] = []
+    notes: list[str] = []
+    facts: list[dict[str, str]] = []
     for one in given:
         if isinstance(one, str | Path):
-            (scan,), lost = load_scans([path_of(one)])
-            loaded.append(scan)
+            read, lost = load_scans([path_of(one)])
+            loaded += read
             notes += lost
+            facts += exam_facts([path_of(one)], read)
         else:
             loaded.append(getattr(one, "scan", one))
-    return Map(build(loaded, **options), notes=tuple(notes))
+    return Map(build(loaded, **options), notes=tuple(notes), scans=tuple(facts))
 
 
 def simulate(
@@ -218,9 +225,9 @@ def map_of(given: Any) -> Map:
     raise UsageError(f"a map is wanted, not {type(given).__name__}; build one with build_map, or give a path")
 
 
-def _provenance(command: str, tactile_map: TactileMap) -> Provenance:
+def _provenance(made: Map) -> Provenance:
     from dataclasses import asdict
 
     from tactile_bayes.files.provenance import Provenance
 
-    return Provenance(command, {"called_from": "Python", **asdict(tactile_map.recipe)})
+    return Provenance("map", {"called_from": "Python", **asdict(made.tactile_map.recipe)}, scans=made.scans)

@@ -52,11 +52,11 @@ def init(folder: Path, output: Path, force: bool) -> None:
     if not found.rows:
         raise BadDataError("holds no scan (.mcap, .npz)", way_out="give the folder of the scans", path=str(folder))
     write_manifest(output, found.rows, force=force)
-    patients = {row["patient"] for row in found.rows if "patient" in row}
-    nameless = sum("patient" not in row for row in found.rows)
+    patients = {row["patient"] for row in found.rows} - {""}
+    nameless = sum(not row["patient"] for row in found.rows)
     click.echo(f"{output}: {len(found.rows)} exams of {len(patients)} patients")
     if nameless:
-        click.echo(f"{nameless} scans do not say whose they are: fill in the column patient")
+        click.echo(f"{nameless} of them do not say whose they are: fill in the column patient")
     click.echo(RESEARCH_USE)
 
 

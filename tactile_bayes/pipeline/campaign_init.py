@@ -14,7 +14,8 @@ from tactile_bayes.pipeline.campaign_folder import JOURNAL
 from tactile_bayes.records import dataclass
 
 _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}
-_DEFAULTS: Final = {"visit": "1", "mass": "1"}
+_DEFAULTS: Final = {"patient": "", "visit": "1", "mass": "1", "side": ""}
+"""Cells of a scan that does not say; patient and side are left blank, for somebody to fill in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ def find_exams(folder: Path, table: Path) -> Found:
             found.skipped.append(f"{name}: {error.what}")
         else:
             found.rows.append({"file": name, **_DEFAULTS, **facts})
-    found.rows.sort(key=lambda row: (natural(row.get("patient", "")), natural(row["visit"]), row["mass"], row["file"]))
+    found.rows.sort(key=lambda row: (natural(row["patient"]), natural(row["visit"]), row["mass"], row["file"]))
     _number(found.rows)
     return found
 
@@ -83,7 +84,7 @@ def _facts(path: Path, name: str) -> dict[str, str]:
 
 def _number(rows: list[dict[str, Any]]) -> None:
     """Number the exams of each mass at each visit, in the order of their files."""
-    count: dict[tuple[str | None, str, str], int] = {}
+    count: dict[tuple[str, str, str], int] = {}
     for row in rows:
-        key = (row.get("patient"), row["visit"], row["mass"])
+        key = (row["patient"], row["visit"], row["mass"])
         row["replicate"] = count[key] = count.get(key, 0) + 1

@@ -37,8 +37,16 @@ def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mappi
     settings
         By the names of the command's options.
     """
-    from tactile_bayes.files.provenance import Provenance, hash_inputs, scan_facts
+    from tactile_bayes.files.provenance import Provenance
 
-    inputs = hash_inputs(**{f"scan_{number}": path for number, path in enumerate(paths, start=1)})
-    facts = [scan_facts(digest, scan.session) for digest, scan in zip(inputs.values(), scans, strict=True)]
+    facts = exam_facts(paths, scans)
+    inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
     return Provenance("map", settings, inputs, scans=facts)
+
+
+def exam_facts(paths: Sequence[Path], scans: Sequence[Scan]) -> list[dict[str, str]]:
+    """Digest of each scan file and what it says of its exam, for `Provenance.scans`."""
+    from tactile_bayes.files.atomic import sha256
+    from tactile_bayes.files.provenance import scan_facts
+
+    return [scan_facts(sha256(path), scan.session) for path, scan in zip(paths, scans, strict=True)]

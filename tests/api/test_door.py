@@ -85,6 +85,14 @@ def test_the_defaults_are_the_command_lines() -> None:
         assert by_hand[name] == shown[name], name
 
 
+def test_a_map_from_python_names_its_scans_as_the_command_lines_does(folder: Path, tmp_path: Path) -> None:
+    built = tb.build_map(DEMO / "scan.mcap")
+    built.save(tmp_path / "map.nc")
+    assert built.scans
+    assert tb.read_map(tmp_path / "map.nc").scans == tb.read_map(folder / "map.nc").scans == built.scans
+    assert tb.build_map(tb.demo_scan()).scans == ()
+
+
 def test_either_way_gives_the_same_numbers(folder: Path, found: tb.SizeEstimate) -> None:
     told = json.loads(run_here("estimate", "map.nc", "--method", "laplace", "--json", cwd=folder).stdout)
     assert json.loads(json.dumps(found.answer.document)) == told

@@ -90,7 +90,8 @@ def test_init_writes_what_the_scans_carry_and_names_what_it_leaves_out(study: Pa
 def test_init_leaves_blank_what_no_scan_says_and_run_asks_for_it(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", thinned(0, 3))
     done = run_here("campaign", "init", ".", "-o", "exams.csv", cwd=tmp_path)
-    assert "1 scans do not say whose they are: fill in the column patient" in done.stdout
+    assert "1 of them do not say whose they are: fill in the column patient" in done.stdout
+    assert (tmp_path / "exams.csv").read_text().splitlines()[0] == "file,patient,visit,mass,replicate,side"
     refused = run_here("campaign", "run", "exams.csv", "-o", "out", cwd=tmp_path)
     assert (refused.returncode, refused.stderr.count("\n")) == (3, 1)
     assert not (tmp_path / "out").exists()

@@ -298,7 +298,10 @@ def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
         write_map(paths[-1], field_map(seed=seed, half_mm=20.0), provenance=Provenance("map", {}))
     rows = pooled_rows(paths, Settings(method="laplace"), clock=time.process_time)
     assert [one.maps for one in rows] == [1, 2, 3]
-    assert rows[2].answer.half_width_mm < rows[0].answer.half_width_mm
+    spread = pooled_rows(paths, Settings(method="laplace", between_map_sd=0.15), clock=time.process_time)
+    assert spread[2].answer.half_width_mm < 0.85 * spread[0].answer.half_width_mm
+    # by simulated exams, which differ by 3 %, what the maps share makes nearly all of an interval
+    assert rows[2].answer.half_width_mm == pytest.approx(rows[0].answer.half_width_mm, rel=0.1)
     assert rows[2].another_half_mm < 0.85 * rows[0].another_half_mm
     assert rows[2].cpu_s > rows[0].cpu_s
 
