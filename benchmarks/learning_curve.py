@@ -48,34 +48,43 @@ def main() -> None:
     table = population_table(columns)
     if given.without_places:
         table = replace(table, by_place=None)
-    bodies = np.unique(table.body)
+    bodies, ways = np.unique(table.body), [(), tuple(given.known)] if given.known else [()]
     for number in given.bodies:
         if number > len(bodies) - 20:
             print(f"{number:5d}: the table has {len(bodies)} bodies")
             continue
         for form in given.forms:
             learn = partial(population_learner(form), recipe=Recipe(way, "free", 20.0, noise="field"))
-            sized = partial(size_error, known=given.known)
-            found = [_held_out(table, learn, sized, number, given.seed + i) for i in range(given.repeats)]
-            error, variance, body = (np.concatenate([one[i] for one in found]) for i in range(3))
-            print(f"{number:5d} {form:17s} {_figures(error, variance)}", flush=True)
-    _by_class(table, error, variance, body)
+            held = [_held_out(table, learn, ways, number, given.seed + i) for i in range(given.repeats)]
+            found = [
+                tuple(np.concatenate(parts) for parts in zip(*one, strict=True)) for one in zip(*held, strict=True)
+            ]
+            for known, (error, variance, _) in zip(ways, found, strict=True):
+                print(f"{number:5d} {form:17s} {_figures(error, variance)}{_words(known)}", flush=True)
+    for known, (error, variance, body) in zip(ways, found, strict=True):
+        print(f"by classes{_words(known)}")
+        _by_class(table, error, variance, body)
+
+
+def _words(known: Sequence[str]) -> str:
+    return f"  known: {', '.join(known)}" if known else ""
 
 
 def _held_out(
     table: PopulationTable,
     learn: Callable[..., BodyCalibration],
-    sized: Callable[[BodyCalibration, PopulationTable], tuple[float, float]],
+    ways: Sequence[Sequence[str]],
     number: int,
     seed: int,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(b,) log errors, their variances and the bodies' numbers, of those that took no part."""
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """(b,) log errors, their variances and the bodies' numbers, of those that took no part, for each known set."""
     bodies = np.unique(table.body)
     taught = np.random.default_rng(seed).permutation(bodies)[:number]
     calibration = learn(table.rows(np.isin(table.body, taught)))
     rest = np.setdiff1d(bodies, taught)
-    found = np.array([sized(calibration, table.rows(table.body == one)) for one in rest])
-    return found[:, 0], found[:, 1], rest
+    exams = [table.rows(table.body == one) for one in rest]
+    sized = (np.array([size_error(calibration, one, known=known) for one in exams]) for known in ways)
+    return [(found[:, 0], found[:, 1], rest) for found in sized]
 
 
 def size_error(
