@@ -36,9 +36,12 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
     by_place = array_of(document, "by_place") if "by_place" in document else None
     if by_place is not None and by_place.shape != (k, len(BY_PLACE)):
         raise BadDataError(f"hidden.by_place is no ({k}, {len(BY_PLACE)})", way_out="learn the calibration anew")
+    expected, covariance, with_body = arrays
     return HiddenTerms(
         names,
-        *arrays,
+        expected,
+        covariance,
+        with_body,
         body_variance=float(document["body_variance"]),
         by_place=by_place,
         inverted=tuple(document.get("inverted", ())),

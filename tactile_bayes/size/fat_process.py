@@ -125,7 +125,10 @@ class PlaceTable:
         """(6,) standardised mean over the maps of a mass that resemble the table's, or the reason why there is none."""
         known = [one for one in by_place if one is not None]
         if not known:
-            return None, "no map keeps frames that feel the lump alone (maps of earlier versions keep none)"
+            return (
+                None,
+                "no map keeps frames that feel the lump alone, over even fat (maps of earlier versions keep none)",
+            )
         found = np.array(known)
         inside = self.leverage(found) <= 1.0
         if not inside.any():

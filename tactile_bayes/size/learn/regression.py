@@ -185,7 +185,8 @@ class BodyRegression:
 
     def standard_bodies(self, mode: FloatArray) -> FloatArray:
         """(groups,) B of each body left out of the fit, in SDs of B at its place."""
-        return -left_out_errors(self.mean_terms, self.mean_log_d) / np.exp(mode[-3] + mode[-2] * self.mean_u)
+        left_out = -left_out_errors(self.mean_terms, self.mean_log_d)
+        return np.asarray(left_out / np.exp(mode[-3] + mode[-2] * self.mean_u))
 
     def posterior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of k coefficients, ln(sd between bodies), its slope, ln(sd between exams), as normal.
