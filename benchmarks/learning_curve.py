@@ -106,10 +106,10 @@ def size_error(
     body, _, error = at.body_and_error(at.terms(a, p).mean(axis=0, keepdims=True), *middle, np.zeros(1))
     told = {name: float(exams.unknowns[name][0]) for name in known}
     told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
-    expected, left = known_body(at, told, *middle)
-    own = np.sqrt(max(body[0] ** 2 - at.other_sd**2, 0.0))
-    variance = (left * own) ** 2 + at.other_sd**2 + float(error[0]) + exam / len(exams)
-    return float(size.mean() + expected[0] * own - np.log(exams.d_mm[0])), float(variance)
+    own_sd = np.sqrt(np.maximum(body**2 - at.other_sd**2, 0.0))
+    expected, left = known_body(at, told, *middle, own_sd)
+    variance = left[0] + at.other_sd**2 + error[0] + exam / len(exams)
+    return float(size.mean() + expected[0] - np.log(exams.d_mm[0])), float(variance)
 
 
 def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...] | None]:

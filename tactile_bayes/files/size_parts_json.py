@@ -22,6 +22,7 @@ def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
         "body_variance": number(hidden.body_variance),
         **({} if hidden.by_place is None else {"by_place": numbers(hidden.by_place)}),
         **({"inverted": list(hidden.inverted)} if hidden.inverted else {}),
+        **({"most_sd": number(hidden.most_sd)} if np.isfinite(hidden.most_sd) else {}),
     }
 
 
@@ -45,6 +46,7 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
         body_variance=float(document["body_variance"]),
         by_place=by_place,
         inverted=tuple(document.get("inverted", ())),
+        most_sd=float(document.get("most_sd", np.inf)),
     )
 
 

@@ -56,6 +56,8 @@ class HiddenTerms:
         Coefficients of the standardised `presets.BY_PLACE` in what is expected; None where these take no part.
     inverted
         Those that enter by their inverse.
+    most_sd
+        SD(B) beyond which these properties explain no more of B: of faint and deep lumps it is the map that is unlike.
     """
 
     names: tuple[str, ...]
@@ -65,6 +67,7 @@ class HiddenTerms:
     body_variance: float
     by_place: FloatArray | None = None
     inverted: tuple[str, ...] = ()
+    most_sd: float = float("inf")
 
     def share(self, *names: str) -> float:
         """Share of B's variance removed by knowing these properties."""

@@ -258,11 +258,11 @@ class _Pool:
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
         other_sd = self.calibration.other_sd
         own_sd = np.sqrt(np.maximum(body_sd**2 - other_sd**2, 0.0))
-        expected, left = known_body(self.calibration, self.known, middle_a, middle_width)
-        return expected * own_sd + shift, {
+        expected, left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
+        return expected + shift, {
             "between_maps": np.sum(weight**2, axis=0) * tau**2,
             "calibration": error,
-            "body": (left * own_sd) ** 2 + other_sd**2,
+            "body": left + other_sd**2,
             **site_variance(self.calibration.site, middle_width),
         }
 

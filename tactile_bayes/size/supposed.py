@@ -68,24 +68,33 @@ def suppositions(
         Of ln d as it is.
     """
     at = np.array([middle[0]]), np.array([middle[1]])
-    body_sd = calibration.body_and_error(calibration.terms(*at), *at, np.zeros(1))[0][0]
-    own_variance = max(body_sd**2 - calibration.other_sd**2, 0.0)
+    body_sd = calibration.body_and_error(calibration.terms(*at), *at, np.zeros(1))[0]
+    own_sd = np.sqrt(np.maximum(body_sd**2 - calibration.other_sd**2, 0.0))
     names, found = () if calibration.hidden is None else calibration.hidden.names, {}
-    before, left_before = known_body(calibration, known, *at)
+    before, left_before = known_body(calibration, known, *at, own_sd)
     for label, (name, value) in SUPPOSED.items():
         low, high = calibration.bodies.get(name, (value, value))
         if name in names and name not in known and low <= value <= high:
-            expected, left = known_body(calibration, {**known, name: value}, *at)
-            gone = own_variance * (left_before**2 - left**2) / variance if variance > 0 else 0.0
-            shift = float((expected - before)[0] * np.sqrt(own_variance))
-            found[label] = Supposition(name, value, shift, float(np.sqrt(np.clip(1.0 - gone, 0.0, 1.0))))
+            expected, left = known_body(calibration, {**known, name: value}, *at, own_sd)
+            gone = float((left_before - left)[0]) / variance if variance > 0 else 0.0
+            ratio = float(np.sqrt(np.clip(1.0 - gone, 0.0, 1.0)))
+            found[label] = Supposition(name, value, float((expected - before)[0]), ratio)
     return found
 
 
 def known_body(
-    calibration: BodyCalibration, known: Mapping[str, float], log_amplitude: FloatArray, log_width: FloatArray
-) -> tuple[FloatArray, float]:
-    """Mean of B given known properties, and what remains of its SD, both over its SD.
+    calibration: BodyCalibration,
+    known: Mapping[str, float],
+    log_amplitude: FloatArray,
+    log_width: FloatArray,
+    own_sd: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of B given known properties.
+
+    Parameters
+    ----------
+    log_amplitude, log_width, own_sd : (n,) arrays
+        Of maps: ln a, p, and SD(B) there without `BodyCalibration.other_sd`, of which no property tells anything.
 
     Raises
     ------
@@ -93,7 +102,7 @@ def known_body(
         When the calibration knows nothing of a property.
     """
     if not known:
-        return np.zeros(len(log_width)), 1.0
+        return np.zeros(len(log_width)), own_sd**2
     hidden = calibration.hidden
     names = () if hidden is None else hidden.names
     for name in known:
@@ -101,4 +110,5 @@ def known_body(
             raise UsageError(f"the calibration has no property {name}; it has {', '.join(names) or 'none'}")
     assert hidden is not None
     expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
-    return expected, float(np.sqrt(1.0 - hidden.share(*known)))
+    explained_sd = np.minimum(own_sd, hidden.most_sd)
+    return expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2

@@ -112,7 +112,7 @@ def test_what_decides_is_named_and_what_does_not_is_not(learned):
 def test_a_known_seat_moves_the_size_and_narrows_it(learned):
     assert learned.hidden is not None
     terms = learned.terms(np.array(-0.8), np.array(1.4))
-    body_sd = np.exp(learned.mean[6] + learned.mean[7] * terms[1])
+    body_sd = min(np.exp(learned.mean[6] + learned.mean[7] * terms[1]), learned.hidden.most_sd)
     low, high = (body_sd * float(learned.hidden.expected_body({"seat": s}, terms)) for s in (0.0, 1.2))
     assert low - high == pytest.approx(-SEAT_SLOPE * 1.2, rel=0.15)
     assert learned.hidden.share("seat", "fat_kpa") >= learned.hidden.share("seat") - 1e-12
@@ -136,7 +136,7 @@ def test_soft_lumps_have_no_bias_where_their_stiffness_is_known():
     features, body_sd = learned.features(a, p), np.exp(learned.mean[6] + learned.mean[7] * learned.terms(a, p)[:, 1])
     told = [learned.hidden.expected_body({"stiffness_ratio": np.exp(v)}, x)
             for v, x in zip(table.unknowns["stiffness_ratio"], features, strict=True)]  # fmt: skip
-    known = without + body_sd * np.array(told)
+    known = without + np.minimum(body_sd, learned.hidden.most_sd) * np.array(told)
     for low, high in ((8, 11), (11, 30), (50, 101)):
         members = (ratio >= low)[table.body] & (ratio < high)[table.body]
         assert abs(known[members].mean()) < 0.02

@@ -102,7 +102,7 @@ def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
         **found.fields(data, data.terms),
         mean=mean,
         covariance=covariance,
-        hidden=hidden_terms(found.maps, data, body=data.standard_bodies(mean), features=data.terms),
+        hidden=hidden_terms(found.maps, data, **data.bodies_left_out(mean), features=data.terms),
         fit=figures(found.maps, data, mean),
     )
 

@@ -70,13 +70,13 @@ def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> Fat
     rows, fitted, exam = fit_process(found.maps, ProcessRows.of(found, places))
     features = monomials(found.values, POWERS)
     mean = np.concatenate([fitted.mean, fitted.log_spread, exam[:1]])
-    body = -fitted.left_out(rows.data.mean_log_d)[0] / np.exp(rows.spread @ fitted.log_spread)
+    body, body_sd = -fitted.left_out(rows.data.mean_log_d)[0], np.exp(rows.spread @ fitted.log_spread)
     by_place = None if places is None else rows.x[:, -len(BY_PLACE) :]
     return FatProcess(
         **found.fields(rows.data, features, inside=INSIDE),
         mean=mean,
         covariance=_covariance(rows, fitted, exam),
-        hidden=hidden_terms(found.maps, rows.data, body=body, features=features, by_place=by_place),
+        hidden=hidden_terms(found.maps, rows.data, body=body, body_sd=body_sd, features=features, by_place=by_place),
         fit=_figures(found.maps, rows, fitted, exam),
         kernel=fitted.kernel,
         other_sd=other_sd,

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.hidden import INVERTED, HiddenTerms
 from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable
+
+EXPLAINED: Final = 0.75
+"""Of the table's bodies, by SD(B), those of which what is known tells as much as it does of all, in that SD."""
 
 
 def hidden_terms(
@@ -14,6 +19,7 @@ def hidden_terms(
     data: BodyRegression,
     *,
     body: FloatArray,
+    body_sd: FloatArray,
     features: FloatArray,
     by_place: FloatArray | None = None,
 ) -> HiddenTerms | None:
@@ -21,9 +27,9 @@ def hidden_terms(
 
     Parameters
     ----------
-    body : (groups,) array
-        B of each body, which took no part in the fit that says so, in SDs of B at its place: faint and deep lumps,
-        of which B is large, would decide alone otherwise.
+    body, body_sd : (groups,) arrays
+        B of each body, which took no part in the fit that says so, and SD(B) at its place. Bodies count by their B in
+        that SD: faint and deep lumps, of which B is large, would decide alone otherwise.
     features : (n, c) array
         What a map leads one to expect is linear in these.
     by_place : (n, 6) array
@@ -39,13 +45,16 @@ def hidden_terms(
     varied = np.stack([data.mean(values) for values in entered], axis=1)
     coefficients = np.linalg.lstsq(design, varied, rcond=None)[0]
     rest = varied - design @ coefficients
+    most_sd = float(np.quantile(body_sd, EXPLAINED))
+    told = np.minimum(1.0, most_sd / body_sd)
     freedom = max(data.groups - design.shape[1], 1)
     return HiddenTerms(
         names=tuple(table.unknowns),
         expected=np.asarray(coefficients[:c].T),
         covariance=np.asarray(rest.T @ rest / freedom),
-        with_body=np.asarray(rest.T @ body / freedom),
+        with_body=np.asarray(rest.T @ (told * body / body_sd) / (freedom * np.mean(told**2))),
         body_variance=1.0,
         by_place=None if by_place is None else np.asarray(coefficients[c:].T),
         inverted=inverted,
+        most_sd=most_sd,
     )

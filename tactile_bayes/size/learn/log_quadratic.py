@@ -62,7 +62,7 @@ def learn_log_quadratic(
         most_leverage=float(leverage.max()),
         domain=domain_of(table),
         recipe=recipe,
-        hidden=hidden_terms(table, data, body=data.standard_bodies(mean), features=data.terms),
+        hidden=hidden_terms(table, data, **data.bodies_left_out(mean), features=data.terms),
         fit=figures(table, data, mean),
         source=source,
         with_fat=learn_fat(table),

@@ -183,10 +183,10 @@ class BodyRegression:
         """(groups,) residual of each body's mean."""
         return np.asarray(self.mean_log_d - self.mean_terms @ mode[: self.terms.shape[1]])
 
-    def standard_bodies(self, mode: FloatArray) -> FloatArray:
-        """(groups,) B of each body left out of the fit, in SDs of B at its place."""
+    def bodies_left_out(self, mode: FloatArray) -> dict[str, FloatArray]:
+        """``body`` and ``body_sd`` of `hidden.hidden_terms`, (groups,) arrays."""
         left_out = -left_out_errors(self.mean_terms, self.mean_log_d)
-        return np.asarray(left_out / np.exp(mode[-3] + mode[-2] * self.mean_u))
+        return {"body": left_out, "body_sd": np.exp(mode[-3] + mode[-2] * self.mean_u)}
 
     def posterior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of k coefficients, ln(sd between bodies), its slope, ln(sd between exams), as normal.
