@@ -291,8 +291,14 @@ def test_a_file_holds_the_process_of_figures_by_place(learned_by_place, tmp_path
     assert got.hidden is not None
     assert want.hidden is not None
     np.testing.assert_allclose(got.hidden.expected, want.hidden.expected, atol=1e-6)
+    assert got.hidden.most_sd == pytest.approx(want.hidden.most_sd, rel=1e-6)
     document = json.loads((tmp_path / "s.json").read_text())
     inner = document["fat_process"]["with_places"]
+    short = inner["hidden"]["by_place"][0].pop()
+    (tmp_path / "spoilt.json").write_text(json.dumps(document))
+    with pytest.raises(BadDataError, match=r"hidden.by_place is no \(1, 6\)"):
+        read_size_calibration(tmp_path / "spoilt.json")
+    inner["hidden"]["by_place"][0].append(short)
     del inner["places"]
     (tmp_path / "cut.json").write_text(json.dumps(document))
     with pytest.raises(BadDataError, match="with_places is no process of figures by place"):

@@ -43,3 +43,13 @@ def test_bodies_that_the_calibration_does_not_hold_are_not_supposed() -> None:
     hard_only = replace(use, bodies={"stiffness_ratio": (40.0, 100.0), "seat": (0.0, 0.4)})
     assert set(pooled([shape(2.7)], use=hard_only).supposing) == {"hard", "centred"}
     assert pooled([shape(2.7)], use=calibration()).supposing == {}
+
+
+def test_where_bodies_differ_most_what_is_known_tells_no_more() -> None:
+    """The control: twice that SD of B, and no limit, is twice the shift."""
+    use = knowing()
+    assert use.hidden is not None
+    limited = replace(use, hidden=replace(use.hidden, most_sd=BODY_SD / 2))
+    found, less = (pooled([shape(2.7)], use=one).supposing["soft"] for one in (use, limited))
+    assert less.log_shift == pytest.approx(found.log_shift / 2, rel=1e-6)
+    assert 1.0 - less.sd_ratio**2 == pytest.approx((1.0 - found.sd_ratio**2) / 4, rel=0.05)
