@@ -39,8 +39,8 @@ def supposed_lines(supposed: Mapping[str, Any] | None, median_mm: float, *, plac
     """A line for each pair of suppositions that moves the largest size."""
     found = []
     for words, first, second, *follow in PAIRS:
-        pair = [] if supposed is None else [supposed[name] for name in (first, second) if name in supposed]
-        if len(pair) == 2 and any(abs(one["max_size_mm"]["median"] / median_mm - 1) >= LEAST_CHANGE for one in pair):
+        pair = _pair(supposed, median_mm, (first, second))
+        if pair:
             values = [after.format(one["value"]) for after, one in zip(follow, pair, strict=True)]
             sizes = [_size(one["max_size_mm"], places) for one in pair]
             found.append(f"Were {words}{values[0]}: {sizes[0]}; {second}{values[1]}: {sizes[1]}.")
@@ -48,13 +48,17 @@ def supposed_lines(supposed: Mapping[str, Any] | None, median_mm: float, *, plac
 
 
 def supposed_line(supposed: Mapping[str, Any] | None, median_mm: float, *, places: int) -> list[str]:
-    """The first pair in a few words, for a short report; empty where it hardly moves the size."""
-    if supposed is None or not supposed_lines(supposed, median_mm, places=places):
-        return []
-    pair = [supposed[name]["max_size_mm"]["median"] for name in ("soft", "hard") if name in supposed]
-    if len(pair) < 2 or all(abs(one / median_mm - 1) < LEAST_CHANGE for one in pair):
-        return []
-    return [f"No map shows stiffness: were the lump soft, {pair[0]:.{places}f} mm; hard, {pair[1]:.{places}f} mm."]
+    """A soft lump's size and a hard one's in a few words, for a short report; empty where they hardly differ."""
+    pair = [one["max_size_mm"]["median"] for one in _pair(supposed, median_mm, ("soft", "hard"))]
+    words = [f"{name}, {size:.{places}f} mm" for name, size in zip(("soft", "hard"), pair, strict=False)]
+    return [f"No map shows stiffness: were the lump {'; '.join(words)}."] if pair else []
+
+
+def _pair(supposed: Mapping[str, Any] | None, median_mm: float, names: tuple[str, str]) -> list[Mapping[str, Any]]:
+    """Two suppositions, where one of them at least moves the largest size; empty otherwise."""
+    pair = [] if supposed is None else [supposed[name] for name in names if name in supposed]
+    moves = any(abs(one["max_size_mm"]["median"] / median_mm - 1) >= LEAST_CHANGE for one in pair)
+    return pair if moves and len(pair) == 2 else []
 
 
 def _size(size: Mapping[str, float], places: int) -> str:

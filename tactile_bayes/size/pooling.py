@@ -177,13 +177,15 @@ def pooled_size(
     between = priors.between_maps or calibration.between_exams
     another = priors.another_exam
     size = pool.size(between, figures)
-    middle = [float(np.mean([np.nanmean(getattr(m, n)) for m in used])) for n in ("log_amplitude", "log_width")]
+    log_a, log_width = (
+        float(np.mean([np.nanmean(getattr(m, n)) for m in used])) for n in ("log_amplitude", "log_width")
+    )
     variance = float(np.nanvar(np.log(size.max_size_mm)))
     return replace(
         size,
         outliers=outlying_maps(centre, noise, BetweenMaps() if another is None else another),
         another_exam=None if another is None else pool.size(another, figures),
-        supposing=suppositions(calibration, priors.known, (middle[0], middle[1]), variance=variance),
+        supposing=suppositions(calibration, priors.known, (log_a, log_width), variance=variance),
     )
 
 

@@ -1,6 +1,6 @@
 """What is known of a body, or supposed of it, and what that says of B, its departure from the calibration.
 
-No map shows how stiff a lump is, and few show its seat: sizes are drawn to the middle of the calibration's bodies. How
+No map shows how stiff a lump is, and without frames none shows its seat: sizes are drawn to the middle of the calibration's bodies. How
 large the lump would be if it were soft or hard tells a reader on which side a size errs, and by how much.
 """
 
