@@ -1,7 +1,8 @@
 """What is known of a body, or supposed of it, and what that says of B, its departure from the calibration.
 
-No map shows how stiff a lump is, and without frames none shows its seat: sizes are drawn to the middle of the calibration's bodies. How
-large the lump would be if it were soft or hard tells a reader on which side a size errs, and by how much.
+No map shows how stiff a lump is, and without frames none shows its seat: sizes are drawn to the middle of the
+calibration's bodies. How large the lump would be if it were soft or hard tells a reader on which side a size errs, and
+by how much.
 """
 
 from __future__ import annotations
