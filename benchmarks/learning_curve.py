@@ -4,7 +4,8 @@
 
 POPULATION.csv is a table of `population`. From it, N bodies are drawn at random, each form learns from them, and the
 others are sized by the mean of their exams. Printed: mean absolute error and bias, share of 95 % intervals that hold,
-SD of standardised errors, median half width; then the same of the last form by classes of lumps.
+SD of standardised errors, median half width; then the same of the last form by classes of lumps. With `--known
+stiffness_ratio` sizes are given the true value of each held-out body, as `estimate --known` would be.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.pipeline.size_calibration import FORMS, population_learner, rows_of_one_way
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.hidden import LOGGED
 from tactile_bayes.size.learn.regression import PopulationTable
-from tactile_bayes.studies.population import population_table
+from tactile_bayes.size.supposed import known_body
+from tactile_bayes.studies.population import UNKNOWNS, population_table
 
 _STEP = 1e-3
 _NORMAL_95 = 1.959964
@@ -37,6 +40,7 @@ def main() -> None:
     parser.add_argument("--bodies", type=int, nargs="+", default=[250, 500, 1000, 2000])
     parser.add_argument("--forms", nargs="+", choices=FORMS, default=["log-quadratic", "gaussian-process"])
     parser.add_argument("--without-places", action="store_true", help="learn without the figures by place")
+    parser.add_argument("--known", nargs="+", choices=UNKNOWNS, default=[], help="properties told of each body")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
@@ -44,42 +48,68 @@ def main() -> None:
     table = population_table(columns)
     if given.without_places:
         table = replace(table, by_place=None)
-    bodies = np.unique(table.body)
+    bodies, ways = np.unique(table.body), [(), tuple(given.known)] if given.known else [()]
     for number in given.bodies:
         if number > len(bodies) - 20:
             print(f"{number:5d}: the table has {len(bodies)} bodies")
             continue
         for form in given.forms:
             learn = partial(population_learner(form), recipe=Recipe(way, "free", 20.0, noise="field"))
-            found = [_held_out(table, learn, number, given.seed + i) for i in range(given.repeats)]
-            error, variance, body = (np.concatenate([one[i] for one in found]) for i in range(3))
-            print(f"{number:5d} {form:17s} {_figures(error, variance)}", flush=True)
-    _by_class(table, error, variance, body)
+            held = [_held_out(table, learn, ways, number, given.seed + i) for i in range(given.repeats)]
+            found = [
+                tuple(np.concatenate(parts) for parts in zip(*one, strict=True)) for one in zip(*held, strict=True)
+            ]
+            for known, (error, variance, _) in zip(ways, found, strict=True):
+                print(f"{number:5d} {form:17s} {_figures(error, variance)}{_words(known)}", flush=True)
+    for known, (error, variance, body) in zip(ways, found, strict=True):
+        print(f"by classes{_words(known)}")
+        _by_class(table, error, variance, body)
+
+
+def _words(known: Sequence[str]) -> str:
+    return f"  known: {', '.join(known)}" if known else ""
 
 
 def _held_out(
-    table: PopulationTable, learn: Callable[..., BodyCalibration], number: int, seed: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(b,) log errors, their variances and the bodies' numbers, of those that took no part."""
+    table: PopulationTable,
+    learn: Callable[..., BodyCalibration],
+    ways: Sequence[Sequence[str]],
+    number: int,
+    seed: int,
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """(b,) log errors, their variances and the bodies' numbers, of those that took no part, for each known set."""
     bodies = np.unique(table.body)
     taught = np.random.default_rng(seed).permutation(bodies)[:number]
     calibration = learn(table.rows(np.isin(table.body, taught)))
     rest = np.setdiff1d(bodies, taught)
-    found = np.array([_sized(calibration, table.rows(table.body == one)) for one in rest])
-    return found[:, 0], found[:, 1], rest
+    exams = [table.rows(table.body == one) for one in rest]
+    sized = (np.array([size_error(calibration, one, known=known) for one in exams]) for known in ways)
+    return [(found[:, 0], found[:, 1], rest) for found in sized]
 
 
-def _sized(calibration: BodyCalibration, exams: PopulationTable) -> tuple[float, float]:
-    """Log error of one body by the mean of its exams, and the variance that the calibration states."""
+def size_error(
+    calibration: BodyCalibration, exams: PopulationTable, *, known: Sequence[str] = ()
+) -> tuple[float, float]:
+    """Log error of one body by the mean of its exams, and the variance that the calibration states.
+
+    Parameters
+    ----------
+    known
+        Properties of which the true value is told.
+    """
     at = calibration.at_fat(_known(exams.profile, len(exams))).at_places(_known(exams.by_place, len(exams)))
     a, p = exams.log_amplitude, exams.log_width
     size = at.log_size(a, p)
     slope = np.stack([(at.log_size(a + _STEP, p) - at.log_size(a - _STEP, p)) / (2 * _STEP), at.width_slope(a, p)])
-    own = np.einsum("in,nij,jn->n", slope, exams.covariance[:, :2, :2], slope).mean()
+    exam = np.einsum("in,nij,jn->n", slope, exams.covariance[:, :2, :2], slope).mean() + np.exp(2 * at.mean[-1])
     middle = a.mean(keepdims=True), p.mean(keepdims=True)
     body, _, error = at.body_and_error(at.terms(a, p).mean(axis=0, keepdims=True), *middle, np.zeros(1))
-    variance = float(body[0] ** 2 + error[0] + (own + np.exp(2 * at.mean[-1])) / len(exams))
-    return float(size.mean() - np.log(exams.d_mm[0])), variance
+    told = {name: float(exams.unknowns[name][0]) for name in known}
+    told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
+    own_sd = np.sqrt(np.maximum(body**2 - at.other_sd**2, 0.0))
+    expected, left = known_body(at, told, *middle, own_sd)
+    variance = left[0] + at.other_sd**2 + error[0] + exam / len(exams)
+    return float(size.mean() + expected[0] - np.log(exams.d_mm[0])), float(variance)
 
 
 def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...] | None]:

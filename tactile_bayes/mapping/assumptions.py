@@ -38,6 +38,14 @@ def assumptions_to_check(quality: Mapping[str, float]) -> tuple[str, ...]:
     return tuple(text for text in (_curved(quality), *_uneven(quality, far=False)) if text)
 
 
+def uneven(quality: Mapping[str, float]) -> bool:
+    """Whether the head's pressure profile changes over the map; parameters as above.
+
+    Then the frames tell the layers' tilt and not only the lump's place, so that figures by place mislead.
+    """
+    return bool(_uneven(quality, far=True) or _uneven(quality, far=False))
+
+
 def _lag(quality: Mapping[str, float]) -> str:
     lag = _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM)
     if lag is None:

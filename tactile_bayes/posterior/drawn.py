@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.mapping.assumptions import uneven
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import shape_fault
 from tactile_bayes.posterior.assessment import Assessment, MapDraws
@@ -96,7 +97,7 @@ def _drawn(
     fault = shape_fault(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
-    told = None if _beside_another(made) else posterior.by_place(tactile_map)
+    told = None if _beside_another(made) or uneven(tactile_map.quality) else posterior.by_place(tactile_map)
     calibration = fitting_calibration(posterior, calibration, told)
     far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
     size = None if fault or far else _size(posterior, made.draws, calibration, options.size_priors, rng=rng)

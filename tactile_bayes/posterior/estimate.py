@@ -33,7 +33,7 @@ from tactile_bayes.size.posterior import SizePosterior
 MOST_INVALID = 0.05
 OTHER_HEAD = (
     "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
-    "calibrate size population.csv --form log-quadratic -o size.json`, and give --size-calibration size.json"
+    "calibrate size population.csv --form gaussian-process -o size.json`, and give --size-calibration size.json"
 )
 """How to make a calibration for another head."""
 

@@ -16,6 +16,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.masses_document import masses_document
 from tactile_bayes.report.quantities import ANOTHER_EXAM, WIDTHS, another_exam, estimate_quantities
 from tactile_bayes.report.scene_text import scene_document
+from tactile_bayes.report.supposed_text import supposed_document
 from tactile_bayes.size.posterior import SIZES, SizePosterior
 
 SCHEMA = "tactile-bayes/estimate/1"
@@ -51,6 +52,7 @@ def estimate_document(
         "advice": estimate.advice,
         **{name: one(name) for name in (*SIZES, *WIDTHS)},
         ANOTHER_EXAM: another_exam(estimate.size, quantities),
+        "supposing": supposed_document(estimate.size, quantities.get("max_size_mm")),
         "centre_mm": point("centre_mm"),
         "centre_patient_mm": point("centre_patient_mm"),
         "position": None if place is None else place.as_dict(probability),

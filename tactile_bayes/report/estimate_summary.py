@@ -14,16 +14,17 @@ from tactile_bayes.report.estimate_text import (
     convergence_text,
     exam_spread,
     no_estimate_line,
+    size_decimals,
     size_table,
     tracker_share,
     warnings,
 )
 from tactile_bayes.report.masses_document import MassDocument, mass_lines, numbered
-from tactile_bayes.report.narrowing import MORE, joined, width_lines
+from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
 from tactile_bayes.report.scene_text import scene_line
+from tactile_bayes.report.supposed_text import supposed_document, supposed_line
 from tactile_bayes.size.posterior import EXTREMES
 
-MOST_LINES = 12
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 MOST_CAUTIONS = 3
 MOST_MASSES = 3
@@ -79,7 +80,17 @@ def _something(
     room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
     beside = _masses(masses, room=min(MOST_MASSES, room))
     widths = [] if estimate.size is None else width_lines(estimate.size.variance_share)
-    return [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
+    lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
+    return [*lines, *_supposed(estimate, quantities)] if len(lines) < MOST_LINES - 2 else lines
+
+
+def _supposed(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
+    """How large a soft lump and a hard one would be, where that matters."""
+    largest = quantities.get("max_size_mm")
+    if largest is None:
+        return []
+    supposed = supposed_document(estimate.size, largest)
+    return supposed_line(supposed, largest.median, places=size_decimals([largest]))
 
 
 def _cautions(estimate: Estimate) -> list[str]:

@@ -29,6 +29,7 @@ from tactile_bayes.report.size_text import (
     table_row,
     two_intervals_text,
 )
+from tactile_bayes.report.supposed_text import supposed_document, supposed_lines
 from tactile_bayes.size.posterior import EXTREMES, SIZES
 
 ANOTHER_LARGEST = f"{ANOTHER_EXAM}.max_size_mm"
@@ -145,6 +146,9 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Se
         lines += width_lines(estimate.size.variance_share)
         if found is not None and found.repeatability:
             lines.append(site_interval_text(found.repeatability))
+        largest = quantities["max_size_mm"]
+        supposed, places = supposed_document(estimate.size, largest), size_decimals([largest])
+        lines += supposed_lines(supposed, largest.median, places=places)
         if "oval_probability" in estimate.size.figures:
             lines.append(shape_text(estimate.size.figures))
         if found is not None and found.size_calibration:

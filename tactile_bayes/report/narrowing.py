@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from tactile_bayes.report.size_text import SOURCES
 
+MOST_LINES = 12
+"""Of a short report."""
 MORE = "More (all quantities, places looked at, odds, priors, omissions): estimate -v."
 """The end of a short report's last line but one."""
 NARROWED_BY = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.narrowing import MORE, joined, width_lines
+from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.site_text import site_words
@@ -24,6 +24,7 @@ from tactile_bayes.report.size_text import (
     table_head,
     table_row,
 )
+from tactile_bayes.report.supposed_text import supposed_document, supposed_line, supposed_lines
 from tactile_bayes.size import omissions
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.pooling import PooledEstimate
@@ -55,6 +56,7 @@ def pooled_document(
     """
     size, used = pooled.size, pooled.calibration or calibration
     sizes: dict[str, Any] = dict.fromkeys(EXTREMES)
+    largest = None if size is None else size.summarise("max_size_mm", probability=probability)
     if size is not None:
         sizes = {name: size.summarise(name, probability=probability).as_dict() for name in EXTREMES}
     return {
@@ -63,6 +65,7 @@ def pooled_document(
         "reason": pooled.reason,
         **sizes,
         ANOTHER_EXAM: _another_exam(size, probability),
+        "supposing": supposed_document(size, largest),
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
@@ -121,6 +124,9 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         by = f"sizes by {document['site']}; " if document["site"] else ""
         site = f"; {document['repeatability']}" if "repeatability" in document else ""
         lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %{site}.")
+        if len(lines) < MOST_LINES - 2:
+            places = decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS)
+            lines += supposed_line(document["supposing"], largest["median"], places=places)
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
@@ -150,9 +156,11 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
-    lines += ["", *_table(document)]
     worst, figures = _worst(document), document["figures"]
+    lines += ["", *_table(document)]
     lines += ["", *width_lines(document["variance_share"])]
+    places = decimals(worst["mc_error"], most=SIZE_DECIMALS)
+    lines += supposed_lines(document["supposing"], document["max_size_mm"]["median"], places=places)
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     if "repeatability" in document:
         lines.append(site_interval_text(document["repeatability"]))

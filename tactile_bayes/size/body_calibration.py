@@ -253,7 +253,8 @@ class BodyCalibration:
     def omissions(self) -> list[str]:
         """What a size does not contain, in words."""
         notes = [omissions.fat_depth(self.fat_note)] if self.fat_note else []
-        return [*notes, omissions.by_place(self.places_note)] if self.places_note else notes
+        notes += [omissions.by_place(self.places_note)] if self.places_note else []
+        return [*notes, omissions.bodies(self.bodies)] if self.bodies else notes
 
     def _unlike(self, amplitude: float, sigma_mm: float) -> str:
         return (

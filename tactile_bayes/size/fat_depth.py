@@ -184,7 +184,7 @@ class FatTerms:
             "round_lumps": self.round_lumps(log_depth),
             "information_inverse": of_features @ self.information_inverse @ of_features.T,
             "most_leverage": self.most_leverage,
-            "hidden": None if hidden is None else replace(hidden, expected=hidden.expected @ of_features.T),
+            "hidden": None if hidden is None else hidden.at_depth(of_features),
             "fit": self.fit,
             "with_fat": None,
             "fat_mm": float(np.exp(log_depth)),

@@ -125,7 +125,10 @@ class PlaceTable:
         """(6,) standardised mean over the maps of a mass that resemble the table's, or the reason why there is none."""
         known = [one for one in by_place if one is not None]
         if not known:
-            return None, "no map keeps frames that feel the lump alone (maps of earlier versions keep none)"
+            return (
+                None,
+                "no map keeps frames that feel the lump alone, over even fat (maps of earlier versions keep none)",
+            )
         found = np.array(known)
         inside = self.leverage(found) <= 1.0
         if not inside.any():
@@ -219,7 +222,10 @@ class FatProcess(FatTerms):
         """The calibration at one depth for (3,) or (9,) standardised figures of the frames."""
         fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
         own = {"kernel": self._kernel, "profile": figures, "other_sd": self.other_sd, "with_places": self.with_places}
-        return ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own})
+        found = ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own})
+        if self.places is None or found.hidden is None:
+            return found
+        return replace(found, hidden=found.hidden.at_places(figures[len(HEAD_PROFILE) :]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,12 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
 
 LOGGED = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
-"""Properties that enter by their logarithm."""
+"""Properties that vary and enter by their logarithm, but for those that enter by their inverse."""
+INVERTED = ("stiffness_ratio",)
+"""Properties by whose inverse a size goes: 50 times as stiff as fat and 100 times are both nearly rigid.
+
+Files of earlier versions have them by the logarithm; each file says what it has.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,15 +43,21 @@ class HiddenTerms:
     Parameters
     ----------
     names
-        Of k properties; those in `LOGGED` enter by their logarithm.
-    expected : (k, 6) array
-        Coefficients of `QUADRATIC` in what a map leads one to expect of each.
+        Of k properties.
+    expected : (k, c) array
+        Coefficients of a calibration's c `features` in what a map leads one to expect of each.
     covariance : (k, k) array
         About that.
     with_body : (k,) array
         Covariance with B.
     body_variance
-        Of B in the same table.
+        Of B, in the units that `with_body` has it in: 1 where these are the SD(B) of each body's place.
+    by_place : (k, 6) array
+        Coefficients of the standardised `presets.BY_PLACE` in what is expected; None where these take no part.
+    inverted
+        Those that enter by their inverse.
+    most_sd
+        SD(B) beyond which these properties explain no more of B: of faint and deep lumps it is the map that is unlike.
     """
 
     names: tuple[str, ...]
@@ -53,6 +65,9 @@ class HiddenTerms:
     covariance: FloatArray
     with_body: FloatArray
     body_variance: float
+    by_place: FloatArray | None = None
+    inverted: tuple[str, ...] = ()
+    most_sd: float = float("inf")
 
     def share(self, *names: str) -> float:
         """Share of B's variance removed by knowing these properties."""
@@ -60,9 +75,26 @@ class HiddenTerms:
         gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
         return float(np.clip(gain @ self.with_body[at] / self.body_variance, 0.0, 1.0))
 
-    def expected_body(self, known: Mapping[str, float], terms: FloatArray) -> FloatArray:
-        """(...,) mean of B given known properties, for (..., 6) terms of the map."""
+    def expected_body(self, known: Mapping[str, float], features: FloatArray) -> FloatArray:
+        """(...,) mean of B over its SD, given known properties, for (..., c) features of the map."""
         at = [self.names.index(name) for name in known]
-        gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
-        given = np.array([np.log(v) if name in LOGGED else v for name, v in known.items()])
-        return np.asarray((given - terms @ self.expected[at].T) @ gain)
+        gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at]) / np.sqrt(self.body_variance)
+        given = np.array([self._entered(name, value) for name, value in known.items()])
+        return np.asarray((given - features @ self.expected[at].T) @ gain)
+
+    def at_depth(self, contraction: FloatArray) -> HiddenTerms:
+        """The terms at one depth of fat, by the matrix that takes what is linear in the features to that depth."""
+        return replace(self, expected=self.expected @ contraction.T)
+
+    def at_places(self, figures: FloatArray) -> HiddenTerms:
+        """The terms for one mass's (6,) standardised figures by place, at one depth of fat."""
+        if self.by_place is None:
+            return self
+        expected = self.expected.copy()
+        expected[:, 0] += self.by_place @ figures  # of the feature 1
+        return replace(self, expected=expected, by_place=None)
+
+    def _entered(self, name: str, value: float) -> float:
+        if name in self.inverted:
+            return 1.0 / value
+        return float(np.log(value)) if name in LOGGED else value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 SPREAD: Final = "spread between maps of one mass (15 % in the paper): this is one map"
@@ -21,3 +22,17 @@ def fat_depth(why: str) -> str:
 def by_place(why: str) -> str:
     """The figures by place as a source left out, where maps do not give them."""
     return f"how the lump feels under each part of the head, which would narrow the size: {why}"
+
+
+def bodies(ranges: Mapping[str, tuple[float, float]]) -> str:
+    """Bodies unlike those that a calibration was learned over as a source left out; these by their columns."""
+    words = {
+        "stiffness_ratio": "lumps {:.3g} to {:.3g} times as stiff as fat",
+        "gland_ratio": "gland {:.3g} to {:.3g} times",
+        "fat_kpa": "fat of {:.3g} to {:.3g} kPa",
+    }
+    parts = [text.format(*ranges[name]) for name, text in words.items() if name in ranges]
+    return (
+        f"bodies unlike the calibration's ({', '.join(parts)}, even layers, tissue that does not stiffen where it is "
+        "pressed), whose sizes may lie outside the interval"
+    )

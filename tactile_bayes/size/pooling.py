@@ -14,7 +14,6 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import REPLICATES, Labels, even_replicates
 from tactile_bayes.inference.normal import normal_quantile
@@ -26,6 +25,7 @@ from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, turned
 from tactile_bayes.size.posterior import SizePosterior, shares
 from tactile_bayes.size.site_shift import site_log_shift, site_slope, site_variance
+from tactile_bayes.size.supposed import known_body, suppositions
 
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
@@ -181,10 +181,16 @@ def pooled_size(
     }
     between = priors.between_maps or calibration.between_exams
     another = priors.another_exam
+    size = pool.size(between, figures)
+    log_a, log_width = (
+        float(np.mean([np.nanmean(getattr(m, n)) for m in used])) for n in ("log_amplitude", "log_width")
+    )
+    variance = float(np.nanvar(np.log(size.max_size_mm)))
     return replace(
-        pool.size(between, figures),
+        size,
         outliers=outlying_maps(centre, noise, another or priors.learned_between_maps or BetweenMaps()),
         another_exam=None if another is None else pool.size(another, figures),
+        supposing=suppositions(calibration, priors.known, (log_a, log_width), variance=variance),
     )
 
 
@@ -259,11 +265,11 @@ class _Pool:
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
         other_sd = self.calibration.other_sd
         own_sd = np.sqrt(np.maximum(body_sd**2 - other_sd**2, 0.0))
-        expected, left = _known_body(self.calibration, self.known, middle_a, middle_width)
-        return expected * own_sd + shift, {
+        expected, left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
+        return expected + shift, {
             "between_maps": np.sum(weight**2, axis=0) * tau**2,
             "calibration": error,
-            "body": (left * own_sd) ** 2 + other_sd**2,
+            "body": left + other_sd**2,
             **site_variance(self.calibration.site, middle_width),
         }
 
@@ -371,22 +377,6 @@ def pool_maps(
         weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
         size = replace(size, figures={**size.figures, **weights})
     return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration, fat_apart_mm)
-
-
-def _known_body(
-    calibration: BodyCalibration, known: Mapping[str, float], log_amplitude: FloatArray, log_width: FloatArray
-) -> tuple[FloatArray, float]:
-    """Mean of B given the known properties, and what remains of its SD, both over its SD."""
-    if not known:
-        return np.zeros(len(log_width)), 1.0
-    hidden = calibration.hidden
-    names = () if hidden is None else hidden.names
-    for name in known:
-        if name not in names:
-            raise UsageError(f"the calibration has no property {name}; it has {', '.join(names) or 'none'}")
-    assert hidden is not None
-    expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
-    return expected / np.sqrt(hidden.body_variance), float(np.sqrt(1.0 - hidden.share(*known)))
 
 
 def _elongation(

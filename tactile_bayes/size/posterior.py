@@ -15,6 +15,7 @@ from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+from tactile_bayes.size.supposed import Supposition
 
 EXTREMES = ("max_size_mm", "min_size_mm")
 SIZES = (*EXTREMES, "d_x_mm", "d_y_mm")
@@ -43,6 +44,8 @@ class SizePosterior:
     another_exam
         The same if another exam of the mass may come out as far apart as in the paper's trial; None where that is
         not told.
+    supposing
+        What the size would be if something more were known of the body, by the names of `supposed.SUPPOSED`.
     """
 
     d_x_mm: FloatArray
@@ -53,6 +56,7 @@ class SizePosterior:
     figures: Mapping[str, float] = field(default_factory=dict)
     outliers: tuple[int, ...] = ()
     another_exam: SizePosterior | None = None
+    supposing: Mapping[str, Supposition] = field(default_factory=dict)
 
     @property
     def max_size_mm(self) -> FloatArray:

@@ -135,9 +135,10 @@ def test_a_pooled_mass_keeps_its_schema_and_its_maps(pooled: dict, folder: Path)
 def test_maps_that_do_not_tell_the_depth_of_the_fat_are_pooled_without_and_say_so(pooled: dict) -> None:
     """The bumps of these maps lie on an even pressure, which no body has."""
     assert pooled["fat_mm"] is None
-    head, fat = pooled["left_out"]
+    head, fat, bodies = pooled["left_out"]
     assert "the map does not name its head" in head
     assert fat.startswith("the depth of the fat")
+    assert bodies.startswith("bodies unlike the calibration's (lumps 8 to 100 times as stiff as fat")
     assert f"Left out: {head}; the depth of the fat" in pooled_text(pooled)
     assert "Fat under the head 12.3 mm deep" in pooled_text(pooled | {"fat_mm": 12.3, "left_out": []})
 

@@ -22,6 +22,7 @@ from tactile_bayes.mapping.bump_by_place import USUAL, Bump, by_place
 from tactile_bayes.mapping.frame_sample import STEP, FrameSample
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import BY_PLACE
 from tactile_bayes.scan import Scan
 from tactile_bayes.studies.population import measuring_options
@@ -169,3 +170,16 @@ def test_seats_differ_in_their_figures() -> None:
     # exams of one body differ by 0.03 to 0.05 in each figure (the population of docs/decisions/0106)
     assert np.abs(centred - out).max() > 0.1
     assert len(centred) == len(BY_PLACE)
+
+
+def test_over_uneven_fat_there_are_none() -> None:
+    """The control: a change of the head's profile that may be its own error."""
+    made = map_of(0.0)
+
+    def found(sd: float) -> Estimate:
+        quality = {**made.quality, "profile_change": 0.05, "profile_change_sd": sd}
+        changed = replace(made, quality=quality)
+        return estimate_map(changed, calibration=None, options=measuring_options(), rng=np.random.default_rng(1))
+
+    assert found(0.005).by_place is None
+    assert found(0.04).by_place is not None

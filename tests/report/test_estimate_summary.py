@@ -100,6 +100,27 @@ def test_the_whole_report_has_every_figure_of_the_short_one(folder: Path) -> Non
     assert f"{size['median']:.{places}f}   {size['low']:.{places}f} to {size['high']:.{places}f} mm" in short
 
 
+def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder: Path) -> None:
+    def document(*more: str) -> dict:
+        return json.loads(run_here("estimate", "clear.nc", "--method", "laplace", "--json", *more, cwd=folder).stdout)
+
+    supposed = document()["supposing"]
+    assert supposed["soft"]["property"] == "stiffness_ratio"
+    soft, hard = (
+        document("--known", "stiffness_ratio", str(supposed[name]["value"]))["max_size_mm"] for name in ("soft", "hard")
+    )
+    for name, told in (("soft", soft), ("hard", hard)):
+        ends = supposed[name]["max_size_mm"]
+        assert [ends[end] for end in ("low", "median", "high")] == pytest.approx(
+            [told[end] for end in ("low", "median", "high")], rel=0.01
+        )
+    assert soft["median"] > 1.02 * hard["median"]
+    assert set(document("--known", "stiffness_ratio", "30")["supposing"]) == {"centred", "resting"}
+    whole = run_here("estimate", "clear.nc", "--method", "laplace", "-v", cwd=folder).stdout
+    assert "Were the lump soft (11 times as stiff as fat): " in whole
+    assert "bodies unlike the calibration's (lumps 8 to 100 times as stiff as fat" in whole
+
+
 def crowded() -> tuple[Estimate, dict]:
     """An estimate with everything there is to say about it."""
     options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)

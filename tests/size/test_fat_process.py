@@ -200,7 +200,8 @@ def table_by_place(bodies: int = 300, *, seed: int = 1, told: bool = True) -> Po
     noise = np.random.default_rng(200 + seed).normal(size=(len(one), len(BY_PLACE)))
     figures = 0.1 * noise + [1.0, -0.4, -0.2, 0.2, -0.6, -0.3]
     figures[:, 1] += (seat if told else np.roll(seat, 1))[one.body.astype(int)]
-    return replace(one, d_mm=one.d_mm * np.exp(0.1 * seat[one.body.astype(int)]), by_place=figures)
+    seat = seat[one.body.astype(int)]
+    return replace(one, d_mm=one.d_mm * np.exp(0.1 * seat), by_place=figures, unknowns={"seat": seat})
 
 
 def spread_of_errors(calibration: LogQuadratic, maps: PopulationTable, *, by_place: bool) -> float:
@@ -246,6 +247,19 @@ def test_without_figures_by_place_the_size_says_so(learned_by_place, learned) ->
     assert learned.at_fat(one).at_places([usual]).omissions() == []
 
 
+def test_a_seat_that_the_figures_tell_is_expected_of_the_map(learned_by_place) -> None:
+    """Knowing it adds little then; the control is the process without these figures, to which it says a lot."""
+    profile, usual = [tuple(profile_of(np.array([0.1]))[0])], np.array([1.0, -0.4, -0.2, 0.2, -0.6, -0.3])
+    bare = learned_by_place.at_fat(profile)
+    assert bare.hidden is not None
+    assert bare.unknowns["seat"] > 0.5
+    at = [bare.at_places([tuple(usual + np.eye(6)[1] * seat)]) for seat in (-1.0, 1.0)]
+    assert all(one.knows_places and one.unknowns["seat"] < 0.5 * bare.unknowns["seat"] for one in at)
+    a, p = np.array([-1.0]), np.array([1.4])
+    expected = [float((one.features(a, p) @ one.hidden.expected.T)[0, 0]) for one in at]
+    assert expected == pytest.approx([-1.0, 1.0], abs=0.2)
+
+
 def test_maps_of_a_mass_share_their_mean_figures_by_place(learned_by_place) -> None:
     profile = [tuple(profile_of(np.array([0.1]))[0])]
     usual = np.array([1.0, -0.4, -0.2, 0.2, -0.6, -0.3])
@@ -274,8 +288,17 @@ def test_a_file_holds_the_process_of_figures_by_place(learned_by_place, tmp_path
     got, want = (one.at_fat(profile).at_places(told) for one in (read, learned_by_place))
     assert got.knows_places
     np.testing.assert_allclose(got.log_size(a, a + 2.4), want.log_size(a, a + 2.4), atol=1e-6)
+    assert got.hidden is not None
+    assert want.hidden is not None
+    np.testing.assert_allclose(got.hidden.expected, want.hidden.expected, atol=1e-6)
+    assert got.hidden.most_sd == pytest.approx(want.hidden.most_sd, rel=1e-6)
     document = json.loads((tmp_path / "s.json").read_text())
     inner = document["fat_process"]["with_places"]
+    short = inner["hidden"]["by_place"][0].pop()
+    (tmp_path / "spoilt.json").write_text(json.dumps(document))
+    with pytest.raises(BadDataError, match=r"hidden.by_place is no \(1, 6\)"):
+        read_size_calibration(tmp_path / "spoilt.json")
+    inner["hidden"]["by_place"][0].append(short)
     del inner["places"]
     (tmp_path / "cut.json").write_text(json.dumps(document))
     with pytest.raises(BadDataError, match="with_places is no process of figures by place"):

@@ -112,9 +112,48 @@ def test_what_decides_is_named_and_what_does_not_is_not(learned):
 def test_a_known_seat_moves_the_size_and_narrows_it(learned):
     assert learned.hidden is not None
     terms = learned.terms(np.array(-0.8), np.array(1.4))
-    low, high = (float(learned.hidden.expected_body({"seat": s}, terms)) for s in (0.0, 1.2))
+    body_sd = min(np.exp(learned.mean[6] + learned.mean[7] * terms[1]), learned.hidden.most_sd)
+    low, high = (body_sd * float(learned.hidden.expected_body({"seat": s}, terms)) for s in (0.0, 1.2))
     assert low - high == pytest.approx(-SEAT_SLOPE * 1.2, rel=0.15)
     assert learned.hidden.share("seat", "fat_kpa") >= learned.hidden.share("seat") - 1e-12
+
+
+def with_unknown(name: str, values: np.ndarray, effect: np.ndarray) -> PopulationTable:
+    """Bodies of which one more property is known, with what it does to ln d."""
+    table = population(bodies=len(values), seat_slope=0.0)
+    one = table.body.astype(int)
+    return replace(table, d_mm=table.d_mm * np.exp(effect[one]), unknowns={name: values[one]})
+
+
+def test_soft_lumps_have_no_bias_where_their_stiffness_is_known():
+    """What is 50 times as stiff as fat and what is 100 times are alike; 8 and 16 times are not."""
+    ratio = np.exp(np.random.default_rng(4).uniform(np.log(8), np.log(100), 600))
+    table = with_unknown("stiffness_ratio", np.log(ratio), 2.0 / ratio)
+    learned = learn_log_quadratic(table, recipe=RECIPE)
+    assert learned.hidden is not None
+    a, p = table.log_amplitude, table.log_width
+    without = learned.log_size(a, p) - np.log(table.d_mm)
+    features, body_sd = learned.features(a, p), np.exp(learned.mean[6] + learned.mean[7] * learned.terms(a, p)[:, 1])
+    told = [learned.hidden.expected_body({"stiffness_ratio": np.exp(v)}, x)
+            for v, x in zip(table.unknowns["stiffness_ratio"], features, strict=True)]  # fmt: skip
+    known = without + np.minimum(body_sd, learned.hidden.most_sd) * np.array(told)
+    for low, high in ((8, 11), (11, 30), (50, 101)):
+        members = (ratio >= low)[table.body] & (ratio < high)[table.body]
+        assert abs(known[members].mean()) < 0.02
+    assert without[(ratio < 11)[table.body]].mean() < -0.08  # the control: not told, they come out small
+
+
+def test_where_bodies_differ_more_does_not_decide_what_a_property_tells():
+    """B is 0.8 SD of B times a property's own scale, everywhere; faint lumps' SD is ten times the strong ones'."""
+    rng = np.random.default_rng(6)
+    table = population(bodies=600, seat_slope=0.0)
+    one = table.body.astype(int)
+    u = (table.log_amplitude + 0.8)[::2]
+    seat, rest = rng.normal(size=(2, 600))
+    effect = 0.4 * np.exp(-0.8 * u) * (0.8 * seat + 0.6 * rest)
+    wide = replace(table, d_mm=table.d_mm * np.exp(effect[one]), unknowns={"seat": seat[one]})
+    found = learn_log_quadratic(wide, recipe=RECIPE)
+    assert found.unknowns["seat"] == pytest.approx(0.8**2, abs=0.1)  # 0.3 where all bodies count alike
 
 
 def test_a_balls_oval_map_is_learned_with_its_spread(learned):

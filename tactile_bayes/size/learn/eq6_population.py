@@ -16,13 +16,13 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import RoundLumps
 from tactile_bayes.size.learn.fat_depth import FatTable
+from tactile_bayes.size.learn.hidden import hidden_terms
 from tactile_bayes.size.learn.regression import (
     BodyRegression,
     PopulationTable,
     check_population,
     domain_of,
     figures,
-    hidden_terms,
     leverages,
 )
 from tactile_bayes.size.polynomials import monomials
@@ -112,7 +112,7 @@ def learn_population_eq6(table: PopulationTable, *, recipe: Recipe, source: str 
         most_leverage=float(leverage.max()),
         domain=domain_of(table),
         recipe=recipe,
-        hidden=hidden_terms(table, data, mean, features=features),
+        hidden=hidden_terms(table, data, **data.bodies_left_out(mean), features=features),
         fit=figures(table, data, mean),
         source=source,
         with_fat=learn_fat_eq6(table),
@@ -137,7 +137,7 @@ def learn_fat_eq6(table: PopulationTable) -> FatEq6 | None:
         **found.fields(data, features),
         mean=mean,
         covariance=covariance,
-        hidden=hidden_terms(found.maps, data, mean, features=features),
+        hidden=hidden_terms(found.maps, data, **data.bodies_left_out(mean), features=features),
         fit=figures(found.maps, data, mean),
     )
 

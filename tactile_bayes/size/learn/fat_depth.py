@@ -9,7 +9,8 @@ import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.fat_depth import ROUND, FatCubic, FatDepth, cubic_terms, profile_terms
-from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable, figures, hidden_terms, leverages
+from tactile_bayes.size.learn.hidden import hidden_terms
+from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable, figures, leverages
 from tactile_bayes.size.polynomials import monomials
 
 LEAST_BODIES = 80
@@ -101,7 +102,7 @@ def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
         **found.fields(data, data.terms),
         mean=mean,
         covariance=covariance,
-        hidden=hidden_terms(found.maps, data, mean),
+        hidden=hidden_terms(found.maps, data, **data.bodies_left_out(mean), features=data.terms),
         fit=figures(found.maps, data, mean),
     )
 

@@ -9,12 +9,13 @@ import numpy as np
 from scipy.special import ndtri
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import HELD
+from tactile_bayes.presets import BY_PLACE, HELD
 from tactile_bayes.size.fat_depth import POWERS
 from tactile_bayes.size.fat_process import FatProcess, PlaceTable
 from tactile_bayes.size.learn.fat_depth import LEAST_BODIES, FatTable
-from tactile_bayes.size.learn.process_fit import Fitted, ProcessRows, all_terms, fit_process, left_out_density
-from tactile_bayes.size.learn.regression import PopulationTable, error_figures, hidden_terms, leverages
+from tactile_bayes.size.learn.hidden import hidden_terms
+from tactile_bayes.size.learn.process_fit import Fitted, ProcessRows, fit_process, left_out_density
+from tactile_bayes.size.learn.regression import PopulationTable, error_figures, leverages
 from tactile_bayes.size.polynomials import monomials
 
 INSIDE: Final = 0.99
@@ -69,12 +70,13 @@ def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> Fat
     rows, fitted, exam = fit_process(found.maps, ProcessRows.of(found, places))
     features = monomials(found.values, POWERS)
     mean = np.concatenate([fitted.mean, fitted.log_spread, exam[:1]])
-    whole = replace(rows.data, terms=all_terms(rows, fitted.kernel), mean_terms=fitted.terms)
+    body, body_sd = -fitted.left_out(rows.data.mean_log_d)[0], np.exp(rows.spread @ fitted.log_spread)
+    by_place = None if places is None else rows.x[:, -len(BY_PLACE) :]
     return FatProcess(
         **found.fields(rows.data, features, inside=INSIDE),
         mean=mean,
         covariance=_covariance(rows, fitted, exam),
-        hidden=hidden_terms(found.maps, whole, mean, features=features),
+        hidden=hidden_terms(found.maps, rows.data, body=body, body_sd=body_sd, features=features, by_place=by_place),
         fit=_figures(found.maps, rows, fitted, exam),
         kernel=fitted.kernel,
         other_sd=other_sd,

@@ -9,13 +9,13 @@ from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import FatTerms
 from tactile_bayes.size.hidden import RoundLumps
 from tactile_bayes.size.learn.fat_depth import learn_fat_cubic
+from tactile_bayes.size.learn.hidden import hidden_terms
 from tactile_bayes.size.learn.regression import (
     BodyRegression,
     PopulationTable,
     check_population,
     domain_of,
     figures,
-    hidden_terms,
     leverages,
 )
 from tactile_bayes.size.log_quadratic import LogQuadratic, quadratic_terms
@@ -62,7 +62,7 @@ def learn_log_quadratic(
         most_leverage=float(leverage.max()),
         domain=domain_of(table),
         recipe=recipe,
-        hidden=hidden_terms(table, data, mean),
+        hidden=hidden_terms(table, data, **data.bodies_left_out(mean), features=data.terms),
         fit=figures(table, data, mean),
         source=source,
         with_fat=learn_fat(table),

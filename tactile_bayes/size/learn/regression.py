@@ -22,7 +22,6 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.laplace import mode_and_covariance
 from tactile_bayes.presets import HELD
-from tactile_bayes.size.hidden import HiddenTerms
 
 LEAST_BODIES = 20
 Terms = Callable[[FloatArray, FloatArray], FloatArray]
@@ -184,6 +183,11 @@ class BodyRegression:
         """(groups,) residual of each body's mean."""
         return np.asarray(self.mean_log_d - self.mean_terms @ mode[: self.terms.shape[1]])
 
+    def bodies_left_out(self, mode: FloatArray) -> dict[str, FloatArray]:
+        """``body`` and ``body_sd`` of `hidden.hidden_terms`, (groups,) arrays."""
+        left_out = -left_out_errors(self.mean_terms, self.mean_log_d)
+        return {"body": left_out, "body_sd": np.exp(mode[-3] + mode[-2] * self.mean_u)}
+
     def posterior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of k coefficients, ln(sd between bodies), its slope, ln(sd between exams), as normal.
 
@@ -234,36 +238,6 @@ def _slopes(table: PopulationTable, terms_of: Terms) -> FloatArray:
     by_a = (terms_of(a + h, p) - terms_of(a - h, p)) / (2 * h)
     by_p = (terms_of(a, p + h) - terms_of(a, p - h)) / (2 * h)
     return np.stack([by_a, by_p])
-
-
-def hidden_terms(
-    table: PopulationTable, data: BodyRegression, mode: FloatArray, *, features: FloatArray | None = None
-) -> HiddenTerms | None:
-    """Joint second moments of B and of what was varied, each about what the map leads one to expect of it.
-
-    Parameters
-    ----------
-    features : (n, c) array
-        What a map leads one to expect is linear in these; the regression's own terms where left out. B is about the
-        terms in any case.
-    """
-    if not table.unknowns:
-        return None
-    own = features is None
-    design = data.mean_terms if features is None else np.stack([data.mean(column) for column in features.T], axis=1)
-    varied = np.stack([data.mean(values) for values in table.unknowns.values()], axis=1)
-    coefficients = np.linalg.lstsq(design, varied, rcond=None)[0]
-    body = data.body_residuals(mode)
-    body = body - design @ np.linalg.lstsq(design, body, rcond=None)[0] if own else body
-    rest = np.column_stack([varied - design @ coefficients, body])
-    moments = np.asarray(rest.T @ rest / max(data.groups - int(design.shape[1]), 1), dtype=np.float64)
-    return HiddenTerms(
-        names=tuple(table.unknowns),
-        expected=np.asarray(coefficients.T),
-        covariance=moments[:-1, :-1],
-        with_body=moments[:-1, -1],
-        body_variance=float(moments[-1, -1]),
-    )
 
 
 def figures(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> dict[str, float]:

@@ -249,16 +249,17 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
     terms = used.terms(log_a, log_width)
     body_sd = float(used.body_and_error(terms, log_a, log_width, np.zeros(len(maps)))[0].mean())
-    expected, alone, together = _known(used, maps[0].known, float(log_a.mean()), float(log_width.mean()))
+    own_sd = float(np.sqrt(max(body_sd**2 - used.other_sd**2, 0.0)))
+    expected, alone, together = _known(used, maps[0].known, (float(log_a.mean()), float(log_width.mean())), own_sd)
     n = len(maps)
     exam = used.between_exams.sd**2 / n
     noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
     return _Phantom(
         residual=float(left.mean()) - expected,
         width=float(log_width.mean()) - centre,
-        spread_variance=alone * body_sd**2 + exam,
+        spread_variance=alone + used.other_sd**2 + exam,
         map_variance=noise,
-        common=body_sd * float(np.sqrt(together)),
+        common=float(np.sqrt(together)),
         maps=n,
         uses_fat=used.fat_mm is not None or calibration.with_fat is None,
         uses_places=not used.places_note,
@@ -266,22 +267,26 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
 
 
 def _known(
-    calibration: BodyCalibration, known: Mapping[str, float], log_amplitude: float, log_width: float
+    calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], own_sd: float
 ) -> tuple[float, float, float]:
-    """E[B] given known properties, and of the variance of B the shares that are the phantom's own and the set's."""
+    """E[B] given known properties, and of the variance of B what is the phantom's own and what its set's.
+
+    `middle` is ln a and p of its maps; `own_sd` is SD(B) there.
+    """
     hidden = calibration.hidden
     if hidden is None:
-        return 0.0, 1.0, 0.0
+        return 0.0, own_sd**2, 0.0
+    explained_sd = min(own_sd, hidden.most_sd)
     stated = {name: value for name, value in known.items() if name in hidden.names}
     shared = [name for name in SHARED if name in hidden.names and name not in stated]
-    by_stated = hidden.share(*stated) if stated else 0.0
-    by_both = hidden.share(*stated, *shared) if stated or shared else 0.0
-    lack = LACK * (1.0 - hidden.share(*hidden.names))
-    own, common = 1.0 - by_both - lack, by_both - by_stated + lack
+    by_stated = explained_sd**2 * hidden.share(*stated) if stated else 0.0
+    by_both = explained_sd**2 * hidden.share(*stated, *shared) if stated or shared else 0.0
+    lack = LACK * (own_sd**2 - explained_sd**2 * hidden.share(*hidden.names))
+    own, common = own_sd**2 - by_both - lack, by_both - by_stated + lack
     if not stated:
         return 0.0, own, common
-    features = calibration.features(np.array(log_amplitude), np.array(log_width))
-    return float(hidden.expected_body(stated, features)), own, common
+    features = calibration.features(np.array(middle[0]), np.array(middle[1]))
+    return explained_sd * float(hidden.expected_body(stated, features)), own, common
 
 
 def _figures(data: Residuals, found: ShiftPosterior, centre: float) -> dict[str, float]:

@@ -313,8 +313,8 @@ def test_two_sets_of_an_independent_model_give_one_shift_where_their_design_is_s
 
     sets = [shift(seat, stated=True) for seat in ("centred", "resting")]
     apart = abs(sets[0][0] - sets[1][0]) / np.sqrt(sets[0][1] + sets[1][1])
-    assert apart < 4.0  # E[B | seat] is linear: the sets differ by a tenth of a size where their seats are stated
-    assert all(abs(one) < 0.15 and left < 0.1 for one, _, left in sets)
+    assert apart < 1.0  # 2 % of a size; 8 to 15 % where what is stated of a body counts by the spread of all bodies
+    assert all(abs(one) < 0.15 and left < 0.14 for one, _, left in sets)
     # the control: without depth and seat the sets' design is taken for scatter
     assert all(shift(seat, stated=False)[2] > 0.2 for seat in ("centred", "resting"))
 

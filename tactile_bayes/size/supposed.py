@@ -1,0 +1,115 @@
+"""What is known of a body, or supposed of it, and what that says of B, its departure from the calibration.
+
+No map shows how stiff a lump is, and without frames none shows its seat: sizes are drawn to the middle of the
+calibration's bodies. How large the lump would be if it were soft or hard tells a reader on which side a size errs, and
+by how much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
+from tactile_bayes.size.body_calibration import BodyCalibration
+
+SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
+    "soft": ("stiffness_ratio", 11.0),
+    "hard": ("stiffness_ratio", 70.0),
+    "centred": ("seat", 0.0),
+    "resting": ("seat", 1.0),
+}
+"""A property and its value by name: lumps of 8 to 15 and 50 to 100 times the stiffness of fat, centred on the gland's
+surface and resting on it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Supposition:
+    """What the size would be if one more property of the body were known.
+
+    Parameters
+    ----------
+    name, value
+        The property, by the names of `HiddenTerms`, and its value.
+    log_shift
+        By which ln d moves.
+    sd_ratio
+        SD of ln d with it, over that without.
+    """
+
+    name: str
+    value: float
+    log_shift: float
+    sd_ratio: float
+
+    @property
+    def change(self) -> float:
+        """Change of the size, as a share."""
+        return float(np.expm1(self.log_shift))
+
+    def moved(self, size_mm: float, *, median_mm: float) -> float:
+        """Size where one of a distribution with this median comes to lie: the median itself, or an interval's end."""
+        return float(median_mm * np.exp(self.log_shift + self.sd_ratio * np.log(size_mm / median_mm)))
+
+
+def suppositions(
+    calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], *, variance: float
+) -> dict[str, Supposition]:
+    """Of `SUPPOSED` those that the calibration's bodies hold and that nobody knows, by name.
+
+    Parameters
+    ----------
+    middle
+        Mean ln a and p of the maps.
+    variance
+        Of ln d as it is.
+    """
+    at = np.array([middle[0]]), np.array([middle[1]])
+    body_sd = calibration.body_and_error(calibration.terms(*at), *at, np.zeros(1))[0]
+    own_sd = np.sqrt(np.maximum(body_sd**2 - calibration.other_sd**2, 0.0))
+    names, found = () if calibration.hidden is None else calibration.hidden.names, {}
+    before, left_before = known_body(calibration, known, *at, own_sd)
+    for label, (name, value) in SUPPOSED.items():
+        low, high = calibration.bodies.get(name, (value, value))
+        if name in names and name not in known and low <= value <= high:
+            expected, left = known_body(calibration, {**known, name: value}, *at, own_sd)
+            gone = float((left_before - left)[0]) / variance if variance > 0 else 0.0
+            ratio = float(np.sqrt(np.clip(1.0 - gone, 0.0, 1.0)))
+            found[label] = Supposition(name, value, float((expected - before)[0]), ratio)
+    return found
+
+
+def known_body(
+    calibration: BodyCalibration,
+    known: Mapping[str, float],
+    log_amplitude: FloatArray,
+    log_width: FloatArray,
+    own_sd: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of B given known properties.
+
+    Parameters
+    ----------
+    log_amplitude, log_width, own_sd : (n,) arrays
+        Of maps: ln a, p, and SD(B) there without `BodyCalibration.other_sd`, of which no property tells anything.
+
+    Raises
+    ------
+    UsageError
+        When the calibration knows nothing of a property.
+    """
+    if not known:
+        return np.zeros(len(log_width)), own_sd**2
+    hidden = calibration.hidden
+    names = () if hidden is None else hidden.names
+    for name in known:
+        if name not in names:
+            raise UsageError(f"the calibration has no property {name}; it has {', '.join(names) or 'none'}")
+    assert hidden is not None
+    expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
+    explained_sd = np.minimum(own_sd, hidden.most_sd)
+    return expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2
