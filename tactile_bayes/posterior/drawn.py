@@ -127,6 +127,8 @@ def _size(
         priors=priors,
         replicates=draws.replicates,
         rng=rng,
+        oblique=posterior.oblique,
+        irregular=posterior.irregular,
     )
 
 

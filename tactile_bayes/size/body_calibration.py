@@ -8,8 +8,8 @@ g is the form: a polynomial (`log_quadratic`), Eq 6 (`population_eq6`) or a Gaus
 from body to body by what a map does not show (seat, stiffness, moduli): :math:`N(0, s^2)`, with ln s a polynomial in u
 and v. E differs from exam to exam of one body.
 
-A ball under the oblong head gives an oval map; its half log axis ratio is
-:math:`q_0 = \gamma_0 + \gamma_1 u + \gamma_2 v`, and only what exceeds it says that a lump is not round.
+A ball under the oblong head gives an oval map; its half log axis ratio :math:`q_0` is a quadratic in u and v, and only
+what exceeds it says that a lump is not round.
 
 Where the depth F of the fat under the head is known, the coefficients are those at that depth, `fat_depth.FatTerms`.
 """
@@ -194,8 +194,8 @@ class BodyCalibration:
 
     def round_excess(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) q0, the half log axis ratio of a ball's map."""
-        c = self.round_lumps.coefficients
-        return np.asarray(c[0] + c[1] * (log_amplitude - self.centre[0]) + c[2] * (log_width - self.centre[1]))
+        u, v = np.asarray(log_amplitude - self.centre[0]), np.asarray(log_width - self.centre[1])
+        return self.round_lumps.excess(u, v)
 
     def body_and_error(
         self, terms: FloatArray, log_amplitude: FloatArray, log_width: FloatArray, score: FloatArray

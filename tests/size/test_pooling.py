@@ -11,7 +11,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
 from tactile_bayes.size.elongation import ShapePrior, elongation, turned
 from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
 
@@ -25,7 +25,7 @@ def calibration(*, body_sd: float = BODY_SD, hidden: HiddenTerms | None = None) 
         centre=(-1.0, 1.5),
         mean=mean,
         covariance=np.eye(9) * 1e-6,
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), 0.02, 0.01),
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
         information_inverse=np.eye(6) * 1e-2,
         most_leverage=1.0,
         domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},

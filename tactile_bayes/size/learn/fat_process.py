@@ -71,7 +71,7 @@ def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> Fat
     mean = np.concatenate([fitted.mean, fitted.log_spread, exam[:1]])
     whole = replace(rows.data, terms=all_terms(rows, fitted.kernel), mean_terms=fitted.terms)
     return FatProcess(
-        **found.fields(rows.data, features, inside=INSIDE),
+        **found.fields(features, inside=INSIDE),
         mean=mean,
         covariance=_covariance(rows, fitted, exam),
         hidden=hidden_terms(found.maps, whole, mean, features=features),
