@@ -37,8 +37,9 @@ OTHER_HEAD = (
 )
 """How to make a calibration for another head."""
 IRREGULAR = (
-    "irregular outline: the bump is more skewed, or its axis ratio changes more outwards, than a single ball or "
-    "ellipsoid shows; two lumps that touch, a tilted or a rough one look so, and sizes get a wider interval"
+    "irregular outline: the bump is more skewed, its axis ratio changes more outwards, or it depends more on the "
+    "place under the head than a ball's; two lumps that touch, an upright, tilted or rough one look so, and sizes "
+    "get a wider interval"
 )
 """Said of a lump whose map is `MapPosterior.irregular`."""
 

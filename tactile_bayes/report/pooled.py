@@ -113,7 +113,8 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         lines += _table(document) + width_lines(document["variance_share"])
         ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
         by = f"sizes by {document['site']}; " if document["site"] else ""
-        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %.")
+        form = "; irregular outline, with a wider interval" if document["figures"].get("irregular_outline") else ""
+        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %{form}.")
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 

@@ -140,6 +140,10 @@ class BodyCalibration:
         """The calibration for a mass whose maps have these `presets.BY_PLACE`: this one, if it has no use for them."""
         return self
 
+    def unlike_places(self, by_place: tuple[float, ...] | None) -> bool:  # noqa: ARG002
+        """Whether the figures by place are far from those of balls; asked before `at_places`."""
+        return False
+
     def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> BodyCalibration:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth.
 

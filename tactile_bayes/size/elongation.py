@@ -8,10 +8,12 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.records import dataclass
 
-SHOWN = 0.16
-"""Share of a lump's half log axis ratio that its map shows, over d in map widths (record 0107)."""
-SHOWN_CV = 0.25
+SHOWN, SHOWN_POWER = 0.083, 1.5
+"""Share of a lump's half log axis ratio that its map shows: factor, and power of d in map widths (record 0107)."""
+SHOWN_CV = 0.2
 """Coefficient of variation of that between lumps."""
+OVAL_SD = 0.4
+"""SD of the log mean diameter by which an oval lump is off the calibration for balls, over its half log axis ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,7 @@ class Elongation:
 
 def shown_share(log_size: FloatArray, log_width: FloatArray) -> float:
     """Share of a lump's half log axis ratio that its map shows, from (n,) draws of ln d and of the log mean width."""
-    return SHOWN * float(np.exp(np.nanmean(log_size - log_width)))
+    return SHOWN * float(np.exp(SHOWN_POWER * np.nanmean(log_size - log_width)))
 
 
 def elongation(excess: FloatArray, covariance: FloatArray, *, shown: float, prior: ShapePrior) -> Elongation:

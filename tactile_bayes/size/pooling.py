@@ -23,7 +23,7 @@ from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
-from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, shown_share, turn_matrix
+from tactile_bayes.size.elongation import OVAL_SD, Elongation, ShapePrior, elongation, shown_share, turn_matrix
 from tactile_bayes.size.posterior import SizePosterior, shares
 from tactile_bayes.size.site_shift import site_log_shift, site_variance
 
@@ -236,7 +236,8 @@ class _Pool:
         known, variances = self._left_open(tau=tau, weight=weight, score=score)
         map_part = np.sum(weight * self.by_map, axis=0)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
-        mean, sd = map_part + known + longer, np.sqrt(sum(variances.values()))
+        mean = map_part + known + longer
+        sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
         log_largest, log_smallest = self._evened(mean, sd, z, longer)
         wide = self.half[:, 0] >= 0
         share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
@@ -244,7 +245,7 @@ class _Pool:
         return SizePosterior(
             np.exp(np.where(wide, log_largest, log_smallest)),
             np.exp(np.where(wide, log_smallest, log_largest)),
-            shares(share | {"shape": float(np.var(longer))}),
+            shares(share | {"shape": float(np.var(longer) + OVAL_SD**2 * np.mean(longer**2))}),
             int((~np.isfinite(mean)).sum()),
             self.replicates,
             {"between_map_sd": float(np.sqrt(np.mean(tau**2))), **figures, **weights},

@@ -9,7 +9,16 @@ import pytest
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
-from tactile_bayes.size.elongation import SHOWN, SHOWN_CV, ShapePrior, elongation, shown_share, turn_matrix
+from tactile_bayes.size.elongation import (
+    OVAL_SD,
+    SHOWN,
+    SHOWN_CV,
+    SHOWN_POWER,
+    ShapePrior,
+    elongation,
+    shown_share,
+    turn_matrix,
+)
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
 from tactile_bayes.size.log_quadratic import LogQuadratic
@@ -162,7 +171,7 @@ def test_a_round_lump_stays_round_and_its_largest_size_is_not_biased():
     assert np.log(np.median(found.max_size_mm)) == pytest.approx(2.7, abs=0.01)
 
 
-SEEN = SHOWN * np.exp(2.7 - 1.7)
+SEEN = SHOWN * np.exp(SHOWN_POWER * (2.7 - 1.7))
 """Share of the half log axis ratio that the maps of `shape(2.7)` show: d of 14.9 mm, widths of 5.5 mm."""
 
 
@@ -209,7 +218,7 @@ def test_an_angle_that_the_fit_left_out_is_not_measured_as_round():
 def test_a_1_5_to_1_spheroid_is_covered_and_by_the_slope_of_ln_d_it_was_not():
     """Figures of a simulated lump, 15.2 by 10.1 mm, sigma 4.6 mm (record 0107): beyond a ball's 0.072, SD 0.011."""
     truth, excess, noise = 0.5 * np.log(15.2 / 10.1), np.array([0.072, -0.011]), 0.011**2 * np.eye(2)
-    shown = SHOWN * 13.3 / 4.6
+    shown = SHOWN * (13.3 / 4.6) ** SHOWN_POWER
     found = elongation(excess, noise, shown=shown, prior=ShapePrior())
     assert found.probability > 0.95
     assert abs(found.mean[0] - truth) < 1.96 * np.sqrt(found.covariance[0, 0])
@@ -218,10 +227,17 @@ def test_a_1_5_to_1_spheroid_is_covered_and_by_the_slope_of_ln_d_it_was_not():
     assert abs(before.mean[0] - truth) > 1.96 * np.sqrt(before.covariance[0, 0])
 
 
+def test_the_mean_size_of_an_oval_lump_is_less_certain_than_a_balls():
+    both = [pooled([shape(2.7, q=0.05 + h * SEEN)], priors=KNOWN_0) for h in (0.0, 0.35)]
+    ball, oval = (np.log(one.max_size_mm * one.min_size_mm).std() / 2 for one in both)
+    longer = both[1].figures["oval_half_log_ratio"]
+    assert oval == pytest.approx(np.hypot(ball, OVAL_SD * longer), rel=0.1)
+
+
 def test_the_share_that_a_map_shows_goes_with_d_over_its_width():
     one = shown_share(np.array([2.7, np.nan]), np.array([1.7, 1.7]))
     assert one == pytest.approx(SEEN)
-    assert shown_share(np.array([2.7]), np.array([1.7 + np.log(2)])) == pytest.approx(SEEN / 2)
+    assert shown_share(np.array([2.7]), np.array([1.7 + np.log(2)])) == pytest.approx(SEEN / 2**SHOWN_POWER)
 
 
 def test_an_irregular_outline_widens_both_sizes_and_is_told():

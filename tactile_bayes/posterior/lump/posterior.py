@@ -20,7 +20,7 @@ class MapPosterior:
         Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
         measured beside them; None otherwise.
     irregular
-        Whether the bump is less regular than a ball's, see `correlated.outline`.
+        Whether the bump is less regular than a ball's, see `correlated.outline` and `BodyCalibration.unlike_places`.
     """
 
     amplitude: FloatArray
