@@ -151,8 +151,8 @@ class Sized:
         Whether the 95 % intervals hold these diameters.
     half_width
         Half the interval of the largest size over its median.
-    oval
-        Whether the report says that the lump is oval.
+    oval, irregular
+        Whether the report says that the lump is oval, and that its outline is irregular.
     """
 
     across: float
@@ -163,6 +163,7 @@ class Sized:
     covers_smallest: bool
     half_width: float
     oval: bool
+    irregular: bool
 
 
 def sized(row: Mapping[str, Any], size: SizePosterior) -> Sized:
@@ -178,6 +179,7 @@ def sized(row: Mapping[str, Any], size: SizePosterior) -> Sized:
         smallest.low <= least <= smallest.high,
         (largest.high - largest.low) / 2 / largest.median,
         size.figures["oval_probability"] >= 0.5,
+        size.figures["irregular_outline"] > 0.0,
     )
 
 
@@ -200,7 +202,7 @@ def table(folders: Sequence[Path]) -> str:
             if size is not None:
                 found[name].append(sized(json.loads(path.read_text()), size))
     head = f"{'class':14}{'sized':>8}{'median':>8}{'mean |e|':>9}{'covers':>8}{'smallest':>9}{'covers':>8}"
-    lines = [head + f"{'3D |e|':>8}{'covers':>8}{'half':>6}{'oval':>6}"]
+    lines = [head + f"{'3D |e|':>8}{'covers':>8}{'half':>6}{'oval':>6}{'irregular':>11}"]
     for name, rows in found.items():
         n = len(rows)
 
@@ -212,7 +214,7 @@ def table(folders: Sequence[Path]) -> str:
             f"{name:14}{f'{n}/{asked[name]}':>8}{np.median(across):>+8.1%}{np.abs(across).mean():>9.1%}"
             f"{share('covers'):>8}{np.mean([abs(r.smallest) for r in rows]):>9.1%}{share('covers_smallest'):>8}"
             f"{np.mean([abs(r.any_way) for r in rows]):>8.1%}{share('covers_any'):>8}"
-            f"{np.mean([r.half_width for r in rows]):>6.0%}{share('oval'):>6}"
+            f"{np.mean([r.half_width for r in rows]):>6.0%}{share('oval'):>6}{share('irregular'):>11}"
         )
     return "\n".join(lines)
 

@@ -98,7 +98,7 @@ def _drawn(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
     told = None if _beside_another(made) else posterior.by_place(tactile_map)
-    if isinstance(calibration, BodyCalibration) and calibration.fitting(*posterior.medians).unlike_places(told):
+    if isinstance(calibration, BodyCalibration) and calibration.unlike_places(told):
         posterior = replace(posterior, irregular=True)
         made = replace(made, posterior=posterior)
     calibration = fitting_calibration(posterior, calibration, told)

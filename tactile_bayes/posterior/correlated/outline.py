@@ -17,7 +17,7 @@ from tactile_bayes.posterior.correlated.tangent import tangent_columns
 
 BALLS_SD = (0.008, 0.01)
 """Of skewness and change of balls' maps beyond their noise, over the amplitude (record 0107)."""
-NOISE_FACTOR = 2.0
+NOISE_FACTOR = 2.5
 """Variance of both over that by the residuals: deep and faint lumps are off by more than they say."""
 MOST_SDS = 2.5
 """Length of either beyond which a ball is unlikely: of two components, in the SD of one."""
