@@ -14,7 +14,7 @@ LOGGED = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
 """Properties that enter by their logarithm."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class RoundSpread:
     """How far maps of balls are from the axis ratio that is usual for them.
 
