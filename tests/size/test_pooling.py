@@ -209,7 +209,7 @@ def test_an_angle_that_the_fit_left_out_is_not_measured_as_round():
     straight = shape(2.7, q=0.05)
     beside = pooled([without_r(straight, (lump, 0.01))], priors=KNOWN_0)
     assert beside.figures["oval_half_log_ratio"] == pytest.approx(0.2, rel=0.2)
-    assert beside.figures["oval_probability"] > 0.8
+    assert beside.figures["oval_probability"] > 0.6
     control = pooled([without_r(straight, (0.0, 1e-6))], priors=KNOWN_0)
     unknown = pooled([without_r(straight, None)], priors=KNOWN_0)
     assert control.figures["oval_probability"] < unknown.figures["oval_probability"] < 0.5
@@ -277,18 +277,19 @@ def test_what_is_known_of_the_body_is_used_and_what_the_calibration_does_not_kno
         ("seat",), np.array([[0.6, 0, 0, 0, 0, 0]]), np.array([[0.12]]), np.array([-0.024]), BODY_SD**2
     )
     use = calibration(hidden=hidden)
-    centred = SizePriors(between_maps=BetweenMaps(0.0, 0.0), known={"seat": 0.0})
-    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=use).max_size_mm) for p in (centred, KNOWN_0))
+    as_ball = SizePriors(between_maps=BetweenMaps(0.0, 0.0), shape=ShapePrior(oval_probability=1e-9))
+    centred = replace(as_ball, known={"seat": 0.0})
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=use).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.004)
     left = 1 - 0.024**2 / 0.12 / BODY_SD**2
-    assert known.std() == pytest.approx(np.hypot(BODY_SD * np.sqrt(left), 0.01), rel=0.07)
+    assert known.std() == pytest.approx(np.hypot(BODY_SD * np.sqrt(left), 0.01), rel=0.04)
     # where bodies differ twice as much, what is known of one tells twice as much of its size
     wide = replace(use, mean=use.mean + np.log(2.0) * (np.arange(len(use.mean)) == use.coefficients))
-    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=wide).max_size_mm) for p in (centred, KNOWN_0))
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=wide).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(2 * 0.6 * 0.2, abs=0.008)
     # and nothing of bodies of another kind
     other = replace(use, other_sd=0.1)
-    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=other).max_size_mm) for p in (centred, KNOWN_0))
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=other).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.006)
     assert known.std() == pytest.approx(np.sqrt(BODY_SD**2 * left + 0.01**2 + 0.1**2), rel=0.04)
     with pytest.raises(UsageError, match="no property weather"):
