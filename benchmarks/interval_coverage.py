@@ -361,7 +361,8 @@ def _size_mass(bodies: str, index: int) -> Row:
             continue
         one = found.map_posterior
         profile = head_profile(tactile_map.quality)
-        shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad, profile=profile))
+        told = {"profile": profile, "by_place": found.by_place, "oblique": one.oblique, "irregular": one.irregular}
+        shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad, **told))
         single.append(_both(found.size))
     pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))
     return {

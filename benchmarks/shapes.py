@@ -1,17 +1,17 @@
 """Sizes of simulated lumps that are no balls: spheroids lying flat, standing and tilted, lobed, rough, two that touch.
 
-    python -m benchmarks.shapes make DIR [--bodies 10] [--seed N]    # simulate, map and fit: DIR/<class>-<i>.npz
-    python -m benchmarks.shapes sizes DIR [DIR ...]     # size the fits with the default calibration: one table
+    python -m benchmarks.shapes make DIR [--bodies 10] [--seed N]    # simulate and map: DIR/<class>-<i>.nc and .json
+    python -m benchmarks.shapes sizes DIR [DIR ...]    # estimate the maps with the defaults: one table
 
 Bodies and exams are drawn from `forward.population`, with mean diameters across of 8 to 25 mm and depths up to 1.4
-of them; one exam a body. `make` takes about 5 s of CPU a body and goes on where it stopped; `sizes` takes seconds, so
-that a rule of sizing can be tried on the same fits. The sizes of a map are compared with the diameters seen from above,
-and the largest also with the largest of all.
+of them; one exam a body. `make` takes about 5 s of CPU a body and goes on where it stopped; `sizes` takes half a second
+a body. The sizes of a map are compared with the diameters seen from above, the largest also with the largest of all.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -22,21 +22,16 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.files.shipped import size_calibration_path
-from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_body, draw_exam
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SolidLump
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.elongation import ShapePrior
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
 from tactile_bayes.size.posterior import SizePosterior
 
 SEED: Final = 20270110
 BODIES: Final = BodyPrior(d_mm=(8.0, 25.0), depth_ratio=(0.56, 1.4))
 LARGEST_MM: Final = 25.0
-_DRAWS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_rad")
 # A shape needs this much of its half height below the skin, and above the chest wall.
 _COVER: Final = 1.12
 
@@ -77,6 +72,7 @@ CLASSES: Final = {
     "lobed": ShapeClass(outline=(("lobe_share", 0.2),)),
     "tilted 1.5": replace(_flat(1.5), tilted=True),
     "rough": ShapeClass(outline=(("rough_share", 0.1),)),
+    "standing 2.0": ShapeClass(down=2.0),
 }
 
 
@@ -113,51 +109,30 @@ def draw_scene(name: str, index: int, seed: int) -> Scene:
 
 
 def make(folder: Path, *, bodies: int, seed: int, classes: list[str]) -> None:
-    """Simulate, map and fit, body by body of all classes in turn; what is there already is kept."""
+    """Simulate and map, body by body of all classes in turn; what is there already is kept."""
     folder.mkdir(parents=True, exist_ok=True)
     for index in range(bodies):
         for name in classes:
-            path = folder / f"{name.replace(' ', '_')}-{index}.npz"
-            if path.exists():
+            path = folder / f"{name.replace(' ', '_')}-{index}.nc"
+            if path.with_suffix(".json").exists():
                 continue
             start = time.process_time()
-            np.savez(path, **_measured(draw_scene(name, index, seed)))
+            _simulated(draw_scene(name, index, seed), path)
             print(f"{path.name}: {time.process_time() - start:.0f} s CPU", flush=True)
 
 
-def _measured(scene: Scene) -> dict[str, Any]:
-    """Truth, and the draws of amplitude and shape by the default method; no draws without an estimate."""
+def _simulated(scene: Scene, path: Path) -> None:
+    """Write the map of a scene, and the truth beside it."""
+    from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.mapping.build import build_map
-    from tactile_bayes.pipeline.one_map import estimate_one
-    from tactile_bayes.pipeline.settings import Settings
-    from tactile_bayes.presets import HEAD_PROFILE
-    from tactile_bayes.size.fat_depth import head_profile
 
     made = simulate(scene, rng=np.random.default_rng(scene.seed))
-    truth = made.truth["lumps"][0]
-    names = ("largest_mm", "smallest_mm", "largest_across_mm", "smallest_across_mm", "turn_deg", "depth_mm", "seat")
-    row: dict[str, Any] = {name: truth[name] for name in (*names, "stiffness_ratio")}
+    truth = dict(made.truth["lumps"][0])
     try:
-        tactile_map = build_map(made.scan)
-        estimate = estimate_one(tactile_map, Settings()).estimate
+        write_map(path, build_map(made.scan), provenance=Provenance("benchmarks.shapes", {}, {}), force=True)
     except TactileBayesError as error:
-        return row | {"why": str(error)}
-    posterior = estimate.map_posterior
-    if posterior is None or estimate.size is None:
-        return row | {"why": estimate.reason}
-    profile = head_profile({name: v for name in HEAD_PROFILE if (v := tactile_map.quality.get(name)) is not None})
-    draws = {n: getattr(posterior, n) for n in _DRAWS}
-    return (
-        row
-        | draws
-        | {
-            "profile": np.array(profile if profile is not None else ()),
-            "max_size_mm": estimate.size.max_size_mm,
-            "min_size_mm": estimate.size.min_size_mm,
-            "oval_probability": estimate.size.figures["oval_probability"],
-            "replicates": estimate.size.replicates,
-        }
-    )
+        truth["why"] = str(error)
+    path.with_suffix(".json").write_text(json.dumps(truth))
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +151,8 @@ class Sized:
         Whether the 95 % intervals hold these diameters.
     half_width
         Half the interval of the largest size over its median.
-    oval
-        Whether the report says that the lump is oval.
+    oval, irregular
+        Whether the report says that the lump is oval, and that its outline is irregular.
     """
 
     across: float
@@ -188,6 +163,7 @@ class Sized:
     covers_smallest: bool
     half_width: float
     oval: bool
+    irregular: bool
 
 
 def sized(row: Mapping[str, Any], size: SizePosterior) -> Sized:
@@ -203,33 +179,30 @@ def sized(row: Mapping[str, Any], size: SizePosterior) -> Sized:
         smallest.low <= least <= smallest.high,
         (largest.high - largest.low) / 2 / largest.median,
         size.figures["oval_probability"] >= 0.5,
+        size.figures["irregular_outline"] > 0.0,
     )
 
 
-def resized(row: Mapping[str, Any], prior: ShapePrior | None = None) -> SizePosterior:
-    """Size of stored draws by the default calibration, with another prior of shapes if given."""
-    profile = tuple(float(v) for v in row["profile"]) or None
-    draws = ShapeDraws.of(*(row[n] for n in _DRAWS), profile=profile, labels=row["replicates"])
-    path = size_calibration_path("solid")
-    assert path is not None
-    calibration = read_size_calibration(path)
-    assert isinstance(calibration, BodyCalibration)
-    priors = SizePriors() if prior is None else SizePriors(shape=prior)
-    return pooled_size([draws], calibration=calibration, priors=priors, rng=np.random.default_rng(1))
+def measured(path: Path) -> SizePosterior | None:
+    """Size of a map by `estimate` with its defaults; None without an estimate."""
+    from tactile_bayes.pipeline.one_map import estimate_file
+    from tactile_bayes.pipeline.settings import Settings
+
+    return estimate_file(path, Settings()).estimate.size if path.exists() else None
 
 
-def table(folders: Sequence[Path], prior: ShapePrior | None = None) -> str:
+def table(folders: Sequence[Path]) -> str:
     """Errors and coverage by class."""
     found: dict[str, list[Sized]] = defaultdict(list)
     asked: dict[str, int] = defaultdict(int)
     for name in CLASSES:
-        for path in (p for folder in folders for p in sorted(folder.glob(f"{name.replace(' ', '_')}-*.npz"))):
-            with np.load(path) as row:
-                asked[name] += 1
-                if "why" not in row:
-                    found[name].append(sized(row, resized(row, prior)))
+        for path in (p for folder in folders for p in sorted(folder.glob(f"{name.replace(' ', '_')}-*.json"))):
+            asked[name] += 1
+            size = measured(path.with_suffix(".nc"))
+            if size is not None:
+                found[name].append(sized(json.loads(path.read_text()), size))
     head = f"{'class':14}{'sized':>8}{'median':>8}{'mean |e|':>9}{'covers':>8}{'smallest':>9}{'covers':>8}"
-    lines = [head + f"{'3D |e|':>8}{'covers':>8}{'half':>6}{'oval':>6}"]
+    lines = [head + f"{'3D |e|':>8}{'covers':>8}{'half':>6}{'oval':>6}{'irregular':>11}"]
     for name, rows in found.items():
         n = len(rows)
 
@@ -241,27 +214,24 @@ def table(folders: Sequence[Path], prior: ShapePrior | None = None) -> str:
             f"{name:14}{f'{n}/{asked[name]}':>8}{np.median(across):>+8.1%}{np.abs(across).mean():>9.1%}"
             f"{share('covers'):>8}{np.mean([abs(r.smallest) for r in rows]):>9.1%}{share('covers_smallest'):>8}"
             f"{np.mean([abs(r.any_way) for r in rows]):>8.1%}{share('covers_any'):>8}"
-            f"{np.mean([r.half_width for r in rows]):>6.0%}{share('oval'):>6}"
+            f"{np.mean([r.half_width for r in rows]):>6.0%}{share('oval'):>6}{share('irregular'):>11}"
         )
     return "\n".join(lines)
 
 
 def main() -> None:
-    """Make fits, or print the table."""
+    """Make maps, or print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("make", "sizes"))
     parser.add_argument("folder", type=Path, nargs="+")
     parser.add_argument("--bodies", type=int, default=10)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), choices=list(CLASSES))
-    parser.add_argument("--oval-probability", type=float, default=ShapePrior().oval_probability)
-    parser.add_argument("--oval-sd", type=float, default=ShapePrior().oval_sd)
     arguments = parser.parse_args()
     if arguments.what == "make":
         make(arguments.folder[0], bodies=arguments.bodies, seed=arguments.seed, classes=arguments.classes)
     else:
-        prior = ShapePrior(arguments.oval_probability, arguments.oval_sd)
-        print(table(arguments.folder, prior))
+        print(table(arguments.folder))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
+from tactile_bayes.files.size_parts_json import (
+    array_of,
+    hidden_document,
+    number,
+    numbers,
+    parse_hidden,
+    parse_round_spread,
+    round_document,
+)
 from tactile_bayes.head_shape import DEFAULT_HEAD
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import Recipe
@@ -22,11 +30,7 @@ def bodies_document(calibration: BodyCalibration) -> dict[str, Any]:
         "centre": {"log_amplitude": calibration.centre[0], "log_width": calibration.centre[1]},
         "mean": numbers(calibration.mean),
         "covariance": numbers(calibration.covariance),
-        "round_lumps": {
-            "coefficients": numbers(balls.coefficients),
-            "body_sd": number(balls.body_sd),
-            "exam_sd": number(balls.exam_sd),
-        },
+        "round_lumps": round_document(balls.coefficients, balls.spread),
         "information_inverse": numbers(calibration.information_inverse),
         "most_leverage": number(calibration.most_leverage),
         "domain": ranges(calibration.domain),
@@ -48,7 +52,7 @@ def parse_bodies(document: dict[str, Any]) -> dict[str, Any]:
         "centre": (float(document["centre"]["log_amplitude"]), float(document["centre"]["log_width"])),
         "mean": array_of(document, "mean"),
         "covariance": array_of(document, "covariance"),
-        "round_lumps": RoundLumps(array_of(balls, "coefficients"), float(balls["body_sd"]), float(balls["exam_sd"])),
+        "round_lumps": RoundLumps(array_of(balls, "coefficients"), parse_round_spread(balls)),
         "information_inverse": array_of(document, "information_inverse"),
         "most_leverage": float(document["most_leverage"]),
         "domain": {name: (float(low), float(high)) for name, (low, high) in document["domain"].items()},

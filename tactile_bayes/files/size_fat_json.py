@@ -8,7 +8,16 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.size_parts_json import array_of, hidden_document, number, numbers, parse_hidden
+from tactile_bayes.files.size_parts_json import (
+    array_of,
+    hidden_document,
+    number,
+    numbers,
+    parse_hidden,
+    parse_round_spread,
+    round_document,
+)
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import BY_PLACE, HEAD_PROFILE
 from tactile_bayes.size.fat_depth import ROUND, FatDepth, FatTerms
 from tactile_bayes.size.fat_process import LINEAR_POWERS, SPREAD, FatProcess, Kernel, PlaceTable
@@ -70,11 +79,7 @@ def _shared_document(fat: FatTerms, powers: Sequence[Sequence[int]]) -> dict[str
         "round_powers": [list(one) for one in ROUND],
         "centre": {"log_amplitude": alpha, "log_width": p0, "log_fat": w0},
         "mean": numbers(fat.mean),
-        "round_lumps": {
-            "coefficients": numbers(fat.round_coefficients),
-            "body_sd": number(fat.round_sd[0]),
-            "exam_sd": number(fat.round_sd[1]),
-        },
+        "round_lumps": round_document(fat.round_coefficients, fat.round_spread),
         "information_inverse": numbers(fat.information_inverse),
         "most_leverage": number(fat.most_leverage),
         "fat_mm": [number(end) for end in fat.fat_mm],
@@ -134,11 +139,22 @@ def _shared_fields(document: dict[str, Any]) -> dict[str, Any]:
         ),
         "centre": (float(centre["log_amplitude"]), float(centre["log_width"]), float(centre["log_fat"])),
         "mean": array_of(document, "mean"),
-        "round_coefficients": array_of(balls, "coefficients"),
-        "round_sd": (float(balls["body_sd"]), float(balls["exam_sd"])),
+        "round_coefficients": _round_coefficients(document),
+        "round_spread": parse_round_spread(balls),
         "information_inverse": array_of(document, "information_inverse"),
         "most_leverage": float(document["most_leverage"]),
         "fat_mm": (float(low), float(high)),
         "hidden": parse_hidden(document["hidden"], terms=len(document["information_inverse"])),
         "fit": {name: float(value) for name, value in document["fit"].items()},
     }
+
+
+def _round_coefficients(document: dict[str, Any]) -> FloatArray:
+    """Coefficients of `ROUND`; files of earlier versions have fewer powers."""
+    found, powers = array_of(document["round_lumps"], "coefficients"), document["round_powers"]
+    if len(found) != len(powers):
+        raise BadDataError(f"round_lumps has {len(found)} coefficients of {len(powers)} terms", way_out="learn it anew")
+    whole = np.zeros(len(ROUND))
+    for value, power in zip(found, powers, strict=True):
+        whole[ROUND.index(tuple(power))] = value
+    return whole

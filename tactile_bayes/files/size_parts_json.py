@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import BY_PLACE
-from tactile_bayes.size.hidden import HiddenTerms
+from tactile_bayes.size.hidden import HiddenTerms, RoundSpread
 
 
 def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
@@ -48,6 +48,17 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
         inverted=tuple(document.get("inverted", ())),
         most_sd=float(document.get("most_sd", np.inf)),
     )
+
+
+def round_document(coefficients: FloatArray, spread: RoundSpread) -> dict[str, Any]:
+    """Maps of balls as plain data."""
+    spreads = {name: number(getattr(spread, name)) for name in ("body_sd", "exam_sd", "map_factor")}
+    return {"coefficients": numbers(coefficients), **spreads}
+
+
+def parse_round_spread(balls: dict[str, Any]) -> RoundSpread:
+    """Spread of balls' maps; files of earlier versions have no factor."""
+    return RoundSpread(float(balls["body_sd"]), float(balls["exam_sd"]), float(balls.get("map_factor", 1.0)))
 
 
 def array_of(document: dict[str, Any], name: str) -> FloatArray:

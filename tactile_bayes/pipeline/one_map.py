@@ -395,4 +395,6 @@ def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | N
         profile=head_profile(tactile_map.quality),
         by_place=estimate.by_place,
         labels=estimate.draws.replicates,
+        oblique=posterior.oblique,
+        irregular=posterior.irregular,
     )

@@ -19,6 +19,7 @@ from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration import Calibration, draw_sizes
 from tactile_bayes.size.pooling import SizePriors
 from tactile_bayes.size.posterior import EXTREMES, SizePosterior
@@ -98,6 +99,9 @@ def _drawn(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
     told = None if _beside_another(made) or uneven(tactile_map.quality) else posterior.by_place(tactile_map)
+    if isinstance(calibration, BodyCalibration) and calibration.unlike_places(told):
+        posterior = replace(posterior, irregular=True)
+        made = replace(made, posterior=posterior)
     calibration = fitting_calibration(posterior, calibration, told)
     far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
     size = None if fault or far else _size(posterior, made.draws, calibration, options.size_priors, rng=rng)
@@ -128,6 +132,8 @@ def _size(
         priors=priors,
         replicates=draws.replicates,
         rng=rng,
+        oblique=posterior.oblique,
+        irregular=posterior.irregular,
     )
 
 

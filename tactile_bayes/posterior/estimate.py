@@ -36,6 +36,12 @@ OTHER_HEAD = (
     "calibrate size population.csv --form gaussian-process -o size.json`, and give --size-calibration size.json"
 )
 """How to make a calibration for another head."""
+IRREGULAR = (
+    "irregular outline: the bump is more skewed, its axis ratio changes more outwards, or it depends more on the "
+    "place under the head than a ball's; two lumps that touch, an upright, tilted or rough one look so, and sizes "
+    "get a wider interval"
+)
+"""Said of a lump whose map is `MapPosterior.irregular`."""
 
 
 def estimate_map(
@@ -222,7 +228,7 @@ def _diagnostics(tactile_map: TactileMap, found: Drawn) -> Diagnostics:
         coarse_cells=tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(medians[1:]),
         outside_calibration=() if calibration is None else tuple(calibration.outside(*medians)),
         broken_assumptions=broken_assumptions(tactile_map.quality),
-        assumptions_to_check=assumptions_to_check(tactile_map.quality),
+        assumptions_to_check=(*assumptions_to_check(tactile_map.quality), *_form_to_check(made.posterior)),
         fat_mm=None if calibration is None else calibration.fat_mm,
         method=made.draws.method,
         sampler=made.draws.diagnostics,
@@ -231,6 +237,11 @@ def _diagnostics(tactile_map: TactileMap, found: Drawn) -> Diagnostics:
         by_place=found.by_place,
         by_place_used=calibration is not None and calibration.knows_places,
     )
+
+
+def _form_to_check(posterior: MapPosterior) -> tuple[str, ...]:
+    """What the report says of a lump that is neither ball nor ellipsoid; empty where it may be one."""
+    return (IRREGULAR,) if posterior.irregular else ()
 
 
 def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[str, float]]:

@@ -123,7 +123,8 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
         by = f"sizes by {document['site']}; " if document["site"] else ""
         site = f"; {document['repeatability']}" if "repeatability" in document else ""
-        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %{site}.")
+        form = "; irregular outline, with a wider interval" if document["figures"].get("irregular_outline") else ""
+        lines.append(f"Quality: {by}{ends}the maps of this mass differ by {100 * spread:.0f} %{site}{form}.")
         if len(lines) < MOST_LINES - 2:
             places = decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS)
             lines += supposed_line(document["supposing"], largest["median"], places=places)

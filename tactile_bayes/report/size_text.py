@@ -67,8 +67,11 @@ def ends_text(name: str, mc_error: float, sd: float) -> str:
 
 def shape_text(figures: Mapping[str, float]) -> str:
     """Whether the lump is sized as round or oval, and the difference that makes to the largest size."""
+    lead = "Irregular outline. " if figures.get("irregular_outline") else ""
     probability = figures["oval_probability"]
     longer = 100 * math.expm1(figures["oval_half_log_ratio"])
     if probability < 0.5:
-        return f"Sized as round; an oval lump (probability {probability:.2f}) would be {longer:.0f} % longer."
-    return f"Oval (probability {probability:.2f}): {longer:.0f} % longer than a round lump of the same mean size."
+        text = f"Sized as round; an oval lump (probability {probability:.2f}) would be {longer:.0f} % longer."
+    else:
+        text = f"Oval (probability {probability:.2f}): {longer:.0f} % longer than a round lump of the same mean size."
+    return lead + text

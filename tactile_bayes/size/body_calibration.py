@@ -8,8 +8,8 @@ g is the form: a polynomial (`log_quadratic`), Eq 6 (`population_eq6`) or a Gaus
 from body to body by what a map does not show (seat, stiffness, moduli): :math:`N(0, s^2)`, with ln s a polynomial in u
 and v. E differs from exam to exam of one body.
 
-A ball under the oblong head gives an oval map; its half log axis ratio is
-:math:`q_0 = \gamma_0 + \gamma_1 u + \gamma_2 v`, and only what exceeds it says that a lump is not round.
+A ball under the oblong head gives an oval map; its half log axis ratio :math:`q_0` is a quadratic in u and v, and only
+what exceeds it says that a lump is not round.
 
 Where the depth F of the fat under the head is known, the coefficients are those at that depth, `fat_depth.FatTerms`.
 """
@@ -140,6 +140,10 @@ class BodyCalibration:
         """The calibration for a mass whose maps have these `presets.BY_PLACE`: this one, if it has no use for them."""
         return self
 
+    def unlike_places(self, by_place: tuple[float, ...] | None) -> bool:  # noqa: ARG002
+        """Whether the figures by place are far from those of balls; asked before `at_places`."""
+        return False
+
     def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> BodyCalibration:
         """This calibration, or the one for any depth where no body of the table looks like the map at this depth.
 
@@ -194,8 +198,8 @@ class BodyCalibration:
 
     def round_excess(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(...,) q0, the half log axis ratio of a ball's map."""
-        c = self.round_lumps.coefficients
-        return np.asarray(c[0] + c[1] * (log_amplitude - self.centre[0]) + c[2] * (log_width - self.centre[1]))
+        u, v = np.asarray(log_amplitude - self.centre[0]), np.asarray(log_width - self.centre[1])
+        return self.round_lumps.excess(u, v)
 
     def body_and_error(
         self, terms: FloatArray, log_amplitude: FloatArray, log_width: FloatArray, score: FloatArray

@@ -30,6 +30,8 @@ def draw_sizes(
     priors: SizePriors,
     replicates: Labels | None,
     rng: np.random.Generator,
+    oblique: tuple[float, float] | None = None,
+    irregular: bool = False,
 ) -> SizePosterior:
     """Draw sizes from the joint draws of one map.
 
@@ -42,10 +44,20 @@ def draw_sizes(
         of another exam, and nothing else.
     replicates : (chain * draw,) array
         As `ParameterDraws.replicates`.
+    oblique, irregular
+        As `MapPosterior`'s; Eq 6 does not use them.
     """
     match calibration:
         case BodyCalibration():
-            one = ShapeDraws.of(amplitude, sigma_x_mm, sigma_y_mm, angle_rad, labels=replicates)
+            one = ShapeDraws.of(
+                amplitude,
+                sigma_x_mm,
+                sigma_y_mm,
+                angle_rad,
+                labels=replicates,
+                oblique=oblique,
+                irregular=irregular,
+            )
             return pooled_size([one], calibration=calibration, priors=priors, rng=rng).reshaped(amplitude.shape)
         case SizeCalibration():
             return push_sizes(

@@ -19,7 +19,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
 from tactile_bayes.size.polynomials import monomials, powers
 
 if TYPE_CHECKING:
@@ -28,9 +28,10 @@ if TYPE_CHECKING:
 ORDER = 3
 POWERS = tuple((i, j, k) for k in range(ORDER + 1) for i, j in powers(ORDER - k))
 """Of u, v and w in the twenty terms of the cubic."""
-ROUND = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
-"""The same for what makes a ball's map oval."""
+ROUND = tuple((i, j, k) for k in range(3) for i, j in powers(2 - k))
+"""The same for what makes a ball's map oval: a full quadratic."""
 Powers = tuple[tuple[int, int], ...]
+_ROUND: Powers = tuple((powers(2).index((i, j)), k) for i, j, k in ROUND)
 MOST_LEVERAGE = 1.0
 """A profile is unlike the table's where its leverage exceeds this multiple of the table's largest."""
 
@@ -92,10 +93,10 @@ class FatTerms:
         alpha_0, p_0 and w_0.
     mean, covariance : (k + s + 1,), (k + s + 1, k + s + 1) arrays
         Posterior of the k coefficients, the s of ln SD(B) and ln SD(E).
-    round_coefficients : (6,) array
+    round_coefficients : (10,) array
         Of `ROUND` in q0, see `RoundLumps`.
-    round_sd
-        Its spreads between bodies and between exams.
+    round_spread
+        About it.
     information_inverse : (c, c) array
         Of the c features by which a map is like or unlike the table's.
     most_leverage
@@ -113,7 +114,7 @@ class FatTerms:
     mean: FloatArray
     covariance: FloatArray
     round_coefficients: FloatArray
-    round_sd: tuple[float, float]
+    round_spread: RoundSpread
     information_inverse: FloatArray
     most_leverage: float
     fat_mm: tuple[float, float]
@@ -248,8 +249,7 @@ class FatTerms:
 
     def round_lumps(self, log_depth: float) -> RoundLumps:
         """Map of a ball at one depth of fat."""
-        c, w = self.round_coefficients, log_depth - self.centre[2]
-        return RoundLumps(np.asarray(c[:3] + w * c[3:]), *self.round_sd)
+        return RoundLumps(self._contracted(_ROUND, log_depth) @ self.round_coefficients, self.round_spread)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
+from tactile_bayes.size.polynomials import monomials, powers
 
 LOGGED = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
 """Properties that vary and enter by their logarithm, but for those that enter by their inverse."""
@@ -19,21 +20,46 @@ Files of earlier versions have them by the logarithm; each file says what it has
 """
 
 
+@dataclass(frozen=True, slots=True)
+class RoundSpread:
+    """How far maps of balls are from the axis ratio that is usual for them.
+
+    Parameters
+    ----------
+    body_sd, exam_sd
+        Of the excess q - q0 between bodies, and between exams of one body.
+    map_factor
+        Variance of q about q0 over that of a map's posterior: a deep and faint lump's map is off by more than it says.
+    """
+
+    body_sd: float
+    exam_sd: float
+    map_factor: float = 1.0
+
+    def variance(self, of_maps: FloatArray, *, maps: int = 1) -> FloatArray:
+        """Variance of the mean excess over some maps of a mass, whose posteriors give its mean this variance."""
+        own = self.body_sd**2 + self.exam_sd**2 / maps
+        return np.asarray(own + self.map_factor * of_maps)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RoundLumps:
     """Axis ratio of a ball's map, and the scatter of single maps about it.
 
     Parameters
     ----------
-    coefficients : (3,) array
-        Of 1, u and v in q0.
-    body_sd, exam_sd
-        Of the excess q - q0 between bodies, and between exams of one body.
+    coefficients : (c,) array
+        Of the first c of 1, u, v, u2, uv and v2 in q0.
+    spread
+        About q0.
     """
 
     coefficients: FloatArray
-    body_sd: float
-    exam_sd: float
+    spread: RoundSpread
+
+    def excess(self, u: FloatArray, v: FloatArray) -> FloatArray:
+        """(...,) q0 of maps."""
+        return np.asarray(monomials((u, v), powers(2)[: len(self.coefficients)]) @ self.coefficients)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

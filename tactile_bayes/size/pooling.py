@@ -22,15 +22,17 @@ from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
-from tactile_bayes.size.elongation import Elongation, ShapePrior, elongation, turned
+from tactile_bayes.size.elongation import OVAL_SD, Elongation, ShapePrior, elongation, shown_share, turn_matrix
 from tactile_bayes.size.posterior import SizePosterior, shares
-from tactile_bayes.size.site_shift import site_log_shift, site_slope, site_variance
+from tactile_bayes.size.site_shift import site_log_shift, site_variance
 from tactile_bayes.size.supposed import known_body, suppositions
 
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
 """Of the points: ln d given tau and the spread of B, these two, oval or round, and the two components of an oval."""
 MOST_INVALID = 0.05
+IRREGULAR_SD = 0.15
+"""SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,10 @@ class ShapeDraws:
         Half log axis ratio along the map's x axis and 45 degrees from it.
     turn_rad
         From the axes that the maps of a mass share to this map's.
+    oblique
+        Mean and SD of r where the draws have none, as `MapPosterior`'s.
+    irregular
+        Whether the map is that of an irregular lump.
     profile, by_place
         `presets.HEAD_PROFILE` and `presets.BY_PLACE` of the map; None where it has none.
     labels
@@ -84,6 +90,8 @@ class ShapeDraws:
     profile: tuple[float, ...] | None = None
     by_place: tuple[float, ...] | None = None
     labels: Labels | None = None
+    oblique: tuple[float, float] | None = None
+    irregular: bool = False
 
     @property
     def replicates(self) -> Labels:
@@ -107,6 +115,8 @@ class ShapeDraws:
         profile: tuple[float, ...] | None = None,
         by_place: tuple[float, ...] | None = None,
         labels: Labels | None = None,
+        oblique: tuple[float, float] | None = None,
+        irregular: bool = False,
     ) -> ShapeDraws:
         """Prepare from draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -115,7 +125,7 @@ class ShapeDraws:
         angle = angle_rad.ravel()
         p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
         q, r = half * np.cos(2 * angle), half * np.sin(2 * angle)
-        return cls(log_a, p, q, r, turn_rad, profile, by_place, labels)
+        return cls(log_a, p, q, r, turn_rad, profile, by_place, labels, oblique, irregular)
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -156,7 +166,8 @@ def pooled_size(
     -------
     SizePosterior
         Draws of shape (n,). `figures` holds ``between_map_sd`` (root mean square), ``oval_probability``,
-        ``oval_half_log_ratio`` and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
+        ``oval_half_log_ratio``, ``irregular_outline`` (1 where at least half of the maps have one) and, for several
+        maps, ``weight_1``...; `outliers` the maps that lie apart.
 
     Notes
     -----
@@ -169,16 +180,18 @@ def pooled_size(
     by_map = np.stack([corrected_log_size(calibration, m) for m in used])
     log_size = by_map if used is maps else [corrected_log_size(calibration, m) for m in maps]
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
-    oval, slope = _elongation(maps, calibration, priors.shape)
+    oval, shown = _elongation(maps, list(log_size), calibration, priors.shape)
     points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
     terms = np.stack([calibration.terms(m.log_amplitude, m.log_width) for m in used])
     half = oval.at(points[:, 3:])
-    pool = _Pool(used, by_map, terms, centre, noise, points, half, replicates, calibration, priors.known)
     figures = {
         "oval_probability": oval.probability,
         "oval_half_log_ratio": oval.magnitude,
-        "width_slope": slope,
+        "shown_share": shown,
+        "irregular_outline": float(2 * sum(one.irregular for one in maps) >= len(maps)),
     }
+    form_sd = IRREGULAR_SD * figures["irregular_outline"]
+    pool = _Pool(used, by_map, terms, centre, noise, points, half, replicates, calibration, priors.known, form_sd)
     between = priors.between_maps or calibration.between_exams
     another = priors.another_exam
     size = pool.size(between, figures)
@@ -209,6 +222,8 @@ class _Pool:
     points : (n, `DIMENSIONS`) array
     half : (n, 2) array
         Half log axis ratio of the lump, in two components.
+    form_sd
+        SD of ln d because the lump's outline is irregular.
     """
 
     maps: Sequence[ShapeDraws]
@@ -221,6 +236,7 @@ class _Pool:
     replicates: Labels
     calibration: BodyCalibration
     known: Mapping[str, float]
+    form_sd: float
 
     def size(self, between: BetweenMaps, figures: Mapping[str, float]) -> SizePosterior:
         """Sizes under a prior of the spread between maps."""
@@ -231,7 +247,8 @@ class _Pool:
         known, variances = self._left_open(tau=tau, weight=weight, score=score)
         map_part = np.sum(weight * self.by_map, axis=0)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
-        mean, sd = map_part + known + longer, np.sqrt(sum(variances.values()))
+        mean = map_part + known + longer
+        sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
         log_largest, log_smallest = self._evened(mean, sd, z, longer)
         wide = self.half[:, 0] >= 0
         share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
@@ -239,7 +256,7 @@ class _Pool:
         return SizePosterior(
             np.exp(np.where(wide, log_largest, log_smallest)),
             np.exp(np.where(wide, log_smallest, log_largest)),
-            shares(share | {"shape": float(np.var(longer))}),
+            shares(share | {"shape": float(np.var(longer) + OVAL_SD**2 * np.mean(longer**2))}),
             int((~np.isfinite(mean)).sum()),
             self.replicates,
             {"between_map_sd": float(np.sqrt(np.mean(tau**2))), **figures, **weights},
@@ -269,7 +286,7 @@ class _Pool:
         return expected + shift, {
             "between_maps": np.sum(weight**2, axis=0) * tau**2,
             "calibration": error,
-            "body": left + other_sd**2,
+            "body": left + other_sd**2 + self.form_sd**2,
             **site_variance(self.calibration.site, middle_width),
         }
 
@@ -380,19 +397,32 @@ def pool_maps(
 
 
 def _elongation(
-    maps: Sequence[ShapeDraws], calibration: BodyCalibration, prior: ShapePrior
+    maps: Sequence[ShapeDraws], log_size: Sequence[FloatArray], calibration: BodyCalibration, prior: ShapePrior
 ) -> tuple[Elongation, float]:
-    """Posterior of the lump's shape in the axes the maps share, and the slope that leads from map to lump."""
-    excess, covariance, slope = np.zeros(2), np.zeros((2, 2)), 0.0
+    """Posterior of the lump's shape in the axes the maps share, and the share of it that they show."""
+    excess, covariance, shown = np.zeros(2), np.zeros((2, 2)), 0.0
     k = len(maps)
-    for m in maps:
-        beyond = m.q - calibration.round_excess(m.log_amplitude, m.log_width)
-        both = np.stack([beyond, m.r], axis=-1)
-        both = turned(both[np.isfinite(both).all(axis=1)], -m.turn_rad)
-        excess += both.mean(axis=0) / k
-        covariance += np.cov(both.T) / k**2
-        slope += float(np.nanmean(calibration.width_slope(m.log_amplitude, m.log_width))) / k
-    slope += site_slope(calibration.site)
-    balls = calibration.round_lumps
-    covariance += (balls.body_sd**2 + balls.exam_sd**2 / k + 1e-12) * np.eye(2)
-    return elongation(excess, covariance, slope=slope, prior=prior), slope
+    for one, size in zip(maps, log_size, strict=True):
+        mean, spread = _axis_ratio(one)
+        mean[0] -= float(np.nanmean(calibration.round_excess(one.log_amplitude, one.log_width)))
+        turn = turn_matrix(-one.turn_rad)
+        excess += mean @ turn / k
+        covariance += turn.T @ spread @ turn / k**2
+        shown += shown_share(size, one.log_width) / k
+    balls = calibration.round_lumps.spread
+    whole = balls.map_factor * covariance + (balls.variance(np.zeros(()), maps=k) + 1e-12) * np.eye(2)
+    return elongation(excess, whole, shown=shown, prior=prior), shown
+
+
+def _axis_ratio(one: ShapeDraws) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of q and r; where nobody measured r, it is within twice the SD of q about 0.
+
+    It was left out because the map does not speak for it.
+    """
+    both = np.stack([one.q, one.r], axis=-1)
+    both = both[np.isfinite(both).all(axis=1)]
+    mean, covariance = both.mean(axis=0), np.cov(both.T)
+    if not covariance[1, 1] > 0:
+        mean[1], sd = one.oblique or (0.0, 2.0 * float(np.sqrt(covariance[0, 0])))
+        covariance[1, 1] = sd**2
+    return mean, covariance

@@ -111,11 +111,6 @@ def site_variance(site: SiteShift | None, log_width: FloatArray) -> dict[str, Fl
     return {} if site is None else {"site": site.variance(log_width)}
 
 
-def site_slope(site: SiteShift | None) -> float:
-    """What a site adds to the derivative of ln d by p."""
-    return 0.0 if site is None else float(site.mean[1])
-
-
 def with_site(calibration: BodyCalibration, site: SiteShift) -> BodyCalibration:
     """The calibration with a correction; without the depth of fat or figures by place if the phantoms had none."""
     fat = calibration.with_fat

@@ -14,6 +14,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_quadratic_json import write_log_quadratic
 from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import POWERS, cubic_terms, head_profile
 from tactile_bayes.size.learn.fat_depth import learn_fat_cubic
@@ -148,7 +149,8 @@ def test_maps_of_a_mass_share_one_depth(learned) -> None:
         ShapeDraws(np.full(500, -1.0), 1.4 + 0.01 * rng.standard_normal(500), *np.full((2, 500), 0.02), profile=one)
         for one in profiles
     ]
-    pooled = pool_maps(draws, calibration=learned, priors=SizePriors(), rng=rng)
+    as_balls = SizePriors(shape=ShapePrior(oval_probability=1e-9))
+    pooled = pool_maps(draws, calibration=learned, priors=as_balls, rng=rng)
     assert pooled.calibration is not None
     assert pooled.calibration.fat_mm == pytest.approx(np.exp(2.6), rel=0.02)
     bare = pool_maps([replace(one, profile=None) for one in draws], calibration=learned, priors=SizePriors(), rng=rng)

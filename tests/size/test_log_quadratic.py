@@ -158,7 +158,7 @@ def test_where_bodies_differ_more_does_not_decide_what_a_property_tells():
 
 def test_a_balls_oval_map_is_learned_with_its_spread(learned):
     assert learned.round_excess(np.array(-0.8), np.array(1.4)) == pytest.approx(0.04, abs=0.005)
-    assert learned.round_lumps.body_sd == pytest.approx(0.02, rel=0.3)
+    assert learned.round_lumps.spread.variance(np.array(1e-4)) == pytest.approx(0.02**2 + 0.015**2, rel=0.2)
 
 
 @pytest.mark.parametrize(

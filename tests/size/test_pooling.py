@@ -9,11 +9,20 @@ import pytest
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
-from tactile_bayes.size.elongation import ShapePrior, elongation, turned
+from tactile_bayes.size.elongation import (
+    OVAL_SD,
+    SHOWN,
+    SHOWN_CV,
+    SHOWN_POWER,
+    ShapePrior,
+    elongation,
+    shown_share,
+    turn_matrix,
+)
 from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.pooling import IRREGULAR_SD, ShapeDraws, SizePriors, pool_maps, pooled_size
 
 BODY_SD = 0.08
 
@@ -25,7 +34,7 @@ def calibration(*, body_sd: float = BODY_SD, hidden: HiddenTerms | None = None) 
         centre=(-1.0, 1.5),
         mean=mean,
         covariance=np.eye(9) * 1e-6,
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), 0.02, 0.01),
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
         information_inverse=np.eye(6) * 1e-2,
         most_leverage=1.0,
         domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
@@ -162,12 +171,18 @@ def test_a_round_lump_stays_round_and_its_largest_size_is_not_biased():
     assert np.log(np.median(found.max_size_mm)) == pytest.approx(2.7, abs=0.01)
 
 
+SEEN = SHOWN * np.exp(SHOWN_POWER * (2.7 - 1.7))
+"""Share of the half log axis ratio that the maps of `shape(2.7)` show: d of 14.9 mm, widths of 5.5 mm."""
+
+
 def test_an_oval_lump_is_found_along_either_axis_and_between_them():
-    for q, r in ((0.05 + 0.2, 0.0), (0.05 - 0.2, 0.0), (0.05, 0.2)):
+    lump = 0.3 * SEEN
+    for q, r in ((0.05 + lump, 0.0), (0.05 - lump, 0.0), (0.05, lump)):
         found = pooled([shape(2.7, q=q, r=r)], priors=KNOWN_0)
         assert found.figures["oval_probability"] > 0.95
+        assert found.figures["shown_share"] == pytest.approx(SEEN, rel=0.01)
         ratio = np.median(found.max_size_mm / found.min_size_mm)
-        assert np.log(ratio) == pytest.approx(0.4, rel=0.12)
+        assert np.log(ratio) == pytest.approx(0.6, rel=0.2)
     assert np.median(pooled([shape(2.7, q=0.25)]).d_x_mm) > np.median(pooled([shape(2.7, q=0.25)]).d_y_mm)
     assert np.median(pooled([shape(2.7, q=-0.15)]).d_x_mm) < np.median(pooled([shape(2.7, q=-0.15)]).d_y_mm)
 
@@ -175,19 +190,73 @@ def test_an_oval_lump_is_found_along_either_axis_and_between_them():
 def test_an_oval_seen_by_a_turned_head_is_one_oval():
     """Head turned by 60 degrees between two maps: pooled in the patient's axes they agree, in their own they cancel."""
     turn = np.radians(60.0)
-    lump = np.array([0.2, 0.0])
-    seen = turned(lump, turn)  # in the axes of a head turned by that much
-    maps = [shape(2.7, q=0.05 + 0.2, r=0.0), shape(2.7, q=0.05 + seen[0], r=seen[1], turn=turn, seed=1)]
-    assert pooled(maps, priors=KNOWN_0).figures["oval_half_log_ratio"] == pytest.approx(0.2, rel=0.1)
+    lump = np.array([0.2 * SEEN, 0.0])
+    seen = lump @ turn_matrix(turn)  # in the axes of a head turned by that much
+    maps = [shape(2.7, q=0.05 + lump[0], r=0.0), shape(2.7, q=0.05 + seen[0], r=seen[1], turn=turn, seed=1)]
+    assert pooled(maps, priors=KNOWN_0).figures["oval_half_log_ratio"] == pytest.approx(0.2, rel=0.15)
     blind = [maps[0], shape(2.7, q=0.05 + seen[0], r=seen[1], seed=1)]
     assert pooled(blind, priors=KNOWN_0).figures["oval_half_log_ratio"] < 0.14
+
+
+def without_r(map_draws, oblique):
+    """The same map with an angle that the fit left out."""
+    return replace(map_draws, r=np.zeros_like(map_draws.r), oblique=oblique)
+
+
+def test_an_angle_that_the_fit_left_out_is_not_measured_as_round():
+    """A lump at 45 degrees: as measured beside the fit, unknown, and as the fit without it would have it (control)."""
+    lump = 0.2 * SEEN
+    straight = shape(2.7, q=0.05)
+    beside = pooled([without_r(straight, (lump, 0.01))], priors=KNOWN_0)
+    assert beside.figures["oval_half_log_ratio"] == pytest.approx(0.2, rel=0.2)
+    assert beside.figures["oval_probability"] > 0.6
+    control = pooled([without_r(straight, (0.0, 1e-6))], priors=KNOWN_0)
+    unknown = pooled([without_r(straight, None)], priors=KNOWN_0)
+    assert control.figures["oval_probability"] < unknown.figures["oval_probability"] < 0.5
+
+
+def test_a_1_5_to_1_spheroid_is_covered_and_by_the_slope_of_ln_d_it_was_not():
+    """Figures of a simulated lump, 15.2 by 10.1 mm, sigma 4.6 mm (record 0107): beyond a ball's 0.072, SD 0.011."""
+    truth, excess, noise = 0.5 * np.log(15.2 / 10.1), np.array([0.072, -0.011]), 0.011**2 * np.eye(2)
+    shown = SHOWN * (13.3 / 4.6) ** SHOWN_POWER
+    found = elongation(excess, noise, shown=shown, prior=ShapePrior())
+    assert found.probability > 0.95
+    assert abs(found.mean[0] - truth) < 1.96 * np.sqrt(found.covariance[0, 0])
+    slope = 1.5
+    before = elongation(excess, noise, shown=1 / slope, prior=ShapePrior(0.5, 0.15))
+    assert abs(before.mean[0] - truth) > 1.96 * np.sqrt(before.covariance[0, 0])
+
+
+def test_the_mean_size_of_an_oval_lump_is_less_certain_than_a_balls():
+    both = [pooled([shape(2.7, q=0.05 + h * SEEN)], priors=KNOWN_0) for h in (0.0, 0.35)]
+    ball, oval = (np.log(one.max_size_mm * one.min_size_mm).std() / 2 for one in both)
+    longer = both[1].figures["oval_half_log_ratio"]
+    assert oval == pytest.approx(np.hypot(ball, OVAL_SD * longer), rel=0.1)
+
+
+def test_the_share_that_a_map_shows_goes_with_d_over_its_width():
+    one = shown_share(np.array([2.7, np.nan]), np.array([1.7, 1.7]))
+    assert one == pytest.approx(SEEN)
+    assert shown_share(np.array([2.7]), np.array([1.7 + np.log(2)])) == pytest.approx(SEEN / 2**SHOWN_POWER)
+
+
+def test_an_irregular_outline_widens_both_sizes_and_is_told():
+    plain = shape(2.7)
+    odd = replace(plain, irregular=True)
+    narrow, wide = pooled([plain], priors=KNOWN_0), pooled([odd], priors=KNOWN_0)
+    assert (narrow.figures["irregular_outline"], wide.figures["irregular_outline"]) == (0.0, 1.0)
+    for name in ("max_size_mm", "min_size_mm"):
+        spread = [np.log(getattr(one, name)).std() for one in (narrow, wide)]
+        assert spread[1] == pytest.approx(np.hypot(spread[0], IRREGULAR_SD), rel=0.03)
+    one_of_three = pooled([odd, shape(2.7, seed=1), shape(2.7, seed=2)], priors=KNOWN_0)
+    assert one_of_three.figures["irregular_outline"] == 0.0
 
 
 def test_elongation_is_the_conjugate_posterior():
     """Against a sum over a grid of the same model."""
     prior = ShapePrior(0.4, 0.15)
     measured, noise = np.array([0.06, -0.03]), np.diag([0.03**2, 0.05**2])
-    found = elongation(measured, noise, slope=1.1, prior=prior)
+    found = elongation(measured, noise, shown=1 / 1.1, prior=prior)
     e = np.linspace(-0.9, 0.9, 901)
     x, y = np.meshgrid(e, e, indexing="ij")
     like = np.exp(-0.5 * (((1.1 * 0.06 - x) / (1.1 * 0.03)) ** 2 + ((-1.1 * 0.03 - y) / (1.1 * 0.05)) ** 2))
@@ -195,6 +264,11 @@ def test_elongation_is_the_conjugate_posterior():
     oval = 0.4 * np.sum(like * slab) * (e[1] - e[0]) ** 2
     round_ = 0.6 * like[450, 450]
     assert found.probability == pytest.approx(oval / (oval + round_), rel=1e-6)
+    # an oval's own posterior allows for the share that is known to `SHOWN_CV` only
+    seen = 1.1 * measured
+    wider = 1.1**2 * noise + SHOWN_CV**2 * np.outer(seen, seen)
+    off = np.stack([seen[0] - x, seen[1] - y], axis=-1)
+    like = np.exp(-0.5 * np.einsum("abi,ij,abj->ab", off, np.linalg.inv(wider), off))
     assert found.mean[0] == pytest.approx(np.sum(like * slab * x) / np.sum(like * slab), rel=1e-6)
 
 
@@ -203,18 +277,19 @@ def test_what_is_known_of_the_body_is_used_and_what_the_calibration_does_not_kno
         ("seat",), np.array([[0.6, 0, 0, 0, 0, 0]]), np.array([[0.12]]), np.array([-0.024]), BODY_SD**2
     )
     use = calibration(hidden=hidden)
-    centred = SizePriors(between_maps=BetweenMaps(0.0, 0.0), known={"seat": 0.0})
-    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=use).max_size_mm) for p in (centred, KNOWN_0))
+    as_ball = SizePriors(between_maps=BetweenMaps(0.0, 0.0), shape=ShapePrior(oval_probability=1e-9))
+    centred = replace(as_ball, known={"seat": 0.0})
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=use).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.004)
     left = 1 - 0.024**2 / 0.12 / BODY_SD**2
     assert known.std() == pytest.approx(np.hypot(BODY_SD * np.sqrt(left), 0.01), rel=0.04)
     # where bodies differ twice as much, what is known of one tells twice as much of its size
     wide = replace(use, mean=use.mean + np.log(2.0) * (np.arange(len(use.mean)) == use.coefficients))
-    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=wide).max_size_mm) for p in (centred, KNOWN_0))
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=wide).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(2 * 0.6 * 0.2, abs=0.008)
     # and nothing of bodies of another kind
     other = replace(use, other_sd=0.1)
-    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=other).max_size_mm) for p in (centred, KNOWN_0))
+    known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=other).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.006)
     assert known.std() == pytest.approx(np.sqrt(BODY_SD**2 * left + 0.01**2 + 0.1**2), rel=0.04)
     with pytest.raises(UsageError, match="no property weather"):

@@ -18,12 +18,13 @@ from tactile_bayes.posterior.correlated.draw import draw_scene
 from tactile_bayes.posterior.correlated.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector
 from tactile_bayes.posterior.correlated.neighbour import WANTED, add_beside, rising_ribs
 from tactile_bayes.posterior.correlated.noise import cosines_for
+from tactile_bayes.posterior.correlated.outline import irregular
 from tactile_bayes.posterior.correlated.peakedness import ask_departure
 from tactile_bayes.posterior.correlated.pose_error import pose_covariance
 from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.ridge import ridge_instead, ridge_text
 from tactile_bayes.posterior.correlated.scene import Scene
-from tactile_bayes.posterior.correlated.selection import ASKING, SceneChoice, choose_shape
+from tactile_bayes.posterior.correlated.selection import ASKING, SceneChoice, choose_shape, near
 from tactile_bayes.posterior.correlated.surroundings import Surroundings
 from tactile_bayes.posterior.lump.cells import trusted
 from tactile_bayes.posterior.lump.diagnostics import NoiseFigures
@@ -176,7 +177,27 @@ def _posterior(
         angle_rad=angle,
         background=level.reshape(shape),
         noise_sd=noise_sd.reshape(shape),
+        oblique=_oblique(fit, places),
+        irregular=irregular(fit),
     )
+
+
+def _oblique(fit: FieldFit, places: FloatArray) -> tuple[float, float] | None:
+    """Mean and SD of the half log axis ratio 45 degrees from the map's x axis, where the scene has none.
+
+    By one Newton step from the mode, to that of the scene with it; None where that does not lead to one. Errors of the
+    frames' places are taken to spread it as they spread the ratio along the axes.
+    """
+    if fit.scene.shape != "ellipse":
+        return None
+    scene = replace(fit.scene, shape="rotated")
+    mixture = near(fit, scene)
+    if mixture is None:
+        return None
+    mean, covariance = mixture.moments()
+    r = scene.names.index("r")
+    along = np.array([0.5 * ((name == "u") - (name == "v")) for name in fit.scene.names])
+    return float(mean[r]), float(np.sqrt(covariance[r, r] + along @ places @ along))
 
 
 def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np.random.Generator) -> FloatArray:

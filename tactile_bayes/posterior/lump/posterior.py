@@ -12,7 +12,16 @@ from tactile_bayes.records import dataclass
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPosterior:
-    """Joint draws of the quantities in Eq 7, each (chain, draw)."""
+    """Joint draws of the quantities in Eq 7, each (chain, draw).
+
+    Parameters
+    ----------
+    oblique
+        Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
+        measured beside them; None otherwise.
+    irregular
+        Whether the bump is less regular than a ball's, see `correlated.outline` and `BodyCalibration.unlike_places`.
+    """
 
     amplitude: FloatArray
     sigma_x_mm: FloatArray
@@ -22,6 +31,8 @@ class MapPosterior:
     angle_rad: FloatArray
     background: FloatArray
     noise_sd: FloatArray
+    oblique: tuple[float, float] | None = None
+    irregular: bool = False
 
     @property
     def medians(self) -> tuple[float, float, float]:

@@ -25,7 +25,8 @@ from tactile_bayes.size.learn.regression import (
     figures,
     leverages,
 )
-from tactile_bayes.size.polynomials import monomials
+from tactile_bayes.size.learn.round_lumps import learn_round
+from tactile_bayes.size.polynomials import monomials, powers
 from tactile_bayes.size.population_eq6 import (
     FAT_COEFFICIENTS,
     FAT_FEATURES,
@@ -107,7 +108,7 @@ def learn_population_eq6(table: PopulationTable, *, recipe: Recipe, source: str 
         centre=centre,
         mean=mean,
         covariance=covariance,
-        round_lumps=RoundLumps(*data.oval(table, features[:, :3])),
+        round_lumps=RoundLumps(*learn_round(table, monomials((u, v), powers(2)))),
         information_inverse=inverse,
         most_leverage=float(leverage.max()),
         domain=domain_of(table),
@@ -134,7 +135,7 @@ def learn_fat_eq6(table: PopulationTable) -> FatEq6 | None:
     data, mean, covariance = _posterior(found.maps, Eq6Rows(*found.values, FAT_COEFFICIENTS))
     features = monomials(found.values, FAT_FEATURES)
     return FatEq6(
-        **found.fields(data, features),
+        **found.fields(features),
         mean=mean,
         covariance=covariance,
         hidden=hidden_terms(found.maps, data, **data.bodies_left_out(mean), features=features),

@@ -11,6 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.fat_depth import ROUND, FatCubic, FatDepth, cubic_terms, profile_terms
 from tactile_bayes.size.learn.hidden import hidden_terms
 from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable, figures, leverages
+from tactile_bayes.size.learn.round_lumps import learn_round
 from tactile_bayes.size.polynomials import monomials
 
 LEAST_BODIES = 80
@@ -57,7 +58,7 @@ class FatTable:
         (alpha, p0, w0), maps = self.centre, self.maps
         return maps.log_amplitude - alpha, maps.log_width - p0, self.log_depth - w0
 
-    def fields(self, data: BodyRegression, features: FloatArray, *, inside: float = 1.0) -> dict[str, Any]:
+    def fields(self, features: FloatArray, *, inside: float = 1.0) -> dict[str, Any]:
         """Fields of `FatTerms` that do not depend on the form.
 
         Parameters
@@ -67,13 +68,13 @@ class FatTable:
         inside
             Share of the table's maps that count as inside it.
         """
-        coefficients, between, within = data.oval(self.maps, monomials(self.values, ROUND))
+        coefficients, spread = learn_round(self.maps, monomials(self.values, ROUND))
         inverse, leverage = leverages(features)
         return {
             "depth": self.depth,
             "centre": self.centre,
             "round_coefficients": coefficients,
-            "round_sd": (between, within),
+            "round_spread": spread,
             "information_inverse": inverse,
             "most_leverage": float(np.quantile(leverage, inside)),
             "fat_mm": (float(np.exp(self.log_depth.min())), float(np.exp(self.log_depth.max()))),
@@ -99,7 +100,7 @@ def learn_fat_cubic(table: PopulationTable) -> FatCubic | None:
     data = BodyRegression.of(found.maps, terms_of)
     mean, covariance = data.posterior()
     return FatCubic(
-        **found.fields(data, data.terms),
+        **found.fields(data.terms),
         mean=mean,
         covariance=covariance,
         hidden=hidden_terms(found.maps, data, **data.bodies_left_out(mean), features=data.terms),

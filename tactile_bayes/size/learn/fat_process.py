@@ -73,7 +73,7 @@ def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> Fat
     body, body_sd = -fitted.left_out(rows.data.mean_log_d)[0], np.exp(rows.spread @ fitted.log_spread)
     by_place = None if places is None else rows.x[:, -len(BY_PLACE) :]
     return FatProcess(
-        **found.fields(rows.data, features, inside=INSIDE),
+        **found.fields(features, inside=INSIDE),
         mean=mean,
         covariance=_covariance(rows, fitted, exam),
         hidden=hidden_terms(found.maps, rows.data, body=body, body_sd=body_sd, features=features, by_place=by_place),

@@ -18,6 +18,7 @@ from tactile_bayes.size.learn.regression import (
     figures,
     leverages,
 )
+from tactile_bayes.size.learn.round_lumps import learn_round
 from tactile_bayes.size.log_quadratic import LogQuadratic, quadratic_terms
 
 
@@ -57,7 +58,7 @@ def learn_log_quadratic(
         centre=centre,
         mean=mean,
         covariance=covariance,
-        round_lumps=RoundLumps(*data.oval(table, data.terms[:, :3])),
+        round_lumps=RoundLumps(*learn_round(table, data.terms)),
         information_inverse=inverse,
         most_leverage=float(leverage.max()),
         domain=domain_of(table),

@@ -206,20 +206,6 @@ class BodyRegression:
         covariance[-1, -1] = its_variance
         return np.append(mode, log_exam_sd), covariance
 
-    def oval(self, table: PopulationTable, design: FloatArray) -> tuple[FloatArray, float, float]:
-        """Axis ratio of a ball's map: coefficients of q0 in the (n, c) design, spread between bodies and exams.
-
-        By least squares over the balls, the two spreads by analysis of variance.
-        """
-        coefficients = np.asarray(np.linalg.lstsq(design, table.half_log_ratio, rcond=None)[0])
-        excess = table.half_log_ratio - design @ coefficients
-        mean = self.mean(excess)
-        freedom = len(excess) - self.groups
-        map_variance = float(np.median(table.covariance[:, 2, 2]))
-        within = float(np.sum((excess - mean[self.group]) ** 2) / freedom) if freedom > 0 else map_variance
-        between = float(np.var(mean) - within * np.mean(1.0 / self.exams))
-        return coefficients, float(np.sqrt(max(between, 0.0))), float(np.sqrt(max(within - map_variance, 0.0)))
-
 
 def leverages(features: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(c, c) inverse of X^T X for (n, c) features, and the (n,) leverages of the rows."""

@@ -19,7 +19,7 @@ from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
+from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
 from tactile_bayes.size.learn.site_shift import (
     LACK,
     PhantomMap,
@@ -41,7 +41,7 @@ def calibration(*, hidden: HiddenTerms | None = None) -> LogQuadratic:
         centre=CENTRE,
         mean=np.array([2.5, 0.3, 1.0, 0.0, 0.0, 0.0, np.log(BODY_SD), 0.0, np.log(EXAM_SD)]),
         covariance=np.eye(9) * 1e-6,
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), 0.02, 0.01),
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
         information_inverse=np.eye(6) * 1e-2,
         most_leverage=1.0,
         domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
