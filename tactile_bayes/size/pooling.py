@@ -401,3 +401,14 @@ def _elongation(
     balls = calibration.round_lumps
     covariance += (balls.body_sd**2 + balls.exam_sd**2 / k + 1e-12) * np.eye(2)
     return elongation(excess, covariance, slope=slope, prior=prior), slope
+
+
+def matched_draws(maps: Sequence[ShapeDraws], number: int, rng: np.random.Generator) -> tuple[list[ShapeDraws], Labels]:
+    """As many draws of each map, matched by replicate, with their labels."""
+    used, replicates = _matched(maps, number, rng)
+    return list(used), replicates
+
+
+def shape_of_lump(maps: Sequence[ShapeDraws], calibration: BodyCalibration, prior: ShapePrior) -> Elongation:
+    """Posterior of the half log axis ratio of a lump from all its maps."""
+    return _elongation(maps, calibration, prior)[0]
