@@ -1,7 +1,7 @@
 """Simulated visits of lumps that grow, shrink or stay: what `compare` says of them.
 
     python -m benchmarks.visits make DIR --bodies 50 [--seed N]   # exams, resumable: a file a body
-    python -m benchmarks.visits law DIR                           # the law of `size.change.SharedBody`
+    python -m benchmarks.visits law DIR                           # the law of `size.shared_body`
     python -m benchmarks.visits judge DIR                         # false alarms, power, coverage, widths, same mass
 
 A body has three visits of two exams each: two with a lump of the same size, one with a lump 10, 20 or 35 % larger or
@@ -142,10 +142,17 @@ def make(folder: Path, *, bodies: int, seed: int, workers: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("step", choices=["make"])
+    parser.add_argument("step", choices=["make", "law", "judge"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--bodies", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=20271115)
+    parser.add_argument(
+        "--seed", type=int, default=20271115, help="make: 20271115 was learned from, 20271116 judged on"
+    )
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
-    make(given.folder, bodies=given.bodies, seed=given.seed, workers=given.workers)
+    if given.step == "make":
+        make(given.folder, bodies=given.bodies, seed=given.seed, workers=given.workers)
+    else:
+        from benchmarks import visits_figures
+
+        getattr(visits_figures, given.step)(given.folder)

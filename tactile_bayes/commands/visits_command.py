@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
+
+from tactile_bayes.errors import UsageError
 
 WITH: Final = "--with"
 
@@ -18,29 +20,39 @@ class VisitsCommand(click.Command):
     ``--with 1 a --with 1 b``.
     """
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the command line."""
-        return super().parse_args(ctx, numbered(args))
+    def make_parser(self, ctx: click.Context) -> Any:
+        """Make the parser of the command line."""
+        parser = super().make_parser(ctx)
+        parse = parser.parse_args
+        parser.parse_args = lambda args: parse(numbered(args, strict=not ctx.resilient_parsing))  # type: ignore[method-assign]
+        return parser
 
 
-def numbered(args: Sequence[str]) -> list[str]:
+def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
     """The words with every file after ``--with`` as an option of its own, with the number of its group.
 
-    A ``--with`` that no file follows stays as it is, and click says what it lacks.
+    Parameters
+    ----------
+    strict
+        Refuse a ``--with`` that no file follows; a shell that completes words leaves it out.
+
+    Raises
+    ------
+    UsageError
+        When no file follows a ``--with``, and `strict`.
     """
     found: list[str] = []
-    group, inside, alone = 0, False, False
-    for word in args:
-        if word == WITH:
-            found += [WITH] if alone else []
-            group, inside, alone = group + 1, True, True
-        elif inside and not (word.startswith("-") and len(word) > 1):
+    group, files = 0, -1  # files of the group so far; -1 outside one
+    for word in [*args, ""]:
+        if files >= 0 and word and not word.startswith("-"):
             found += [WITH, str(group), word]
-            alone = False
-        else:
-            found += [WITH, word] if alone else [word]
-            inside = alone = False
-    return [*found, WITH] if alone else found
+            files += 1
+            continue
+        if files == 0 and strict:
+            raise UsageError(f"{WITH} names no map; give the maps of a later visit after it")
+        group, files = (group + 1, 0) if word == WITH else (group, -1)
+        found += [word] if word not in (WITH, "") else []
+    return found
 
 
 def groups_of(later: Sequence[tuple[int, Path]]) -> list[tuple[Path, ...]]:
