@@ -5,9 +5,10 @@
 - `read_scan`, `read_map`, `simulate`, `demo_scan`, `demo_map`: scans and maps
 - `build_map`: from scans to a map
 - `estimate`, `pool`: from a map, or from several maps of one mass, to a size
+- `compare`: from the maps of two visits to the change of a mass's size
 - `calibrate_size`, `validate`: from tables to a size calibration, or to a trial's report
 - `record`: from devices to a scan
-- `Map`, `SizeEstimate`, `PooledSize`, `TrialResult`, `Draws`: what they return; `errors`: what they raise
+- `Map`, `SizeEstimate`, `PooledSize`, `Comparison`, `TrialResult`, `Draws`: what they return; `errors`: what they raise
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 __all__ = [
+    "Comparison",
     "Draws",
     "Map",
     "PooledSize",
@@ -24,6 +26,7 @@ __all__ = [
     "TrialResult",
     "build_map",
     "calibrate_size",
+    "compare",
     "demo_map",
     "demo_scan",
     "errors",
@@ -37,6 +40,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "Comparison": "api.comparisons",
     "Draws": "api.draws",
     "Map": "api.maps",
     "PooledSize": "api.estimates",
@@ -44,6 +48,7 @@ _HOME = {
     "TrialResult": "api.trials",
     "build_map": "api.maps",
     "calibrate_size": "api.trials",
+    "compare": "api.comparisons",
     "demo_map": "api.maps",
     "demo_scan": "api.maps",
     "estimate": "api.estimates",
