@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from tactile_bayes.records import dataclass
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.report.compare_figure import DrawnMap
+    from tactile_bayes.size.between_maps import BetweenMaps
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.change import JointSizes
     from tactile_bayes.size.comparison import Compared
@@ -135,28 +136,25 @@ def _by_place(
     from tactile_bayes.size.same_mass import Place, apart
 
     places = [Place.mean_of([one for one in map(_place, maps) if one is not None]) for maps in visits]
-    found: list[Apart | None] = []
-    doubts, unknown = [], []
-    for number, place in enumerate(places[1:], start=2):
-        first = places[0]
-        if first is None or place is None:
-            found.append(None)
-            unknown.append(str(number if first is not None else 1))
-            continue
-        found.append(apart(first, place, registration_mm=comparing.registration_mm))
-        if found[-1].doubtful:  # type: ignore[union-attr]
-            doubts.append(f"the masses of visits 1 and {number} lie {found[-1].words}")  # type: ignore[union-attr]
-    if doubts and not comparing.same_mass:
+    found = tuple(
+        None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
+        for first, later in ((places[0], later) for later in places[1:])
+    )
+    doubts = [
+        f"the masses of visits 1 and {number} lie {one.words}"
+        for number, one in enumerate(found, start=2)
+        if one is not None and one.doubtful
+    ]
+    unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
+    if not comparing.same_mass and doubts:
         advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
-        return Compared("not_one_mass", "; ".join(doubts), advice, tuple(found)), (), []
-    if unknown and not comparing.same_mass:
-        which = " and ".join(dict.fromkeys(unknown))
-        reason = f"no landmarks show where the mass of visit {which} lies in the patient"
-        return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", tuple(found)), (), []
+        return Compared("not_one_mass", "; ".join(doubts), advice, found), (), []
+    if not comparing.same_mass and unknown:
+        reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
+        return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", found), (), []
     cautions = [f"CAUTION: {text}; taken as one mass because you say so" for text in doubts]
-    if unknown:
-        cautions.append("CAUTION: taken as one mass because you say so: no landmarks show it")
-    return None, tuple(found), cautions
+    cautions += ["CAUTION: taken as one mass because you say so: no landmarks show it"] if unknown else []
+    return None, found, cautions
 
 
 def _sized(
@@ -165,8 +163,9 @@ def _sized(
     settings: Settings,
     *,
     apart: tuple[Apart | None, ...],
-    cautions: list[str],
+    cautions: Sequence[str],
 ) -> Compared:
+    """Sizes of visits that are of one mass, or why there are none."""
     import numpy as np
 
     from tactile_bayes.size.change import joint_sizes, visit_calibrations
@@ -179,35 +178,52 @@ def _sized(
         for maps in visits
     ]
     fitted = visit_calibrations(shapes, calibration)
-    ranges = [
-        (number, at, one.middle)
-        for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), 1)
-        for one in maps
-    ]
-    far = [f"visit {number}: {text}" for number, at, middle in ranges for text in at.too_far(*middle)]
+    far = _by_visit(shapes, fitted, lambda at, middle: at.too_far(*middle))
     if far:
         return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
     priors = size_priors(settings)
     words = sorted(answer.fingerprint for maps in visits for answer in maps)
 
-    def joint(between: Any) -> JointSizes:
+    def joint(between: BetweenMaps | None) -> JointSizes:
         rng = np.random.default_rng([settings.seed, *words])
         return joint_sizes(shapes, calibration=calibration, priors=priors, rng=rng, between=between)
 
     sizes = joint(None)
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
         return Compared("no_estimate", "too many draws have no positive size", "", apart)
-    outside = [f"visit {number}: {text}" for number, at, middle in ranges for text in at.outside(*middle)]
-    cautions += [f"CAUTION: outside the calibration's range: {text}" for text in dict.fromkeys(outside)]
-    cautions += _broken(visits)
-    profiles = [one.profile for maps in shapes for one in maps]
-    depths = None if calibration.with_fat is None else calibration.with_fat.depths_apart(profiles)
-    if depths is not None:
-        cautions.append(
-            "CAUTION: the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(*depths)
-        )
+    outside = _by_visit(shapes, fitted, lambda at, middle: at.outside(*middle))
+    cautions = [
+        *cautions,
+        *(f"CAUTION: outside the calibration's range: {text}" for text in outside),
+        *_broken(visits),
+        *_fat_apart(shapes, calibration),
+    ]
     another = None if priors.another_exam is None else joint(priors.another_exam)
     return Compared("compared", "", "", apart, tuple(cautions), sizes, another)
+
+
+def _by_visit(
+    shapes: Sequence[Sequence[ShapeDraws]],
+    fitted: Sequence[BodyCalibration],
+    texts: Callable[[BodyCalibration, tuple[float, float]], list[str]],
+) -> list[str]:
+    """What is to be said of the middles of the maps, once for each visit."""
+    found = [
+        f"visit {number}: {text}"
+        for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1)
+        for one in maps
+        for text in texts(at, one.middle)
+    ]
+    return list(dict.fromkeys(found))
+
+
+def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[str]:
+    """Caution where the maps differ too much in the depth of fat to be of one breast."""
+    fat = calibration.with_fat
+    depths = None if fat is None else fat.depths_apart([one.profile for maps in shapes for one in maps])
+    if depths is None:
+        return []
+    return ["CAUTION: the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(*depths)]
 
 
 def _broken(visits: Sequence[Sequence[Answer]]) -> list[str]:
