@@ -75,6 +75,7 @@ MEASURED_ELSEWHERE = {
     "head": "benchmarks.forward's model: `head design` is 2 s of work",
     "campaign": "its steps are `map` and `estimate`, in processes that are warm",
     "compare-model": "it solves the scan's frames anew: seconds of work",
+    "compare": "it needs two visits; its maps' estimates, measured here as `estimate`, are the cost",
     "diagnose": "it needs a posterior that `estimate` wrote; the chains are the cost",
     "tradeoff": "it measures itself: a minute of work",
     "population": "hours of work; see benchmarks.own_trial for a scan's",
