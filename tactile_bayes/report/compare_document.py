@@ -141,7 +141,7 @@ def verdict(probability_grown: float) -> str:
     """``"grown"`` or ``"shrunk"`` where the odds carry it, else ``"no_change_shown"``."""
     if probability_grown > SHOWN:
         return "grown"
-    return "shrunk" if probability_grown < 1.0 - SHOWN else "no_change_shown"
+    return "shrunk" if 1.0 - probability_grown > SHOWN else "no_change_shown"
 
 
 def _another(another: JointSizes, later: int, probability: float) -> dict[str, Any]:

@@ -129,8 +129,9 @@ def _another_line(change: Mapping[str, Any]) -> list[str]:
     if another is None:
         return []
     q, spread = another["percent"], 100 * another["between_map_sd"]
-    ends = f"{q['low']:+.0f} to {q['high']:+.0f} %"
-    return [f"If exams of one mass differ by {spread:.0f} %: {ends}, grown with {_odds(another['probability_grown'])}."]
+    odds = f"{q['low']:+.0f} to {q['high']:+.0f} %, probability of growth {_odds(another['probability_grown'])}"
+    lost = change["verdict"] != "no_change_shown" and another["verdict"] == "no_change_shown"
+    return [f"If exams of one mass differ by {spread:.0f} %: {odds}{': no change shown then' if lost else ''}."]
 
 
 def _model_line(document: Mapping[str, Any]) -> str:
