@@ -24,6 +24,8 @@ from tactile_bayes.size.shared_body import SHARED_BODY, STRANGERS, SharedBody
 WHOLE = SharedBody(0.0, 1e6)
 """Everything shared: the body is the same whatever the growth."""
 PRIORS = SizePriors(another_exam=None)
+DRAWS = 2048
+"""Means and variances are those of normals given the draws, so few draws will do."""
 PLACES, PLACES_SEED = 4000, 20271117
 
 
@@ -79,7 +81,8 @@ def _calibration() -> BodyCalibration:
 
 
 def _joint(maps: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration, law: SharedBody) -> JointSizes:
-    return joint_sizes(maps, calibration=calibration, priors=PRIORS, rng=np.random.default_rng(1), law=law)
+    rng = np.random.default_rng(1)
+    return joint_sizes(maps, calibration=calibration, priors=PRIORS, rng=rng, law=law, number=DRAWS)
 
 
 def law(folder: Path) -> None:
@@ -150,24 +153,23 @@ def judge(folder: Path) -> None:
 def _judged(body: Body, calibration: BodyCalibration, one: SharedBody) -> Iterator[Judged]:
     """Comparisons of a body's pairs of visits, with one map a visit and with two."""
     for count in (1, 2):
+        alone = [_log_variance(maps[:count], calibration) if one is SHARED_BODY else np.nan for maps in body.maps]
         for i, j in combinations(range(len(body.maps)), 2):
             pair = [body.maps[i][:count], body.maps[j][:count]]
             if min(map(len, pair)) < count:
                 continue
             change = _joint(pair, calibration, one).change(0, 1)
             q, true = change.log_summary(0.95), float(body.log_d[j] - body.log_d[i])
-            apart_sd = np.nan if one is not SHARED_BODY else _separate_sd(pair, calibration)
-            grown = change.probability_above(0.0)
-            yield Judged(count, true, q.median - true, change.log_sd, q.low <= true <= q.high, grown, apart_sd)
+            grown, separate = change.probability_above(0.0), float(np.sqrt(alone[i] + alone[j]))
+            yield Judged(count, true, q.median - true, change.log_sd, q.low <= true <= q.high, grown, separate)
 
 
-def _separate_sd(pair: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> float:
-    """SD of the change of ln d by two separate estimates; NaN where one has no size."""
-    variance = 0.0
-    for maps in pair:
-        pooled = pool_maps(maps, calibration=calibration, priors=PRIORS, rng=np.random.default_rng(1))
-        variance += np.nan if pooled.size is None else float(np.nanvar(np.log(pooled.size.max_size_mm)))
-    return float(np.sqrt(variance))
+def _log_variance(maps: Sequence[ShapeDraws], calibration: BodyCalibration) -> float:
+    """Variance of ln of the largest size by a visit's maps alone; NaN where they give no size."""
+    if not maps:
+        return np.nan
+    pooled = pool_maps(maps, calibration=calibration, priors=PRIORS, rng=np.random.default_rng(1))
+    return np.nan if pooled.size is None else float(np.nanvar(np.log(pooled.size.max_size_mm)))
 
 
 def _print_pairs(rows: Sequence[Judged], *, in_full: bool) -> None:
