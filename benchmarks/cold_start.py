@@ -76,6 +76,7 @@ MEASURED_ELSEWHERE = {
     "campaign": "its steps are `map` and `estimate`, in processes that are warm",
     "compare-model": "it solves the scan's frames anew: seconds of work",
     "export": "the packages of its extras are the cost",
+    "compare": "it needs two visits; its maps' estimates, measured here as `estimate`, are the cost",
     "diagnose": "it needs a posterior that `estimate` wrote; the chains are the cost",
     "tradeoff": "it measures itself: a minute of work",
     "population": "hours of work; see benchmarks.own_trial for a scan's",

@@ -5,10 +5,11 @@
 - `read_scan`, `read_map`, `simulate`, `demo_scan`, `demo_map`: scans and maps
 - `build_map`: from scans to a map
 - `estimate`, `pool`: from a map, or from several maps of one mass, to a size
+- `compare`: from the maps of two visits to the change of a mass's size
 - `calibrate_size`, `validate`: from tables to a size calibration, or to a trial's report
 - `calibrate_repeatability`: from a campaign's folder to the spread between exams of one mass at its site
 - `record`: from devices to a scan
-- `Map`, `SizeEstimate`, `PooledSize`, `TrialResult`, `Draws`: what they return; `errors`: what they raise
+- `Map`, `SizeEstimate`, `PooledSize`, `Comparison`, `TrialResult`, `Draws`: what they return; `errors`: what they raise
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 __all__ = [
+    "Comparison",
     "Draws",
     "Map",
     "PooledSize",
@@ -26,6 +28,7 @@ __all__ = [
     "build_map",
     "calibrate_repeatability",
     "calibrate_size",
+    "compare",
     "demo_map",
     "demo_scan",
     "errors",
@@ -39,6 +42,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "Comparison": "api.comparisons",
     "Draws": "api.draws",
     "Map": "api.maps",
     "PooledSize": "api.estimates",
@@ -47,6 +51,7 @@ _HOME = {
     "build_map": "api.maps",
     "calibrate_repeatability": "api.trials",
     "calibrate_size": "api.trials",
+    "compare": "api.comparisons",
     "demo_map": "api.maps",
     "demo_scan": "api.maps",
     "estimate": "api.estimates",

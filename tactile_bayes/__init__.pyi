@@ -1,4 +1,6 @@
 from tactile_bayes import errors as errors
+from tactile_bayes.api.comparisons import Comparison as Comparison
+from tactile_bayes.api.comparisons import compare as compare
 from tactile_bayes.api.draws import Draws as Draws
 from tactile_bayes.api.estimates import PooledSize as PooledSize
 from tactile_bayes.api.estimates import SizeEstimate as SizeEstimate

@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "map": ("map", "Build a tactile map from one or more scans (paper steps i-iii)."),
     "calibrate": ("calibrate", "Learn a calibration: `calibrate size`, `calibrate array`."),
     "estimate": ("estimate", "Lump size with a credible interval from tactile maps."),
+    "compare": ("compare", "Compare a mass's size at two visits and more: has it grown?"),
     "report": ("report", "Write one page of an exam to read and to print."),
     "diagnose": ("diagnose", "Check a posterior's draws: R-hat, effective draws, trace, rank and corner figures."),
     "validate": ("validate", "Compare sizes with excision: accuracy of each modality."),

@@ -144,3 +144,20 @@ def _plain(settings: Settings) -> dict[str, Any]:
     plain |= repeatability_setting(settings)
     checkpoint = None if settings.checkpoint is None else settings.checkpoint.name
     return plain | {"calibration": settings.calibration_name, "known": dict(settings.known), "checkpoint": checkpoint}
+
+
+def common_calibration(
+    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str]
+) -> tuple[Path | None, BodyCalibration]:
+    """The calibration that sizes all these maps together, and its file if it is in one.
+
+    Raises
+    ------
+    BadDataError
+        When the maps were normalised in several ways, or one was made with another head than the calibration's.
+    UsageError
+        When the calibration cannot pool maps.
+    """
+    path, calibration = _calibration(answers, settings)
+    _check_heads(answers, calibration, names)
+    return path, calibration

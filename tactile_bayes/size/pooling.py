@@ -426,3 +426,15 @@ def _axis_ratio(one: ShapeDraws) -> tuple[FloatArray, FloatArray]:
         mean[1], sd = one.oblique or (0.0, 2.0 * float(np.sqrt(covariance[0, 0])))
         covariance[1, 1] = sd**2
     return mean, covariance
+
+
+def matched_draws(maps: Sequence[ShapeDraws], number: int, rng: np.random.Generator) -> tuple[list[ShapeDraws], Labels]:
+    """As many draws of each map, matched by replicate, with their labels."""
+    used, replicates = _matched(maps, number, rng)
+    return list(used), replicates
+
+
+def shape_of_lump(maps: Sequence[ShapeDraws], calibration: BodyCalibration, prior: ShapePrior) -> Elongation:
+    """Posterior of the half log axis ratio of a lump from all its maps."""
+    log_size = [corrected_log_size(calibration, one) for one in maps]
+    return _elongation(maps, log_size, calibration, prior)[0]

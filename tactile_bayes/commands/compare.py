@@ -1,0 +1,187 @@
+"""`compare`: change of a mass's size between visits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tactile_bayes.commands.figure_path import METAVAR, FigurePath
+from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
+from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.commands.visits_command import VisitsCommand, groups_of
+from tactile_bayes.errors import UsageError
+from tactile_bayes.pipeline.comparing import GROWN_BY, Comparing, days_of_dates
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.presets import METHODS, REGISTRATION_MM
+
+if TYPE_CHECKING:
+    from tactile_bayes.pipeline.compared import ComparedOutcome
+
+_FILE = FilePath()
+_DEFAULTS = Settings()
+_PERCENT = tuple(100 * share for share in GROWN_BY)
+
+
+@click.command("compare", cls=VisitsCommand)
+@click.argument("first", metavar="VISIT1.nc...", nargs=-1, required=True, type=_FILE)
+@click.option(
+    "--with",
+    "later",
+    type=(click.INT, _FILE),
+    multiple=True,
+    required=True,
+    metavar="VISIT2.nc...",
+    help="Maps of a later visit, up to the next option; again for a third visit.",
+)
+@click.option(
+    "--days",
+    type=FiniteRange(),
+    multiple=True,
+    metavar="DAYS",
+    help="Time of a later visit in days from the first, once for each: growth rates are told.",
+)
+@click.option("--dates", metavar="DATE,DATE...", help="The visits' dates, in place of --days: 2026-01-15,2026-04-20.")
+@click.option(
+    "--grown-by",
+    type=FiniteRange(min=-100.0, min_open=True),
+    multiple=True,
+    default=_PERCENT,
+    show_default=True,
+    metavar="PERCENT",
+    help="Growth of the diameter, in percent, that a probability of more is told for.",
+)
+@click.option(
+    "--same-mass",
+    is_flag=True,
+    help="Say that the visits are of one mass where landmarks are missing, or place it too far apart.",
+)
+@click.option(
+    "--registration-mm",
+    type=FiniteRange(min=0.0, min_open=True),
+    default=REGISTRATION_MM,
+    show_default=True,
+    help="SD each way of one mass's place between visits, by posture and landmarks.",
+)
+@click.option(
+    "--size-calibration", metavar="solid|eq6|solid-mean|SIZE.json", help="Calibration over bodies. Default: solid, or "
+    "solid-mean for maps of frames divided by their means."
+)  # fmt: skip
+@click.option(
+    "--method", type=click.Choice(METHODS), default=_DEFAULTS.method, show_default=True, help="As `estimate`."
+)
+@click.option(
+    "--settings", "settings_file", metavar="FILE.toml", type=_FILE,
+    help="As `estimate`; between_map_sd states the spread between exams of a visit."
+)  # fmt: skip
+@seed_option(_DEFAULTS.seed)
+@click.option(
+    "--interval",
+    type=FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True),
+    default=_DEFAULTS.interval,
+    show_default=True,
+    help="Probability of the intervals.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the maps, their difference and the change.")
+@FORCE
+@click.option("-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines.")
+@click.pass_context
+def command(
+    ctx: click.Context,
+    /,
+    first: tuple[Path, ...],
+    later: tuple[tuple[int, Path], ...],
+    days: tuple[float, ...],
+    dates: str | None,
+    grown_by: tuple[float, ...],
+    same_mass: bool,
+    registration_mm: float,
+    size_calibration: str | None,
+    method: str,
+    settings_file: Path | None,
+    seed: int,
+    interval: float,
+    as_json: bool,
+    figure: Path | None,
+    force: bool,
+    verbose: bool,
+) -> None:
+    """Compare the size of a mass at two visits and more.
+
+    Each visit is one map or several. First the visits must be shown to be of one mass: by what their scans say
+    (patient, side, mass) and by where it lies from the landmarks; if not, the reason is printed and the exit code is
+    6. Then the sizes are estimated together: what the body hides is the same at both visits and cancels in the change.
+    A mass has grown, or shrunk, where the probability is above 0.975; else the least growth that would have been seen
+    is told.
+
+    Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92
+    """
+    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.files.shipped import size_calibration_path
+    from tactile_bayes.report.compare_text import compare_summary, compare_text
+
+    comparing = Comparing(
+        days=_days(days, dates),
+        grown_by=tuple(percent / 100 for percent in grown_by),
+        same_mass=same_mass,
+        registration_mm=registration_mm,
+    )
+    settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed, interval=interval)
+    visits = [first, *groups_of(later)]
+    _check_maps(visits, settings)
+    comparing.check_visits(len(visits))
+    if figure is not None:
+        refuse_existing(figure, force=force)
+    also_read(None if size_calibration is None else size_calibration_path(size_calibration))
+    outcome = _compare(visits, settings, comparing, figure, force=force)
+    check_document(outcome.document, "compare.schema.json", path=Path("the report"))
+    text_of = dump_json if as_json else compare_text if verbose else compare_summary
+    click.echo(text_of(outcome.document), nl=False)
+    ctx.exit(outcome.exit_code)
+
+
+def _days(days: tuple[float, ...], dates: str | None) -> tuple[float, ...] | None:
+    if days and dates is not None:
+        raise UsageError("--days and --dates both say when the visits were; give one of them")
+    if dates is not None:
+        return days_of_dates(dates.split(","))
+    return (0.0, *days) if days else None
+
+
+def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
+    """Refuse a map that is given twice, and a checkpoint."""
+    every = [path for maps in visits for path in maps]
+    twice = [path for i, path in enumerate(every) if path in every[:i]]
+    if twice:
+        raise UsageError(f"{twice[0]} is given twice; give each map once, at its own visit")
+    if settings.checkpoint is not None:
+        raise UsageError("a checkpoint is of one map; leave checkpoint out of the settings")
+
+
+def _compare(
+    visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing, figure: Path | None, *, force: bool
+) -> ComparedOutcome:
+    """Estimate every map, compare, and draw the figure; an error with one map stops it."""
+    from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.pipeline.compared import compare_answers, drawn_maps
+    from tactile_bayes.pipeline.one_map import answer_of, estimate_file
+
+    total, outcomes = sum(len(maps) for maps in visits), []
+    with progress_bar("maps") as progress:
+        for maps in visits:
+            outcomes.append([estimate_file(path, settings) for path in maps])
+            progress(sum(len(one) for one in outcomes), total)
+    answers = [[answer_of(outcome) for outcome in maps] for maps in outcomes]
+    names = [[str(path) for path in maps] for maps in visits]
+    inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
+    compared = compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs)
+    if figure is not None:
+        from tactile_bayes.report.compare_figure import draw_comparison
+
+        drawn = drawn_maps([[outcome.tactile_map for outcome in maps] for maps in outcomes], answers)
+        draw_comparison(compared.compared, compared.document, drawn, figure, force=force)
+    return compared

@@ -1,0 +1,270 @@
+"""Two visits and more compared: whether they are of one mass, and the change of its size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.pipeline.comparing import Comparing
+from tactile_bayes.pipeline.one_map import Answer, size_priors
+from tactile_bayes.pipeline.pooled import common_calibration
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.report.compare_figure import DrawnMap
+    from tactile_bayes.size.between_maps import BetweenMaps
+    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.change import JointSizes
+    from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.pooling import ShapeDraws
+    from tactile_bayes.size.same_mass import Apart, Place
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ComparedOutcome:
+    """A comparison with its JSON object."""
+
+    compared: Compared
+    document: dict[str, Any]
+
+    @property
+    def exit_code(self) -> int:
+        """0 for a comparison, else 6."""
+        return EXIT_DONE if self.compared.joint is not None else EXIT_NO_ESTIMATE
+
+
+def compare_answers(
+    visits: Sequence[Sequence[Answer]],
+    settings: Settings,
+    *,
+    comparing: Comparing,
+    names: Sequence[Sequence[str]],
+    inputs: Mapping[str, Path],
+) -> ComparedOutcome:
+    """Compare the visits of one mass.
+
+    Parameters
+    ----------
+    visits
+        Answers for the maps of each visit, in order of time; none of them an error.
+    names
+        Of the maps, for the report.
+    inputs
+        Files that the maps came from, by role, for the provenance.
+
+    Raises
+    ------
+    BadDataError
+        When the maps were normalised in several ways, or one was made with another head than the calibration's.
+    UsageError
+        When there are fewer than two visits, days do not fit, or the calibration cannot pool maps.
+    """
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.report.compare_document import compare_document
+
+    if len(visits) < 2 or not all(visits):
+        raise UsageError("a comparison needs two visits of at least one map each: compare VISIT1.nc --with VISIT2.nc")
+    comparing.check_visits(len(visits))
+    if settings.calibration == "none":
+        raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
+    every = list(chain.from_iterable(visits))
+    path, calibration = common_calibration(every, settings, names=list(chain.from_iterable(names)))
+    compared = _compared(visits, calibration, settings, comparing)
+    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {}))
+    scans = [scan for one in visits for scan in _scans(one)]
+    provenance = Provenance("compare", _recorded(settings, comparing), digests, seed=settings.seed, scans=scans)
+    document = compare_document(
+        compared,
+        [[answer.document or {} for answer in one] for one in visits],
+        names,
+        days=comparing.days,
+        grown_by=comparing.grown_by,
+        probability=settings.interval,
+        provenance=provenance,
+    )
+    return ComparedOutcome(compared, document)
+
+
+def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[Answer]]) -> list[list[DrawnMap]]:
+    """The maps of each visit with the places of their lumps, for the figure."""
+    from tactile_bayes.report.compare_figure import DrawnMap
+
+    def place(answer: Answer) -> tuple[float, float] | None:
+        centre = None if answer.document is None or answer.shape is None else answer.document["centre_mm"]
+        return None if centre is None else (centre["x"]["median"], centre["y"]["median"])
+
+    return [
+        [DrawnMap(one, place(answer)) for one, answer in zip(some, answers, strict=True)]
+        for some, answers in zip(maps, visits, strict=True)
+    ]
+
+
+def _compared(
+    visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: Comparing
+) -> Compared:
+    from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.same_mass import contradictions
+
+    found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
+    missing = [
+        f"a lump was found on {len(some)} of {len(maps)} maps of visit {number}"
+        for number, (some, maps) in enumerate(zip(found, visits, strict=True), start=1)
+        if not some or 2 * len(some) < len(maps)
+    ]
+    contradicted = contradictions([_scans(one) for one in visits])
+    if contradicted:
+        advice = "compare exams of one mass; where a code is wrong, correct it in the scans' session and map them again"
+        return Compared("not_one_mass", "; ".join(contradicted), advice)
+    if missing:
+        return Compared("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
+    refused, apart, cautions = _by_place(found, comparing)
+    if refused is not None:
+        return refused
+    return _sized(found, calibration, settings, apart=apart, cautions=cautions)
+
+
+def _by_place(
+    visits: Sequence[Sequence[Answer]], comparing: Comparing
+) -> tuple[Compared | None, tuple[Apart | None, ...], list[str]]:
+    """Refusal where the places do not show one mass, the distances from the first visit, and cautions."""
+    from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.same_mass import Place, apart
+
+    places = [Place.mean_of([one for one in map(_place, maps) if one is not None]) for maps in visits]
+    found = tuple(
+        None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
+        for first, later in ((places[0], later) for later in places[1:])
+    )
+    doubts = [
+        f"the masses of visits 1 and {number} lie {one.words}"
+        for number, one in enumerate(found, start=2)
+        if one is not None and one.doubtful
+    ]
+    unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
+    if not comparing.same_mass and doubts:
+        advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
+        return Compared("not_one_mass", "; ".join(doubts), advice, found), (), []
+    if not comparing.same_mass and unknown:
+        reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
+        return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", found), (), []
+    cautions = [f"CAUTION: {text}; taken as one mass because you say so" for text in doubts]
+    cautions += ["CAUTION: taken as one mass because you say so: no landmarks show it"] if unknown else []
+    return None, found, cautions
+
+
+def _sized(
+    visits: Sequence[Sequence[Answer]],
+    calibration: BodyCalibration,
+    settings: Settings,
+    *,
+    apart: tuple[Apart | None, ...],
+    cautions: Sequence[str],
+) -> Compared:
+    """Sizes of visits that are of one mass, or why there are none."""
+    import numpy as np
+
+    from tactile_bayes.size.change import joint_sizes, visit_calibrations
+    from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.pooling import MOST_INVALID
+
+    # one order whatever the caller's, so that the order of a visit's maps leaves no trace
+    shapes: list[list[ShapeDraws]] = [
+        sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
+        for maps in visits
+    ]
+    fitted = visit_calibrations(shapes, calibration)
+    far = _by_visit(shapes, fitted, lambda at, middle: at.too_far(*middle))
+    if far:
+        return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
+    priors = size_priors(settings)
+    words = sorted(answer.fingerprint for maps in visits for answer in maps)
+
+    def joint(between: BetweenMaps | None) -> JointSizes:
+        rng = np.random.default_rng([settings.seed, *words])
+        return joint_sizes(shapes, calibration=calibration, priors=priors, rng=rng, between=between)
+
+    sizes = joint(None)
+    if np.isnan(sizes.log_size).mean() > MOST_INVALID:
+        return Compared("no_estimate", "too many draws have no positive size", "", apart)
+    outside = _by_visit(shapes, fitted, lambda at, middle: at.outside(*middle))
+    cautions = [
+        *cautions,
+        *(f"CAUTION: outside the calibration's range: {text}" for text in outside),
+        *_broken(visits),
+        *_fat_apart(shapes, calibration),
+    ]
+    another = None if priors.another_exam is None else joint(priors.another_exam)
+    return Compared("compared", "", "", apart, tuple(cautions), sizes, another)
+
+
+def _by_visit(
+    shapes: Sequence[Sequence[ShapeDraws]],
+    fitted: Sequence[BodyCalibration],
+    texts: Callable[[BodyCalibration, tuple[float, float]], list[str]],
+) -> list[str]:
+    """What is to be said of the middles of the maps, once for each visit."""
+    found = [
+        f"visit {number}: {text}"
+        for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1)
+        for one in maps
+        for text in texts(at, one.middle)
+    ]
+    return list(dict.fromkeys(found))
+
+
+def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[str]:
+    """Caution where the maps differ too much in the depth of fat to be of one breast."""
+    fat = calibration.with_fat
+    depths = None if fat is None else fat.depths_apart([one.profile for maps in shapes for one in maps])
+    if depths is None:
+        return []
+    return ["CAUTION: the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(*depths)]
+
+
+def _broken(visits: Sequence[Sequence[Answer]]) -> list[str]:
+    """Broken assumptions of the maps' scans."""
+    return [
+        f"CAUTION: visit {number}: {text}"
+        for number, maps in enumerate(visits, start=1)
+        for answer in maps
+        for text in (answer.document or {}).get("diagnostics", {}).get("broken_assumptions", [])
+    ]
+
+
+def _place(answer: Answer) -> Place | None:
+    """Where a map's lump lies in the patient; None without landmarks."""
+    import numpy as np
+
+    from tactile_bayes.size.same_mass import Place
+
+    centre = None if answer.document is None else answer.document["centre_patient_mm"]
+    if centre is None:
+        return None
+    x, y = centre["x"], centre["y"]
+    return Place(np.array([x["median"], y["median"]]), np.diag([x["sd"] ** 2, y["sd"] ** 2]))
+
+
+def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
+    from tactile_bayes.files.provenance import scans_of
+
+    return [scan for one in answers if one.document is not None for scan in scans_of(one.document["provenance"])]
+
+
+def _recorded(settings: Settings, comparing: Comparing) -> dict[str, Any]:
+    """Settings for the provenance."""
+    return {
+        "size_calibration": settings.calibration_name,
+        "method": settings.method,
+        "interval": settings.interval,
+        "scene": settings.scene,
+        "between_map_sd": settings.between_map_sd,
+        "days": None if comparing.days is None else list(comparing.days),
+        "grown_by": list(comparing.grown_by),
+        "same_mass": comparing.same_mass,
+        "registration_mm": comparing.registration_mm,
+    }

@@ -1,0 +1,193 @@
+"""A comparison of visits as plain data: the object that `compare --json` prints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.size.trend import VOLUME, Trend, doubling_days, straight_line
+
+if TYPE_CHECKING:
+    from tactile_bayes.size.change import Change, JointSizes
+    from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.same_mass import Apart
+
+SCHEMA: Final = "tactile-bayes/compare/1"
+SHOWN: Final = 0.975
+"""Probability from which a growth, or a shrinking, is called one."""
+DETECTABLE: Final = 0.95
+"""Probability of the interval that the smallest detectable change would leave out zero by."""
+
+
+def compare_document(
+    compared: Compared,
+    visits: Sequence[Sequence[Mapping[str, Any]]],
+    names: Sequence[Sequence[str]],
+    *,
+    days: Sequence[float] | None,
+    grown_by: Sequence[float],
+    probability: float,
+    provenance: Provenance,
+) -> dict[str, Any]:
+    """JSON object of a comparison, see data_schema/compare.schema.json.
+
+    Parameters
+    ----------
+    visits, names
+        What `estimate` says of each visit's maps, and the maps' names.
+    days
+        Time of each visit; None where it is not known.
+    grown_by
+        Shares of the diameter.
+    """
+    joint = compared.joint
+    changes: list[dict[str, Any]] = []
+    if joint is not None:
+        changes = [
+            _change(joint, compared.another, later, days=days, grown_by=grown_by, probability=probability)
+            for later in range(1, len(visits))
+        ]
+    used = None if joint is None else joint.calibrations[0]
+    return {
+        "schema": SCHEMA,
+        "status": compared.status,
+        "reason": compared.reason,
+        "advice": compared.advice,
+        "cautions": list(compared.cautions),
+        "visits": [
+            _visit(i, visits[i], names[i], joint, day=None if days is None else days[i], probability=probability)
+            for i in range(len(visits))
+        ],
+        "places": [_apart(number, one) for number, one in enumerate(compared.apart, start=2)],
+        "changes": changes,
+        "trend": None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
+        "between_map_sd": None if joint is None else rounded(joint.between_map_sd),
+        "fat_mm": None if used is None or used.fat_mm is None else rounded(used.fat_mm),
+        "by_place_used": None if used is None else used.knows_places,
+        "left_out": [] if used is None else used.omissions(),
+        "research_use": RESEARCH_USE,
+        "provenance": provenance.as_dict(),
+    }
+
+
+def _visit(
+    index: int,
+    documents: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+    joint: JointSizes | None,
+    *,
+    day: float | None,
+    probability: float,
+) -> dict[str, Any]:
+    return {
+        "visit": index + 1,
+        "day": day,
+        "max_size_mm": None if joint is None else joint.size_mm(index, probability).as_dict(),
+        "maps": [
+            {"map": name, **{key: one.get(key) for key in ("status", "reason", "detected_probability")}}
+            for name, one in zip(names, documents, strict=True)
+        ],
+    }
+
+
+def _apart(visit: int, found: Apart | None) -> dict[str, Any]:
+    """How far a visit's mass lies from the first's."""
+    if found is None:
+        return {"visit": visit, "distance_mm": None, "sd_mm": None, "shift_mm": None, "probability": None}
+    return {
+        "visit": visit,
+        "distance_mm": rounded(found.distance_mm),
+        "sd_mm": rounded(found.sd_mm),
+        "shift_mm": [rounded(value) for value in found.shift_mm],
+        "probability": rounded(found.probability),
+    }
+
+
+def _change(
+    joint: JointSizes,
+    another: JointSizes | None,
+    later: int,
+    *,
+    days: Sequence[float] | None,
+    grown_by: Sequence[float],
+    probability: float,
+) -> dict[str, Any]:
+    """Change from the first visit to a later one."""
+    change = joint.change(0, later)
+    grown = change.probability_above(0.0)
+    return {
+        "earlier": 1,
+        "later": later + 1,
+        "verdict": verdict(grown),
+        "log_ratio": change.log_summary(probability).as_dict(),
+        "percent": change.percent(probability).as_dict(),
+        "probability_grown": rounded(grown),
+        "grown_by": [
+            {"percent": rounded(100.0 * share), "probability": rounded(change.probability_above(share))}
+            for share in grown_by
+        ],
+        "smallest_detectable_percent": rounded(100.0 * change.smallest_detectable(DETECTABLE)),
+        "growth_rate": None if days is None else _rate(change, days[later] - days[0], probability),
+        "another_exam": None if another is None else _another(another, later, probability),
+    }
+
+
+def verdict(probability_grown: float) -> str:
+    """``"grown"`` or ``"shrunk"`` where the odds carry it, else ``"no_change_shown"``."""
+    if probability_grown > SHOWN:
+        return "grown"
+    return "shrunk" if 1.0 - probability_grown > SHOWN else "no_change_shown"
+
+
+def _another(another: JointSizes, later: int, probability: float) -> dict[str, Any]:
+    """The change if exams of one mass differ as the paper's maps do."""
+    change = another.change(0, later)
+    return {
+        "between_map_sd": rounded(another.between_map_sd),
+        "percent": change.percent(probability).as_dict(),
+        "probability_grown": rounded(change.probability_above(0.0)),
+        "verdict": verdict(change.probability_above(0.0)),
+    }
+
+
+def _rate(change: Change, days: float, probability: float) -> dict[str, Any]:
+    """Specific growth rate of the volume between two visits."""
+    q = change.log_summary(probability)
+    median, low, high = (VOLUME * one / days for one in (q.median, q.low, q.high))
+    return _rates(days, median, (low, high), probability=probability)
+
+
+def _rates(days: float, median: float, ends: tuple[float, float], *, probability: float) -> dict[str, Any]:
+    """A growth rate in percent of the volume per day, and the doubling times at its median and its ends."""
+    low, high = ends
+    times = {"median": doubling_days(median), "shortest": doubling_days(high), "longest": doubling_days(low)}
+    return {
+        "days": days,
+        "percent_per_day": {
+            "median": rounded(100.0 * median),
+            "low": rounded(100.0 * low),
+            "high": rounded(100.0 * high),
+            "probability": probability,
+        },
+        "doubling_days": {name: None if one is None else rounded(one) for name, one in times.items()},
+    }
+
+
+def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> dict[str, Any]:
+    """Straight line of ln d over all visits."""
+    line: Trend = straight_line(*joint.moments, days)
+    half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
+    ends = VOLUME * (line.per_day - half), VOLUME * (line.per_day + half)
+    departure = None if line.departure is None else rounded(line.departure)
+    rates = _rates(days[-1] - days[0], VOLUME * line.per_day, ends, probability=probability)
+    return {"visits": len(days), **rates, "straight_line_probability": departure}
+
+
+def rounded(value: float) -> float:
+    """Nine significant digits."""
+    return float(f"{value:.9g}")

@@ -1,0 +1,235 @@
+"""Sizes at several visits together: what is shared cancels, what is not does not, and the stated odds hold.
+
+Reference values are the closed form of a linear model with normal errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.size.between_maps import BetweenMaps
+from tactile_bayes.size.change import JointSizes, joint_sizes
+from tactile_bayes.size.elongation import ShapePrior
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.hidden import RoundLumps
+from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.shared_body import SHARED_BODY, STRANGERS, SharedBody
+from tactile_bayes.size.site_shift import SiteShift
+from tactile_bayes.size.trend import doubling_days, straight_line
+
+BODY_SD, EXAM_SD, NOISE = 0.08, 0.02, 0.01
+ROUND = SizePriors(shape=ShapePrior(oval_probability=1e-9), another_exam=None)
+WHOLE = SharedBody(0.0, 1e6)
+
+
+def calibration(*, slope_variance: float = 1e-6) -> LogQuadratic:
+    """ln d = 2.5 + 0.3 u + v; the coefficient of v may be uncertain."""
+    covariance = np.eye(9) * 1e-6
+    covariance[2, 2] = slope_variance
+    return LogQuadratic(
+        centre=(-1.0, 1.5),
+        mean=np.array([2.5, 0.3, 1.0, 0.0, 0.0, 0.0, np.log(BODY_SD), 0.0, np.log(EXAM_SD)]),
+        covariance=covariance,
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), 0.02, 0.01),
+        information_inverse=np.eye(6) * 1e-2,
+        most_leverage=1.0,
+        domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
+        recipe=Recipe("mean", "free", 20.0, False, "field"),
+    )
+
+
+def shape(log_size: float, *, seed: int = 0) -> ShapeDraws:
+    """Draws of a map whose size by the calibration is as given."""
+    rng = np.random.default_rng(seed)
+    v = log_size - 2.5 + NOISE * rng.standard_normal(1000)
+    q, r = (value + 0.01 * rng.standard_normal(1000) for value in (0.05, 0.0))
+    return ShapeDraws(np.full(1000, -1.0), v + 1.5, q, r)
+
+
+def joint(*visits: list[ShapeDraws], law: SharedBody = WHOLE, use: LogQuadratic | None = None, tau: float = EXAM_SD):
+    between = BetweenMaps(tau, 0.0)
+    return joint_sizes(
+        visits, calibration=use or calibration(), priors=ROUND, rng=np.random.default_rng(3), between=between, law=law
+    )
+
+
+def test_a_body_that_is_shared_cancels_and_the_maps_remain():
+    change = joint([shape(2.7)], [shape(2.8, seed=1)]).change(0, 1)
+    assert np.median(change.log_ratio) == pytest.approx(0.1, abs=0.003)
+    assert change.log_sd == pytest.approx(np.sqrt(2 * (EXAM_SD**2 + NOISE**2)), rel=0.04)
+
+
+def test_strangers_have_the_spread_of_two_separate_estimates():
+    change = joint([shape(2.7)], [shape(2.8, seed=1)], law=STRANGERS).change(0, 1)
+    assert change.log_sd == pytest.approx(np.sqrt(2 * (BODY_SD**2 + EXAM_SD**2 + NOISE**2)), rel=0.03)
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.3])
+def test_between_the_two_the_law_says_how_much_of_the_body_is_another(growth):
+    law = SharedBody(0.2, 0.5)
+    change = joint([shape(2.6)], [shape(2.6 + growth, seed=1)], law=law).change(0, 1)
+    shared = 0.8 * np.exp(-0.5 * (growth / 0.5) ** 2)
+    expected = 2 * (EXAM_SD**2 + NOISE**2 + (1 - shared) * BODY_SD**2)
+    assert change.log_sd == pytest.approx(np.sqrt(expected), rel=0.04)
+
+
+def test_exams_of_a_visit_average_out():
+    visits = [[shape(2.7 + 0.1 * v, seed=4 * v + e) for e in range(4)] for v in range(2)]
+    change = joint(*visits).change(0, 1)
+    assert change.log_sd == pytest.approx(np.sqrt(2 * (EXAM_SD**2 + NOISE**2) / 4), rel=0.05)
+
+
+def test_each_visits_size_is_that_of_its_maps_pooled():
+    maps = [shape(2.7, seed=1), shape(2.72, seed=2)]
+    together = joint(maps, [shape(2.9, seed=3)], law=SHARED_BODY)
+    priors = replace(ROUND, between_maps=BetweenMaps(EXAM_SD, 0.0))
+    alone = pooled_size(maps, calibration=calibration(), priors=priors, rng=np.random.default_rng(5), number=8192)
+    for probability in (0.025, 0.5, 0.975):
+        mine = np.quantile(together.log_size[0], probability)
+        assert mine == pytest.approx(np.quantile(np.log(alone.max_size_mm), probability), abs=0.006)
+
+
+def test_visits_in_the_other_order_give_the_opposite_change():
+    one, two = [shape(2.7, seed=1)], [shape(2.82, seed=2)]
+    there, back = joint(one, two).change(0, 1), joint(two, one).change(0, 1)
+    assert np.median(there.log_ratio) == pytest.approx(-np.median(back.log_ratio), abs=0.002)
+    assert there.probability_above(0.0) == pytest.approx(1 - back.probability_above(0.0), abs=0.002)
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.4])
+def test_an_uncertain_coefficient_matters_by_what_changes_of_its_term(growth):
+    """The term of v is v itself: two maps that differ by 0.4 in it differ by 0.4 times the coefficient's error."""
+    use = calibration(slope_variance=0.05**2)
+    change = joint([shape(2.6)], [shape(2.6 + growth, seed=1)], use=use).change(0, 1)
+    expected = 2 * (EXAM_SD**2 + NOISE**2) + (0.05 * growth) ** 2
+    assert change.log_sd == pytest.approx(np.sqrt(expected), rel=0.05)
+
+
+def test_a_sites_correction_is_shared_too():
+    site = SiteShift(1.5, np.array([0.1, 0.0]), np.diag([0.05**2, 0.1**2]), phantoms=5, maps=10)
+    use = replace(calibration(), site=site)
+    apart = joint([shape(2.6)], [shape(3.0, seed=1)], use=use)
+    expected = 2 * (EXAM_SD**2 + NOISE**2) + (0.1 * 0.4) ** 2
+    assert apart.change(0, 1).log_sd == pytest.approx(np.sqrt(expected), rel=0.05)
+    assert np.median(apart.log_size[0]) == pytest.approx(2.7, abs=0.01)
+
+
+def test_the_spread_between_exams_is_learned_at_all_visits_together():
+    alike = [[shape(2.7 + 0.1 * v, seed=3 * v + e) for e in range(3)] for v in range(2)]
+    apart = [[shape(2.7 + 0.1 * v + 0.2 * (e - 1), seed=3 * v + e) for e in range(3)] for v in range(2)]
+    of = {
+        name: joint_sizes(maps, calibration=calibration(), priors=ROUND, rng=np.random.default_rng(1), between=prior)
+        for prior in (BetweenMaps(),)
+        for name, maps in (("alike", alike), ("apart", apart), ("one", [one[:1] for one in apart]))
+    }
+    assert of["one"].between_map_sd == pytest.approx(0.15, rel=0.05)
+    assert of["alike"].between_map_sd < 0.05
+    assert of["apart"].between_map_sd > 0.15
+
+
+def trial(rng: np.random.Generator, law: SharedBody, *, growth: float, use: SharedBody) -> tuple[bool, bool]:
+    """Two visits of two exams from the model with one law, compared by another: does the 95 % interval hold, alarm?"""
+    shared = law.correlation(np.array([0.0, growth]))
+    bodies = BODY_SD * np.linalg.cholesky(shared + 1e-12 * np.eye(2)) @ rng.standard_normal(2)
+    visits = [
+        [shape(2.6 + g - b + EXAM_SD * rng.standard_normal(), seed=int(rng.integers(1 << 30))) for _ in range(2)]
+        for g, b in zip((0.0, growth), bodies, strict=True)
+    ]
+    found: JointSizes = joint_sizes(
+        visits, calibration=calibration(), priors=ROUND, rng=rng, between=BetweenMaps(EXAM_SD, 0.0), law=use, number=512
+    )
+    change = found.change(0, 1)
+    q = change.log_summary(0.95)
+    return q.low <= growth <= q.high, not 0.025 <= change.probability_above(0.0) <= 0.975
+
+
+def test_intervals_hold_and_alarms_are_as_rare_as_stated():
+    """Nominal 95 and 5 % over 300 pairs each; with the body taken as wholly the same, the control, neither does."""
+    law, rng = SharedBody(0.3, 0.5), np.random.default_rng(17)
+    still = np.array([trial(rng, law, growth=0.0, use=law) for _ in range(300)])
+    grown = np.array([trial(rng, law, growth=0.25, use=law) for _ in range(300)])
+    sure = np.array([trial(rng, law, growth=0.0, use=WHOLE) for _ in range(200)])
+    assert 0.92 < still[:, 0].mean() < 0.98
+    assert 0.92 < grown[:, 0].mean() < 0.98
+    assert 0.02 < still[:, 1].mean() < 0.08
+    assert grown[:, 1].mean() > 0.8
+    assert sure[:, 1].mean() > 0.12
+    assert sure[:, 0].mean() < 0.88
+
+
+def test_the_smallest_detectable_change_is_the_growth_whose_interval_begins_at_none():
+    """exp(1.96 SD) - 1: at that estimated growth the probability of a growth is 0.975."""
+    change = joint([shape(2.7)], [shape(2.75, seed=1)]).change(0, 1)
+    least = change.smallest_detectable(0.95)
+    assert least == pytest.approx(np.expm1(1.96 * change.log_sd), rel=1e-3)
+    moved = replace(change, mean=change.mean - change.mean.mean() + np.log1p(least))
+    assert moved.probability_above(0.0) == pytest.approx(0.975, abs=0.003)
+
+
+def test_odds_fall_with_the_growth_that_is_asked_for():
+    change = joint([shape(2.7)], [shape(2.88, seed=1)]).change(0, 1)
+    odds = [change.probability_above(share) for share in (-0.2, 0.0, 0.1, 0.2, 0.5)]
+    assert odds == sorted(odds, reverse=True)
+    assert odds[0] > 0.999 > 0.001 > odds[-1]
+    assert change.percent(0.95).median == pytest.approx(100 * np.expm1(0.18), abs=1.0)
+
+
+@pytest.mark.parametrize("visits", [1, 11])
+def test_one_visit_and_very_many_are_refused(visits):
+    with pytest.raises(UsageError, match="compare 2 to 10"):
+        joint(*[[shape(2.7, seed=i)] for i in range(visits)])
+
+
+def test_a_visit_without_a_map_is_refused():
+    with pytest.raises(UsageError, match="no map"):
+        joint([shape(2.7)], [])
+
+
+def test_a_law_with_impossible_values_is_refused():
+    for values in ((1.2, 1.0), (-0.1, 1.0), (0.1, 0.0)):
+        with pytest.raises(BadDataError):
+            SharedBody(*values)
+
+
+def test_the_correlation_of_many_visits_is_one_matrix():
+    """Positive semi-definite whatever the growth, or no draws could have it."""
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        law = SharedBody(float(rng.uniform(0, 1)), float(rng.uniform(0.05, 3)))
+        matrix = law.correlation(rng.normal(2.7, 0.5, 8))
+        assert np.linalg.eigvalsh(matrix)[0] > -1e-9
+        assert np.allclose(np.diag(matrix), 1.0)
+
+
+def test_a_straight_line_through_two_visits_is_their_change_over_the_time():
+    covariance = np.array([[0.02, 0.018], [0.018, 0.021]])
+    line = straight_line(np.array([2.7, 2.9]), covariance, [0.0, 50.0])
+    assert line.per_day == pytest.approx(0.2 / 50)
+    assert line.sd == pytest.approx(np.sqrt(0.02 + 0.021 - 2 * 0.018) / 50)
+    assert line.departure is None
+
+
+def test_a_straight_line_through_equal_independent_visits_is_least_squares():
+    """numpy's own fit; what all visits share moves neither the slope nor its error."""
+    days, y = np.array([0.0, 30.0, 90.0, 200.0]), np.array([2.60, 2.70, 2.72, 2.95])
+    own = 0.05**2 * np.eye(4)
+    slope = np.polyfit(days, y, 1)[0]
+    for shared in (0.0, 0.1):
+        line = straight_line(y, own + shared**2, list(days))
+        assert line.per_day == pytest.approx(slope)
+        assert line.sd == pytest.approx(0.05 / np.sqrt(np.sum((days - days.mean()) ** 2)))
+    assert line.departure is not None
+    bent = straight_line(np.array([2.6, 2.9, 2.6, 2.9]), own, list(days))
+    assert bent.departure is not None
+    assert bent.departure < 0.001 < line.departure
+
+
+def test_a_volume_that_grows_by_one_percent_a_day_doubles_in_69_days():
+    assert doubling_days(0.01) == pytest.approx(69.3, abs=0.1)
+    assert doubling_days(0.0) is None
+    assert doubling_days(-0.01) is None
