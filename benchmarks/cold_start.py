@@ -75,6 +75,7 @@ MEASURED_ELSEWHERE = {
     "head": "benchmarks.forward's model: `head design` is 2 s of work",
     "campaign": "its steps are `map` and `estimate`, in processes that are warm",
     "compare-model": "it solves the scan's frames anew: seconds of work",
+    "report": "its maps' estimates, measured here as `estimate`, are the cost",
     "export": "the packages of its extras are the cost",
     "compare": "it needs two visits; its maps' estimates, measured here as `estimate`, are the cost",
     "diagnose": "it needs a posterior that `estimate` wrote; the chains are the cost",

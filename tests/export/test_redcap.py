@@ -92,7 +92,7 @@ def test_sizes_are_read_back_equal(tables: Any, estimate: dict[str, Any], exam: 
         "2",
         "2026-11-24",
     )
-    assert float(first["tb_right_mm"]) == estimate["centre_patient_mm"]["x"]["median"]
+    assert float(first["tb_right_mm"]) == estimate["masses"][0]["centre_patient_mm"]["x"]
     assert empty["tb_status"] == "3"
     assert empty["tb_max_mm"] == empty["tb_max_low_mm"] == ""
     assert empty["tb_reason"] == json.loads((exam / "empty.json").read_text())["reason"]

@@ -352,6 +352,7 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
             found += [
                 one.type for one in command.params if one.name in ("figure", "map_figure", "trace", "rank", "corner")
             ]
-    # map, calibrate size, two of estimate, three of diagnose, head design, compare-model, sbc, and three of tradeoff
-    assert len(found) == 13
+    # map, calibrate size, two of estimate, compare, three of diagnose, head design, compare-model, sbc, three of
+    # tradeoff
+    assert len(found) == 14
     assert all(isinstance(one, FigurePath) for one in found)

@@ -15,7 +15,7 @@ from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.change import JointSizes, joint_sizes
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import RoundLumps
+from tactile_bayes.size.hidden import RoundLumps, RoundSpread
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
 from tactile_bayes.size.shared_body import SHARED_BODY, STRANGERS, SharedBody
@@ -35,7 +35,7 @@ def calibration(*, slope_variance: float = 1e-6) -> LogQuadratic:
         centre=(-1.0, 1.5),
         mean=np.array([2.5, 0.3, 1.0, 0.0, 0.0, 0.0, np.log(BODY_SD), 0.0, np.log(EXAM_SD)]),
         covariance=covariance,
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), 0.02, 0.01),
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
         information_inverse=np.eye(6) * 1e-2,
         most_leverage=1.0,
         domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},

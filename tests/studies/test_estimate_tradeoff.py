@@ -136,7 +136,7 @@ def test_wrong_settings_come_out_as_wrong():
     assert row("fit_radius_mm 8").answer.reported is None
     assert ladder().enough() in right
     said = " ".join(advice(ladder()))
-    assert f"more than 0.2 mm: field_cosines 8 {row('field_cosines 8').off.ends:.1f} mm." in said
+    assert re.search(rf"more than 0.2 mm: .*field_cosines 8 {row('field_cosines 8').off.ends:.1f} mm\.", said)
     assert "No size by fit_radius_mm 8." in said
 
 
@@ -299,9 +299,8 @@ def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
     rows = pooled_rows(paths, Settings(method="laplace"), clock=time.process_time)
     assert [one.maps for one in rows] == [1, 2, 3]
     spread = pooled_rows(paths, Settings(method="laplace", between_map_sd=0.15), clock=time.process_time)
-    assert spread[2].answer.half_width_mm < 0.85 * spread[0].answer.half_width_mm
-    # by simulated exams, which differ by 3 %, what the maps share makes nearly all of an interval
-    assert rows[2].answer.half_width_mm == pytest.approx(rows[0].answer.half_width_mm, rel=0.1)
+    one, three = (found.answer.half_width_mm / found.answer.reported.median for found in (spread[0], spread[2]))
+    assert three < 0.9 * one
     assert rows[2].another_half_mm < 0.85 * rows[0].another_half_mm
     assert rows[2].cpu_s > rows[0].cpu_s
 
