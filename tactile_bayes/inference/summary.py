@@ -11,6 +11,11 @@ from tactile_bayes.records import dataclass
 INTERVAL_KIND = "eti"
 
 
+def nine_digits(value: float) -> float:
+    """The value to nine significant digits, as JSON has them."""
+    return float(f"{value:.9g}")
+
+
 @dataclass(frozen=True, slots=True)
 class Quantity:
     """Summary of one quantity's draws.
@@ -35,7 +40,7 @@ class Quantity:
     def as_dict(self) -> dict[str, float | str]:
         """Plain data, rounded to nine significant digits."""
         names = ("median", "mean", "sd", "low", "high", "mc_error")
-        numbers: dict[str, float | str] = {name: float(f"{getattr(self, name):.9g}") for name in names}
+        numbers: dict[str, float | str] = {name: nine_digits(getattr(self, name)) for name in names}
         return numbers | {"probability": self.probability, "kind": self.kind}
 
 

@@ -55,8 +55,7 @@ def pool_answers(
     from tactile_bayes.report.pooled import pooled_document
     from tactile_bayes.size.pooling import pool_maps
 
-    path, calibration = _calibration(answers, settings)
-    _check_heads(answers, calibration, names)
+    path, calibration = common_calibration(answers, settings, names=names)
     digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
     check_repeatability(settings, calibration, digests)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace

@@ -9,6 +9,7 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.summary import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.trend import VOLUME, Trend, doubling_days, straight_line
 
@@ -66,8 +67,8 @@ def compare_document(
         "places": [_apart(number, one) for number, one in enumerate(compared.apart, start=2)],
         "changes": changes,
         "trend": None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
-        "between_map_sd": None if joint is None else rounded(joint.between_map_sd),
-        "fat_mm": None if used is None or used.fat_mm is None else rounded(used.fat_mm),
+        "between_map_sd": None if joint is None else nine_digits(joint.between_map_sd),
+        "fat_mm": None if used is None or used.fat_mm is None else nine_digits(used.fat_mm),
         "by_place_used": None if used is None else used.knows_places,
         "left_out": [] if used is None else used.omissions(),
         "research_use": RESEARCH_USE,
@@ -101,10 +102,10 @@ def _apart(visit: int, found: Apart | None) -> dict[str, Any]:
         return {"visit": visit, "distance_mm": None, "sd_mm": None, "shift_mm": None, "probability": None}
     return {
         "visit": visit,
-        "distance_mm": rounded(found.distance_mm),
-        "sd_mm": rounded(found.sd_mm),
-        "shift_mm": [rounded(value) for value in found.shift_mm],
-        "probability": rounded(found.probability),
+        "distance_mm": nine_digits(found.distance_mm),
+        "sd_mm": nine_digits(found.sd_mm),
+        "shift_mm": [nine_digits(value) for value in found.shift_mm],
+        "probability": nine_digits(found.probability),
     }
 
 
@@ -126,12 +127,12 @@ def _change(
         "verdict": verdict(grown),
         "log_ratio": change.log_summary(probability).as_dict(),
         "percent": change.percent(probability).as_dict(),
-        "probability_grown": rounded(grown),
+        "probability_grown": nine_digits(grown),
         "grown_by": [
-            {"percent": rounded(100.0 * share), "probability": rounded(change.probability_above(share))}
+            {"percent": nine_digits(100.0 * share), "probability": nine_digits(change.probability_above(share))}
             for share in grown_by
         ],
-        "smallest_detectable_percent": rounded(100.0 * change.smallest_detectable(DETECTABLE)),
+        "smallest_detectable_percent": nine_digits(100.0 * change.smallest_detectable(DETECTABLE)),
         "growth_rate": None if days is None else _rate(change, days[later] - days[0], probability),
         "another_exam": None if another is None else _another(another, later, probability),
     }
@@ -148,9 +149,9 @@ def _another(another: JointSizes, later: int, probability: float) -> dict[str, A
     """The change if exams of one mass differ as the paper's maps do."""
     change = another.change(0, later)
     return {
-        "between_map_sd": rounded(another.between_map_sd),
+        "between_map_sd": nine_digits(another.between_map_sd),
         "percent": change.percent(probability).as_dict(),
-        "probability_grown": rounded(change.probability_above(0.0)),
+        "probability_grown": nine_digits(change.probability_above(0.0)),
         "verdict": verdict(change.probability_above(0.0)),
     }
 
@@ -169,12 +170,12 @@ def _rates(days: float, median: float, ends: tuple[float, float], *, probability
     return {
         "days": days,
         "percent_per_day": {
-            "median": rounded(100.0 * median),
-            "low": rounded(100.0 * low),
-            "high": rounded(100.0 * high),
+            "median": nine_digits(100.0 * median),
+            "low": nine_digits(100.0 * low),
+            "high": nine_digits(100.0 * high),
             "probability": probability,
         },
-        "doubling_days": {name: None if one is None else rounded(one) for name, one in times.items()},
+        "doubling_days": {name: None if one is None else nine_digits(one) for name, one in times.items()},
     }
 
 
@@ -183,11 +184,6 @@ def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> dict
     line: Trend = straight_line(*joint.moments, days)
     half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
     ends = VOLUME * (line.per_day - half), VOLUME * (line.per_day + half)
-    departure = None if line.departure is None else rounded(line.departure)
+    departure = None if line.departure is None else nine_digits(line.departure)
     rates = _rates(days[-1] - days[0], VOLUME * line.per_day, ends, probability=probability)
     return {"visits": len(days), **rates, "straight_line_probability": departure}
-
-
-def rounded(value: float) -> float:
-    """Nine significant digits."""
-    return float(f"{value:.9g}")

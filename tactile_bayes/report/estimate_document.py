@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.inference.summary import Quantity, nine_digits
 from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
@@ -57,13 +57,13 @@ def estimate_document(
         "centre_patient_mm": point("centre_patient_mm"),
         "position": None if place is None else place.as_dict(probability),
         "angle_deg": one("angle_deg"),
-        "detected_probability": None if detection is None else _round(detection.probability),
-        "variance_share": None if share is None else {k: _round(v) for k, v in share.items()},
+        "detected_probability": None if detection is None else nine_digits(detection.probability),
+        "variance_share": None if share is None else {k: nine_digits(v) for k, v in share.items()},
         "scene": None if estimate.scene is None else scene_document(estimate.scene),
         "prior_sensitivity": None if estimate.sensitivity is None else rounded(estimate.sensitivity.as_dict()),
         "diagnostics": _diagnostics(estimate),
         "candidates": [
-            {"x_mm": _round(c.centre_mm[0]), "y_mm": _round(c.centre_mm[1]), "fault": c.fault}
+            {"x_mm": nine_digits(c.centre_mm[0]), "y_mm": nine_digits(c.centre_mm[1]), "fault": c.fault}
             for c in estimate.candidates
         ],
         "other_rises": [rise.as_dict() for rise in estimate.other_rises],
@@ -77,15 +77,11 @@ def estimate_document(
     }
 
 
-def _round(value: float) -> float:
-    return float(f"{value:.9g}")
-
-
 def rounded(value: Any) -> Any:
     """Plain data with its numbers rounded to nine significant digits."""
     if isinstance(value, dict):
         return {name: rounded(one) for name, one in value.items()}
-    return _round(value) if isinstance(value, float) else value
+    return nine_digits(value) if isinstance(value, float) else value
 
 
 def _diagnostics(estimate: Estimate) -> dict[str, Any]:
@@ -103,6 +99,6 @@ def size_diagnostics(size: SizePosterior) -> dict[str, Any]:
 
 def _finite(found: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        name: (_round(value) if math.isfinite(value) else None) if isinstance(value, float) else value
+        name: (nine_digits(value) if math.isfinite(value) else None) if isinstance(value, float) else value
         for name, value in found.items()
     }

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.clock_face import ClockPosition, clock_position
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.report.masses_document import patient_mm
 
 NOT_SIZED = "not sized"
 Quantity = Mapping[str, Any]
@@ -195,10 +195,6 @@ def _placed(
     centre_sd_mm: tuple[float, float] = (0.0, 0.0),
     **facts: Any,
 ) -> ExamMass:
-    patient = None
-    if tactile_map.patient_from_plane is not None:
-        x, y, _ = apply(tactile_map.patient_from_plane, np.array([*centre_mm, 0.0]))
-        patient = (float(x), float(y))
     covariance = np.diag(np.square(centre_sd_mm))
     place = clock_position(tactile_map, centre_mm, side=side, covariance_mm2=covariance)
-    return ExamMass(number, centre_mm, place=place, patient_mm=patient, **facts)
+    return ExamMass(number, centre_mm, place=place, patient_mm=patient_mm(tactile_map, *centre_mm), **facts)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.geometry import apply
-from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.inference.summary import Quantity, nine_digits
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.result import Mass
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, estimate_quantities
@@ -56,9 +56,9 @@ def _mass(
     return {
         "number": number,
         "reported": mass.reported,
-        "centre_mm": {"x": _round(mass.x_mm), "y": _round(mass.y_mm)},
-        "centre_patient_mm": None if patient is None else {"x": _round(patient[0]), "y": _round(patient[1])},
-        "detected_probability": _round(mass.probability),
+        "centre_mm": {"x": nine_digits(mass.x_mm), "y": nine_digits(mass.y_mm)},
+        "centre_patient_mm": None if patient is None else {"x": nine_digits(patient[0]), "y": nine_digits(patient[1])},
+        "detected_probability": nine_digits(mass.probability),
         "amplitude": one("amplitude"),
         **{name: one(name) for name in EXTREMES},
         ANOTHER_EXAM: another_exam(estimate.size, quantities),
@@ -74,10 +74,6 @@ def patient_mm(tactile_map: TactileMap, x_mm: float, y_mm: float) -> tuple[float
         return None
     x, y, _ = apply(tactile_map.patient_from_plane, np.array([x_mm, y_mm, 0.0]))
     return float(x), float(y)
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.9g}")
 
 
 def others(masses: Sequence[MassDocument]) -> list[MassDocument]:

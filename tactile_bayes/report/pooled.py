@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.inference.summary import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
@@ -67,13 +68,13 @@ def pooled_document(
         ANOTHER_EXAM: _another_exam(size, probability),
         "supposing": supposed_document(size, largest),
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
-        "variance_share": None if size is None else {k: _round(v) for k, v in size.variance_share.items()},
-        "figures": {} if size is None else {name: _round(value) for name, value in size.figures.items()},
+        "variance_share": None if size is None else {k: nine_digits(v) for k, v in size.variance_share.items()},
+        "figures": {} if size is None else {name: nine_digits(value) for name, value in size.figures.items()},
         "left_out": _omitted(used, documents),
         "by_place_used": used.knows_places,
-        "fat_mm": None if used.fat_mm is None else _round(used.fat_mm),
-        "fat_apart_mm": None if pooled.fat_apart_mm is None else [_round(depth) for depth in pooled.fat_apart_mm],
-        "unknowns": {name: _round(share) for name, share in used.unknowns.items()},
+        "fat_mm": None if used.fat_mm is None else nine_digits(used.fat_mm),
+        "fat_apart_mm": None if pooled.fat_apart_mm is None else [nine_digits(depth) for depth in pooled.fat_apart_mm],
+        "unknowns": {name: nine_digits(share) for name, share in used.unknowns.items()},
         "site": None if used.site is None else site_words(used.site),
         **({} if repeatability is None else {"repeatability": repeatability.words()}),
         "outside_calibration": list(pooled.outside),
@@ -104,7 +105,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
         "status": document["status"],
         "reason": document["reason"],
         "detected_probability": document["detected_probability"],
-        "log_size": _round(pooled.centres[index]) if index in pooled.centres else None,
+        "log_size": nine_digits(pooled.centres[index]) if index in pooled.centres else None,
         "outlying": index in pooled.outlying,
         "broken_assumptions": list(document["diagnostics"].get("broken_assumptions", [])),
     }
@@ -226,7 +227,3 @@ def _rise_line(name: str, rise: Mapping[str, float]) -> str:
 def _unknowns(document: Mapping[str, Any]) -> str:
     text = fat_text(document["fat_mm"], by_place=document["by_place_used"]) + unknowns_text(document["unknowns"])
     return text[0].upper() + text[1:] + "."
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.9g}")

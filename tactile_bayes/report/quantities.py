@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray, apply
-from tactile_bayes.inference.summary import Quantity, summarise
+from tactile_bayes.inference.summary import Quantity, nine_digits, summarise
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.posterior import EXTREMES, SIZES, SizePosterior
@@ -50,4 +50,4 @@ def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity])
     if size is None or size.another_exam is None:
         return None
     sizes = {name: quantities[f"{ANOTHER_EXAM}.{name}"].as_dict() for name in EXTREMES}
-    return {"between_map_sd": float(f"{size.another_exam.figures['between_map_sd']:.9g}"), **sizes}
+    return {"between_map_sd": nine_digits(size.another_exam.figures["between_map_sd"]), **sizes}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tactile_bayes.inference.summary import Quantity
+from tactile_bayes.inference.summary import Quantity, nine_digits
 from tactile_bayes.size.posterior import SizePosterior
 
 LEAST_CHANGE = 0.02
@@ -27,7 +27,7 @@ def supposed_document(size: SizePosterior | None, largest: Quantity | None) -> d
             "property": one.name,
             "value": one.value,
             "max_size_mm": {
-                **{name: _round(one.moved(end, median_mm=largest.median)) for name, end in ends.items()},
+                **{name: nine_digits(one.moved(end, median_mm=largest.median)) for name, end in ends.items()},
                 "probability": largest.probability,
             },
         }
@@ -63,7 +63,3 @@ def _pair(supposed: Mapping[str, Any] | None, median_mm: float, names: tuple[str
 
 def _size(size: Mapping[str, float], places: int) -> str:
     return "{median:.{0}f} mm ({low:.{0}f} to {high:.{0}f})".format(places, **size)
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.9g}")

@@ -242,22 +242,24 @@ def test_no_lump_found_is_told_with_what_was_covered() -> None:
     assert headline(without_lump("window")) == "No size"  # a rise that cannot be measured is not "no lump"
 
 
-def test_several_masses_are_numbered_with_a_place_each() -> None:
-    tactile_map, document = demo()
-    second = {
+def unsized(reason: str) -> dict[str, Any]:
+    """A second mass without a size, as the JSON has it."""
+    sizes = dict.fromkeys(("centre_patient_mm", "amplitude", "max_size_mm", "min_size_mm", "another_exam"))
+    return {
         "number": 2,
         "reported": False,
         "centre_mm": {"x": 15.0, "y": 8.0},
-        "centre_patient_mm": None,
         "detected_probability": 0.99,
-        "amplitude": None,
-        "max_size_mm": None,
-        "min_size_mm": None,
-        "another_exam": None,
-        "reason": "its window reaches beyond the map",
+        **sizes,
+        "reason": reason,
         "reason_code": "window",
         "advice": "",
     }
+
+
+def test_several_masses_are_numbered_with_a_place_each() -> None:
+    tactile_map, document = demo()
+    second = unsized("its window reaches beyond the map")
     first = {**second, "number": 1, "reported": True, "reason": ""}
     both = {**document, "masses": [first, second]}
     page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
@@ -316,20 +318,7 @@ def test_a_page_from_python_is_the_same_and_private(tmp_path: Path) -> None:
 def full() -> Exam:
     """As much as a page can hold: repeats, masses, cautions, long texts, a tall map."""
     tactile_map, document = demo()
-    mass = {
-        "number": 2,
-        "reported": False,
-        "centre_mm": {"x": 15.0, "y": 8.0},
-        "centre_patient_mm": None,
-        "detected_probability": 0.99,
-        "amplitude": None,
-        "max_size_mm": None,
-        "min_size_mm": None,
-        "another_exam": None,
-        "reason": "a reason that is long " * 20,
-        "reason_code": "window",
-        "advice": "",
-    }
+    mass = unsized("a reason that is long " * 20)
     masses = [{**mass, "number": 1, "reported": True}, *({**mass, "number": n} for n in range(2, 12))]
     diagnostics = {**document["diagnostics"], "broken_assumptions": [f"caution {n} " * 80 for n in range(9)]}
     told = {**document, "masses": masses, "diagnostics": diagnostics}

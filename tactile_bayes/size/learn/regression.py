@@ -179,10 +179,6 @@ class BodyRegression:
         prior = -0.5 * np.sum(((theta[:, -2:] - _PRIOR[:2, 0]) / _PRIOR[:2, 1]) ** 2, axis=1)
         return np.asarray(total + prior)
 
-    def body_residuals(self, mode: FloatArray) -> FloatArray:
-        """(groups,) residual of each body's mean."""
-        return np.asarray(self.mean_log_d - self.mean_terms @ mode[: self.terms.shape[1]])
-
     def bodies_left_out(self, mode: FloatArray) -> dict[str, FloatArray]:
         """``body`` and ``body_sd`` of `hidden.hidden_terms`, (groups,) arrays."""
         left_out = -left_out_errors(self.mean_terms, self.mean_log_d)
