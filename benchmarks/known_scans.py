@@ -1,6 +1,6 @@
 """Sizes estimated from scans of known lumps, through the commands a user would type.
 
-Usage: python -m benchmarks.known_scans DIRECTORY [--method importance] [--phantoms] [--known-seat]
+Usage: python -m benchmarks.known_scans DIRECTORY [--method importance] [--phantoms | --size-calibration NAME] [--known-seat]
 
 DIRECTORY holds ``phantoms.csv`` and ``scans/`` with ``*.npz`` and ``truth.csv`` (one row a lump). Nothing is tuned to
 them: every option has its default, and the calibration is the one that comes with the program. ``--phantoms`` learns
@@ -46,12 +46,12 @@ def seats(path: Path) -> dict[str, str]:
 
 
 def estimates(
-    data: Path, method: str, *, phantoms: bool, known_seat: bool
+    data: Path, method: str, *, phantoms: bool, known_seat: bool, calibration: str | None
 ) -> Iterator[tuple[str, list[float], dict[str, Any]]]:
     """Name, true diameters and JSON estimate of each scan."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        size: tuple[object, ...] = ()
+        size: tuple[object, ...] = ("--size-calibration", calibration) if calibration else ()
         if phantoms:
             size = ("--size-calibration", work / "size.json")
             run("calibrate", "size", data / "phantoms.csv", "-o", size[1])
@@ -71,12 +71,17 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--method", default="importance")
     parser.add_argument("--phantoms", action="store_true")
+    parser.add_argument("--size-calibration")
     parser.add_argument("--known-seat", action="store_true")
     arguments = parser.parse_args()
     print(f"{'scan':28}{'true, mm':>12}{'max size, mm':>14}{'95 % interval':>18}{'error':>8}  covered")
     errors, covered = [], 0
     for name, sizes, found in estimates(
-        arguments.data, arguments.method, phantoms=arguments.phantoms, known_seat=arguments.known_seat
+        arguments.data,
+        arguments.method,
+        phantoms=arguments.phantoms,
+        known_seat=arguments.known_seat,
+        calibration=arguments.size_calibration,
     ):
         true = " and ".join(f"{d:g}" for d in sizes) or "no lump"
         if found["status"] == "no_estimate":

@@ -108,6 +108,12 @@ class HiddenTerms:
         given = np.array([self._entered(name, value) for name, value in known.items()])
         return np.asarray((given - features @ self.expected[at].T) @ gain)
 
+    def score(self, name: str, value: float, features: FloatArray) -> float:
+        """How far a value is from what a map's (c,) features lead one to expect of a property, in SDs."""
+        at = self.names.index(name)
+        off = self._entered(name, value) - features @ self.expected[at]
+        return float(abs(off) / np.sqrt(self.covariance[at, at]))
+
     def at_depth(self, contraction: FloatArray) -> HiddenTerms:
         """The terms at one depth of fat, by the matrix that takes what is linear in the features to that depth."""
         return replace(self, expected=self.expected @ contraction.T)

@@ -25,6 +25,8 @@ SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
 }
 """A property and its value by name: lumps of 8 to 15 and 50 to 100 times the stiffness of fat, centred on the gland's
 surface and resting on it."""
+LIKELY_SDS: Final = 2.5
+"""A value farther than this from what the map leads one to expect is not supposed: figures by place tell the seat."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,7 @@ class Supposition:
 def suppositions(
     calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], *, variance: float
 ) -> dict[str, Supposition]:
-    """Of `SUPPOSED` those that the calibration's bodies hold and that nobody knows, by name.
+    """Of `SUPPOSED` those that the calibration's bodies hold, that the map leaves open and that nobody knows, by name.
 
     Parameters
     ----------
@@ -73,9 +75,12 @@ def suppositions(
     own_sd = np.sqrt(np.maximum(body_sd**2 - calibration.other_sd**2, 0.0))
     names, found = () if calibration.hidden is None else calibration.hidden.names, {}
     before, left_before = known_body(calibration, known, *at, own_sd)
+    features = calibration.features(*at)[0]
     for label, (name, value) in SUPPOSED.items():
         low, high = calibration.bodies.get(name, (value, value))
-        if name in names and name not in known and low <= value <= high:
+        if name not in names or name in known or not low <= value <= high:
+            continue
+        if calibration.hidden is not None and calibration.hidden.score(name, value, features) <= LIKELY_SDS:
             expected, left = known_body(calibration, {**known, name: value}, *at, own_sd)
             gone = float((left_before - left)[0]) / variance if variance > 0 else 0.0
             ratio = float(np.sqrt(np.clip(1.0 - gone, 0.0, 1.0)))

@@ -45,6 +45,15 @@ def test_bodies_that_the_calibration_does_not_hold_are_not_supposed() -> None:
     assert pooled([shape(2.7)], use=calibration()).supposing == {}
 
 
+def test_what_the_map_tells_is_not_supposed_otherwise() -> None:
+    """Maps of this calibration tell the seat to 0.1 about 0.6: neither 0 nor 1 can be; to 0.35 both can."""
+    use = knowing()
+    assert use.hidden is not None
+    told = replace(use, hidden=replace(use.hidden, covariance=np.array([[0.5, -0.01], [-0.01, 0.01]])))
+    assert set(pooled([shape(2.7)], use=told).supposing) == {"soft", "hard"}
+    assert set(pooled([shape(2.7)], use=use).supposing) == {"soft", "hard", "centred", "resting"}
+
+
 def test_where_bodies_differ_most_what_is_known_tells_no_more() -> None:
     """The control: twice that SD of B, and no limit, is twice the shift."""
     use = knowing()
