@@ -68,6 +68,15 @@ def test_frames_that_come_less_often_make_a_map_from_any_start(every, start):
     assert len(thinned.frames) == thinned.frame_count
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("every", range(2, 41))
+def test_every_thinning_makes_a_map_from_every_start(every):
+    whole = tb.demo_scan()
+    for start in range(every):
+        frames = PressureFrames(whole.frames.time_s[start::every], whole.frames.counts[start::every].copy())
+        assert "stroke_lag_mm" in build_map(replace(whole, frames=frames)).quality
+
+
 @pytest.mark.parametrize("step", [0.25, 1, 1.5, 2, 3, 6, 7.3])
 @pytest.mark.parametrize("every", [1, 2, 3, 6, 7])
 @pytest.mark.parametrize("start", range(3))
