@@ -139,7 +139,9 @@ def _by_class(table: PopulationTable, error: FloatArray, variance: FloatArray, b
     classes = {
         "soft (E2/E1 below 15)": stiffness < 15,
         "hard (50 and more)": stiffness >= 50,
+        "softest (below 9)": stiffness < 9,
         "centred (seat 0)": seat == 0,
+        "soft and centred": (stiffness < 15) & (seat == 0),
         "out of the gland (seat 0.8 and more)": seat >= 0.8,
         "deep (h/d 1.4 and more)": ratio >= 1.4,
         "shallow (h/d below 0.8)": ratio < 0.8,

@@ -27,7 +27,7 @@ class BodyPrior:
     depth_ratio
         h/d, from just under the skin to where nothing is felt any more.
     stiffness_ratio
-        E2/E1, from the paper's "widths change by less than 5 % above 8" to rigid.
+        E2/E1, from the softer carcinomas under a few per cent of strain (Samani et al. 2007) to rigid.
     seat
         From centred on the fat-gland boundary to a tenth of a diameter above the gland.
     fat_kpa, gland_ratio
@@ -38,7 +38,7 @@ class BodyPrior:
 
     d_mm: Range = (5.0, 30.0)
     depth_ratio: Range = (0.56, 1.8)
-    stiffness_ratio: Range = (8.0, 100.0)
+    stiffness_ratio: Range = (6.0, 100.0)
     seat: Range = (0.0, 1.2)
     fat_kpa: Range = (3.5, 7.5)
     gland_ratio: Range = (5.0, 16.0)
