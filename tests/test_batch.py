@@ -566,25 +566,26 @@ def test_a_cluster_gives_the_same_results_and_names_what_failed(cluster):
     assert strange.error == "LocalError: cannot travel 7"
 
 
-def profiling(_item: int) -> list[str]:
-    from distributed import get_worker
-
-    return sorted(
-        name for name, one in get_worker().periodic_callbacks.items() if "profile" in name and one.is_running()
-    )
-
-
 @pytest.mark.slow
-def test_workers_of_a_cluster_do_not_profile_while_a_batch_runs(cluster):
+def test_workers_of_a_cluster_do_not_profile_while_a_batch_runs(cluster, child_environment):
     # the profiler made workers of a campaign grow by 0.4 MB an exam, to 560 MB
     from distributed import Client
 
-    with open_executor(cluster=cluster[0]) as executor:
-        (during,) = run_batch(profiling, [0], key=str, executor=executor)
+    def profiling(dask_worker):
+        callbacks = dask_worker.periodic_callbacks.items()
+        return sorted(name for name, one in callbacks if "profile" in name and one.is_running())
+
+    options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
     with Client(cluster[0]) as client:
-        after = client.submit(profiling, 0, pure=False).result()
-    assert during.value == []
-    assert after == ["profile", "profile-cycle"]
+        with open_executor(cluster=cluster[0]):
+            during = [*client.run(profiling).values()]
+            with running(child_environment, "worker", cluster[0], *options) as late:
+                address_in(late, "Registered to:")
+                with_another = [*client.run(profiling).values()]
+        after = [*client.run(profiling).values()]
+    assert during == [[]]
+    assert with_another == [[], []]
+    assert after == [["profile", "profile-cycle"]]
 
 
 @pytest.mark.slow
