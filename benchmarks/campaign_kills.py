@@ -23,8 +23,9 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.campaign_scale import JOURNAL, entries
+from benchmarks.campaign_scale import entries
 from benchmarks.campaign_scans import Faults, make
+from tactile_bayes.files.campaign_names import JOURNAL
 
 MOST_CPU_S, GRACE_S = 9.0, 10.0
 

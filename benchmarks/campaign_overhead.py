@@ -24,16 +24,17 @@ from unittest import mock
 
 import psutil
 
-from benchmarks.campaign_scale import JOURNAL, PORT, Cluster, Watch, entries
+from benchmarks.campaign_scale import PORT, Cluster, Watch, entries
 from tactile_bayes.batch import run_batch
 from tactile_bayes.executors import open_executor
+from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, JOURNAL
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline import campaign as campaigns
 from tactile_bayes.pipeline import campaign_report, campaign_stages, campaign_tables
-from tactile_bayes.pipeline.campaign_folder import EXAMS, open_campaign
+from tactile_bayes.pipeline.campaign_folder import open_campaign
 from tactile_bayes.pipeline.campaign_inputs import Sources
 from tactile_bayes.pipeline.campaign_settings import CampaignSettings
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, Task
+from tactile_bayes.pipeline.campaign_steps import Task
 
 
 @contextmanager

@@ -31,8 +31,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from tactile_bayes.files.campaign_names import JOURNAL
+
 PORT, SAMPLE_S, WORKERS = 18786, 5.0, 2
-JOURNAL = "campaign.journal"
 
 
 class Watch:

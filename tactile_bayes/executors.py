@@ -176,6 +176,9 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
                 "give the address it prints"
             ) from None
         _check_workers(client, address)
+        from tactile_bayes.worker_profile import without_profile
+
+        stack.enter_context(without_profile(client))
         workers = stack.enter_context(client.get_executor(pure=False))
         yield ClusterWorkers(workers, sum(client.nthreads().values()))
 

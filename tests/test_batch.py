@@ -567,6 +567,28 @@ def test_a_cluster_gives_the_same_results_and_names_what_failed(cluster):
 
 
 @pytest.mark.slow
+def test_workers_of_a_cluster_do_not_profile_while_a_batch_runs(cluster, child_environment):
+    # the profiler made workers of a campaign grow by 0.4 MB an exam, to 560 MB
+    from distributed import Client
+
+    def profiling(dask_worker):
+        callbacks = dask_worker.periodic_callbacks.items()
+        return sorted(name for name, one in callbacks if "profile" in name and one.is_running())
+
+    options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
+    with Client(cluster[0]) as client:
+        with open_executor(cluster=cluster[0]):
+            during = [*client.run(profiling).values()]
+            with running(child_environment, "worker", cluster[0], *options) as late:
+                address_in(late, "Registered to:")
+                with_another = [*client.run(profiling).values()]
+        after = [*client.run(profiling).values()]
+    assert during == [[]]
+    assert with_another == [[], []]
+    assert after == [["profile", "profile-cycle"]]
+
+
+@pytest.mark.slow
 def test_a_scheduler_killed_in_the_middle_is_one_line_and_what_is_done_is_kept(child_environment, tmp_path):
     pytest.importorskip("distributed", reason="the [cluster] extra is not installed")
     script = tmp_path / "run.py"

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import write_text
+from tactile_bayes.files.campaign_names import exam_name, mass_name
 from tactile_bayes.files.remote import check_address, is_address
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.shipped import NONE, SHIPPED
@@ -67,12 +68,12 @@ class Exam:
     @property
     def of_mass(self) -> str:
         """Name of the mass at this visit, which is also its folder's."""
-        return f"{self.patient}.v{self.visit}.m{self.mass}"
+        return mass_name(patient=self.patient, visit=self.visit, mass=self.mass)
 
     @property
     def name(self) -> str:
         """Name of the exam, which is also its folder's."""
-        return f"{self.of_mass}.r{self.replicate}"
+        return exam_name(self.of_mass, self.replicate)
 
     @property
     def order(self) -> tuple[Any, ...]:

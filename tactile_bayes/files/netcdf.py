@@ -109,6 +109,7 @@ def _write_dimensions(place: Any, variables: Mapping[str, Variable], *, first: i
         else:
             scale = place.create_dataset(name, shape=(length,), dtype=">f4")
             scale.make_scale(_NO_VARIABLE.format(length))
+            scale.flush()
         scale.attrs["_Netcdf4Dimid"] = np.int32(number)
         scales[name] = scale
     return scales
@@ -128,6 +129,7 @@ def _write_values(place: Any, name: str, variable: Variable) -> Any:
         written.attrs["scale_factor"] = np.float64(variable.scale)
     for key, text in variable.attributes.items():
         written.attrs[key] = text
+    written.flush()  # else its chunks get their place when its last reference goes, and a profiler may hold one
     return written
 
 

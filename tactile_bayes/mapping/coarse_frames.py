@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,30 @@ LEAST_REACH_MM = 10.0
 _CHUNK = 512
 
 IndexArray = NDArray[np.intp]
+
+
+def stretches(time_s: FloatArray) -> IndexArray:
+    """(n,) which stretch of `POOL_S` each frame lies in, counting those that hold a frame; times rise.
+
+    Not by the clock: of frames that come regularly, but less often, every so-many-th stretch might hold none.
+    """
+    return np.cumsum(np.diff(_slot(time_s), prepend=_slot(time_s[:1])) != 0)
+
+
+def thinning(times_s: Iterable[FloatArray], *, most: int) -> int:
+    """Of how many stretches one is averaged, so that scans with frames at these times give `most` at most, or so."""
+    return max(1, -(-sum(int(stretches(one)[-1]) + 1 for one in times_s if len(one)) // most))
+
+
+def every_stretch(time_s: FloatArray, every: int) -> IndexArray:
+    """Indices of the frames in every so-many-th of the `stretches`, at least of one; the clock says in which first."""
+    number = stretches(time_s)
+    chosen = (_slot(time_s[:1]) + number) % every == 0
+    return np.flatnonzero(chosen if chosen.any() else number == 0)
+
+
+def _slot(time_s: FloatArray) -> FloatArray:
+    return np.asarray(np.floor(time_s / POOL_S))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,8 +87,7 @@ class CoarseFrames:
         good, scan = selection.good_taxels, selection.scan
         readout = Readout.of(scan.element_calibration, good)
         weight, row, block, basis = _taxel_blocks(good)
-        slot = np.floor(scan.frames.time_s[frames] / POOL_S)
-        first = np.flatnonzero(np.diff(slot, prepend=slot[:1] - 1) != 0)
+        first = np.flatnonzero(np.diff(stretches(scan.frames.time_s[frames]), prepend=-1))
         pooled = np.empty((len(frames), weight.shape[1]))
         for part in chunks(len(frames), _CHUNK):
             chosen = frames[part]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse
-from tactile_bayes.mapping.coarse_frames import POOL_S, CoarseFrames, block_means
+from tactile_bayes.mapping.coarse_frames import CoarseFrames, block_means, every_stretch, thinning
 from tactile_bayes.mapping.frame_sample import MOST_STEPS, STEP, FrameSample
 from tactile_bayes.mapping.frames import SelectedFrames
 
@@ -22,8 +22,8 @@ def sample_frames(selections: Sequence[SelectedFrames], plane: Plane) -> FrameSa
     The scans are of one head. Only blocks that have a good taxel in all of them are kept.
     """
     used = [part for part in selections if part.used.any()]
-    every = _every(used)
-    parts = [found for part in used if (found := _averaged(part, plane, every)) is not None]
+    every = thinning((part.scan.frames.time_s[part.used] for part in used), most=MOST_FRAMES)
+    parts = [_averaged(part, plane, every) for part in used]
     if not parts:
         return None
     shared = set.intersection(*(set(part.block.tolist()) for part, _, _ in parts))
@@ -36,19 +36,10 @@ def sample_frames(selections: Sequence[SelectedFrames], plane: Plane) -> FrameSa
     return FrameSample(steps * STEP, np.round(turns, _PLACE_DIGITS), np.round(parts[0][2][chosen[0]], _PLACE_DIGITS))
 
 
-def _every(parts: Sequence[SelectedFrames]) -> int:
-    """Of how many stretches of `POOL_S` one is kept."""
-    times = [part.scan.frames.time_s[part.used] for part in parts]
-    slots = sum(float(np.ptp(one)) / POOL_S + 1.0 for one in times)
-    return max(1, int(np.ceil(slots / MOST_FRAMES)))
-
-
-def _averaged(part: SelectedFrames, plane: Plane, every: int) -> tuple[CoarseFrames, FloatArray, FloatArray] | None:
+def _averaged(part: SelectedFrames, plane: Plane, every: int) -> tuple[CoarseFrames, FloatArray, FloatArray]:
     """A scan's averaged frames, their rows of the transform to the plane, and the blocks' (k, 3) places."""
     frames = np.flatnonzero(part.used)
-    frames = frames[np.floor(part.scan.frames.time_s[frames] / POOL_S) % every == 0]
-    if not len(frames):
-        return None
+    frames = frames[every_stretch(part.scan.frames.time_s[frames], every)]
     coarse = CoarseFrames.of(part, frames)
     rotation, lever = part.poses.rotation[frames], inverse(part.scan.head.scanhead_from_tracker)
     turn = plane.plane_from_base[:3, :3] @ rotation @ lever[:3, :3]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.coarse_frames import POOL_S, CoarseFrames
+from tactile_bayes.mapping.coarse_frames import CoarseFrames, every_stretch, thinning
 from tactile_bayes.mapping.shift_fit import ShiftFit
 from tactile_bayes.mapping.source import Source
 from tactile_bayes.mapping.strokes import find_strokes
@@ -32,18 +32,14 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
     One linear step from no shift, so a figure above 1 mm is rough. The standard error holds errors that frames share
     over 0.2 s.
     """
-    total = sum(len(source.frames) for source in sources)
-    slots = sum(np.ptp(source.selection.scan.frames.time_s[source.frames]) for source in sources if len(source.frames))
-    every = max(1, int(np.ceil(slots / POOL_S / MOST_FRAMES)))
-    if not total:
-        return {}
+    every = thinning((source.selection.scan.frames.time_s[source.frames] for source in sources), most=MOST_FRAMES)
     parts, places, moves, blocks = [], [], [], []
     for number, source in enumerate(sources):
         way = np.ones(len(source.frames))
         for stroke in find_strokes(source, number):
             way[stroke.start : stroke.stop] = stroke.direction
         time_s = source.selection.scan.frames.time_s
-        kept = np.flatnonzero(np.floor(time_s[source.frames] / POOL_S) % every == 0)
+        kept = every_stretch(time_s[source.frames], every)
         if not len(kept):
             continue
         coarse = CoarseFrames.of(source.selection, source.frames[kept])
@@ -54,6 +50,8 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
         places.append(place)
         moves.append(move)
         blocks.append(coarse.blocks(time_s))
+    if not parts:
+        return {}
     ways = np.concatenate([move[:, 0, 0] for move in moves])
     if not (np.any(ways > 0) and np.any(ways < 0)):
         return {}

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.coarse_frames import LEAST_REACH_MM, POOL_S, CoarseFrames, IndexArray, stroke_starts
+from tactile_bayes.mapping.coarse_frames import (
+    LEAST_REACH_MM,
+    POOL_S,
+    CoarseFrames,
+    IndexArray,
+    every_stretch,
+    stroke_starts,
+)
 from tactile_bayes.mapping.project import Projection
 from tactile_bayes.mapping.shift_fit import ShiftFit
 from tactile_bayes.mapping.source import Source
@@ -157,7 +164,7 @@ class _Part:
         time_s = source.selection.scan.frames.time_s
         readings = len(source.frames) * 5e-3 / POOL_S * source.readout.size / 4 if len(time_s) else 0.0
         every = int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))
-        kept = np.flatnonzero(np.floor(time_s[source.frames] / POOL_S) % max(every, 1) == 0)
+        kept = every_stretch(time_s[source.frames], max(every, 1))
         coarse = CoarseFrames.of(source.selection, source.frames[kept])
         first = next(n for n, one in enumerate(strokes) if one.scan == number)
         starts = [one.start for one in strokes if one.scan == number]

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, MAP, MASSES, REPEATABILITY, SHAPE
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.pipeline.campaign_copies import copy_tasks
-from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
 from tactile_bayes.pipeline.campaign_inputs import READ, read_sources, same_bytes
 from tactile_bayes.pipeline.campaign_keys import digest_of
 from tactile_bayes.pipeline.campaign_match import Breasts, NamedPlace
@@ -37,7 +37,7 @@ from tactile_bayes.pipeline.campaign_repeatability import (
 )
 from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 from tactile_bayes.pipeline.campaign_stages import CampaignState, Fault, Progress, Stages, untold
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, MAP, REPEATABILITY, SHAPE, Task
+from tactile_bayes.pipeline.campaign_steps import Task
 from tactile_bayes.pipeline.settings import Settings
 
 if TYPE_CHECKING:

@@ -13,12 +13,11 @@ from typing import Final
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
+from tactile_bayes.files.campaign_names import EXAMS, JOURNAL, MASSES
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.campaign_keys import stamp
 from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
 
-JOURNAL: Final = "campaign.journal"
-EXAMS, MASSES = "exams", "masses"
 _HEADER: Final = {"campaign": 1}
 _LATEST: Final = 1000
 """So many results of a step tell how long it takes."""

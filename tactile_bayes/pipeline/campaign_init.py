@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.campaign_names import JOURNAL
 from tactile_bayes.files.manifest_csv import natural
 from tactile_bayes.files.remote import check_address, fetched, files_below
-from tactile_bayes.pipeline.campaign_folder import JOURNAL
 from tactile_bayes.records import dataclass
 
 _FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}

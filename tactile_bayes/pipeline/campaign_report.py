@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.pipeline.campaign import Campaign
-from tactile_bayes.pipeline.campaign_folder import EXAMS, JOURNAL
-from tactile_bayes.pipeline.campaign_steps import (
+from tactile_bayes.files.campaign_names import (
+    DONE,
     ESTIMATE,
+    EXAMS,
+    FAILURES,
+    JOURNAL,
     MAP,
     MAP_FIGURE,
     REPEATABILITY,
@@ -20,8 +22,10 @@ from tactile_bayes.pipeline.campaign_steps import (
     SIZED,
     SIZED_FIGURE,
     THUMBNAIL,
+    TRIAL,
 )
-from tactile_bayes.pipeline.campaign_tables import DONE, FAILURES, TRIAL, Row, exam_rows, write_tables
+from tactile_bayes.pipeline.campaign import Campaign
+from tactile_bayes.pipeline.campaign_tables import Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:

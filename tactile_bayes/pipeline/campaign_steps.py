@@ -13,6 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.campaign_names import (
+    ESTIMATE,
+    MAP,
+    MAP_FIGURE,
+    POOLED,
+    POOLED_DRAWS,
+    POSTERIOR,
+    REPEATABILITY,
+    SCAN,
+    SHAPE,
+    SIZE_FIGURE,
+    SIZED,
+    SIZED_FIGURE,
+    THUMBNAIL,
+)
 from tactile_bayes.pipeline.campaign_keys import stamp
 from tactile_bayes.pipeline.campaign_match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.pipeline.settings import Settings
@@ -25,10 +40,6 @@ if TYPE_CHECKING:
     from tactile_bayes.pipeline.repeatability import ExamFolder
     from tactile_bayes.scan import Scan
 
-SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
-SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.png", "size.png"
-POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"
-REPEATABILITY, SIZED, SIZED_FIGURE = "repeatability.json", "sized.json", "sized.png"
 FILES: Final = {
     "map": (SCAN, MAP),
     "estimate": (ESTIMATE, POSTERIOR, SHAPE, THUMBNAIL),

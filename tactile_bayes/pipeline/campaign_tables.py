@@ -8,15 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, MASSES, POOLED, SIZED, TRIAL
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.manifest_csv import Exam, table_text
 from tactile_bayes.pipeline.campaign import Campaign
-from tactile_bayes.pipeline.campaign_folder import EXAMS, MASSES
 from tactile_bayes.pipeline.campaign_match import unnamed
-from tactile_bayes.pipeline.campaign_steps import ESTIMATE, POOLED, SIZED
 from tactile_bayes.records import dataclass
 
-DONE, FAILURES, TRIAL = "exams_done.csv", "failures.csv", "trial.csv"
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
 _TRIAL_COLUMNS: Final = (
     "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",

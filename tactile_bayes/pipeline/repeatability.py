@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from tactile_bayes.size.repeatability import Repeatability
 
 COMMAND: Final = "calibrate repeatability"
-_ESTIMATE, _SHAPE = "estimate.json", "shape.npz"
 _AGAIN: Final = "run the campaign again"
 _LEARN: Final = "learn one from exams that were sized so: `calibrate repeatability`; or leave --repeatability out"
 
@@ -86,7 +86,7 @@ class _Repeat:
 
     @property
     def shape_path(self) -> Path:
-        return self.exam.folder / _SHAPE
+        return self.exam.folder / SHAPE
 
 
 def exams_in(folder: Path) -> list[ExamFolder]:
@@ -99,9 +99,9 @@ def exams_in(folder: Path) -> list[ExamFolder]:
     """
     from tactile_bayes.files.tables import read_raw
 
-    table = folder / "exams_done.csv"
+    table = folder / DONE
     if not table.is_file():
-        raise BadDataError("holds no exams_done.csv", way_out="give a folder of `campaign run`", path=str(folder))
+        raise BadDataError(f"holds no {DONE}", way_out="give a folder of `campaign run`", path=str(folder))
     _, rows = read_raw(table)
     found = []
     for row in rows:
@@ -109,11 +109,11 @@ def exams_in(folder: Path) -> list[ExamFolder]:
             patient, visit, mass, replicate = (row[name] for name in ("patient", "visit", "mass", "replicate"))
         except KeyError as missing:
             raise BadDataError(f"has no column {missing}", way_out=_AGAIN, path=str(table)) from None
-        of_mass = f"{patient}.v{visit}.m{mass}"
-        name = f"{of_mass}.r{replicate}"
+        of_mass = mass_name(patient=patient, visit=visit, mass=mass)
+        name = exam_name(of_mass, replicate)
         if Path(name).name != name:
             raise BadDataError(f"names an exam {name!r}", way_out=_AGAIN, path=str(table))
-        found.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / "exams" / name))
+        found.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / EXAMS / name))
     return found
 
 
@@ -209,7 +209,7 @@ def _read(exam: ExamFolder) -> _Repeat | None:
     from tactile_bayes.files.provenance import scans_of
     from tactile_bayes.files.schema import check_document
 
-    path = exam.folder / _ESTIMATE
+    path = exam.folder / ESTIMATE
     document: Any = load_json(path, way_out=_AGAIN)
     check_document(document, "estimate.schema.json", path=path)
     if document["max_size_mm"] is None:
@@ -225,7 +225,7 @@ def _read(exam: ExamFolder) -> _Repeat | None:
         calibration,
         digests.get("size_calibration", ""),
         tuple(sorted(scan["sha256"] for scan in scans_of(provenance) if "sha256" in scan)),
-        sha256(exam.folder / _SHAPE),
+        sha256(exam.folder / SHAPE),
         document["max_size_mm"],
         document["diagnostics"].get("between_map_sd") or 0.0,
     )
