@@ -313,8 +313,8 @@ def test_two_sets_of_an_independent_model_give_one_shift_where_their_design_is_s
 
     sets = [shift(seat, stated=True) for seat in ("centred", "resting")]
     apart = abs(sets[0][0] - sets[1][0]) / np.sqrt(sets[0][1] + sets[1][1])
-    assert apart < 1.0  # 2 % of a size; 8 to 15 % where what is stated of a body counts by the spread of all bodies
-    assert all(abs(one) < 0.15 and left < 0.14 for one, _, left in sets)
+    assert apart < 1.96  # 7 to 8 % of a size: the stiffest lumps, in the seats at both ends of the range (record 0118)
+    assert all(abs(one) < 0.18 and left < 0.14 for one, _, left in sets)  # +6 and +10 %, Eq 6 +12 and +17 %
     # the control: without depth and seat the sets' design is taken for scatter
     assert all(shift(seat, stated=False)[2] > 0.2 for seat in ("centred", "resting"))
 
