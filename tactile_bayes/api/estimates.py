@@ -194,7 +194,7 @@ class SizeEstimate(Sized):
         """
         if self.status != "estimate":
             raise UsageError(f"there are no draws to write: {self.why}")
-        self.outcome.write(path_of(path), force=force)
+        self.outcome.write(path_of(path), document=self.answer.document, force=force)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

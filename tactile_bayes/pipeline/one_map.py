@@ -71,8 +71,14 @@ class Outcome:
     settings: Settings
     calibration: Calibration | None = None
 
-    def write(self, path: Path, *, force: bool = False) -> None:
-        """Write all draws, and what goes with them, as netCDF that arviz opens."""
+    def write(self, path: Path, *, document: Mapping[str, Any] | None = None, force: bool = False) -> None:
+        """Write all draws, and what goes with them, as netCDF that arviz opens.
+
+        Parameters
+        ----------
+        document
+            The JSON object of `answer_of`, where it was made already.
+        """
         import numpy as np
 
         from tactile_bayes.files.posterior_nc import write_posterior
@@ -82,7 +88,8 @@ class Outcome:
         groups = inference_groups(
             self.estimate, calibration=self.calibration, size_priors=size_priors(self.settings), rng=rng
         )
-        write_posterior(path, self.estimate, provenance=self.provenance, groups=groups, force=force)
+        told = document or answer_of(self).document
+        write_posterior(path, self.estimate, provenance=self.provenance, groups=groups, document=told, force=force)
 
 
 def answer_file(path: Path, *, settings: Settings) -> Answer:

@@ -24,7 +24,7 @@ def compare_summary(document: Mapping[str, Any]) -> str:
     lines += [_visit_line(one) for one in shown]
     lines += _place_line(document["places"][-1])
     lines += [_change_line(last), _odds_line(last), _verdict_line(last)]
-    lines += _rate_lines(document, last)[:1] + _another_line(last)
+    lines += _rate_lines(document, last)[:1] + _site_line(document) + _another_line(last)
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
@@ -42,7 +42,7 @@ def compare_text(document: Mapping[str, Any]) -> str:
         lines += _rate_lines({"trend": None}, change) + _another_line(change)
     lines += [""] if document["trend"] is not None else []
     lines += _trend_lines(document["trend"])
-    lines.append(_model_line(document))
+    lines += [*_site_line(document), _model_line(document)]
     if document["left_out"]:
         lines.append(f"Left out: {'; '.join(document['left_out'])}.")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
@@ -132,6 +132,12 @@ def _another_line(change: Mapping[str, Any]) -> list[str]:
     odds = f"{q['low']:+.0f} to {q['high']:+.0f} %, probability of growth {_odds(another['probability_grown'])}"
     lost = change["verdict"] != "no_change_shown" and another["verdict"] == "no_change_shown"
     return [f"If exams of one mass differ by {spread:.0f} %: {odds}{': no change shown then' if lost else ''}."]
+
+
+def _site_line(document: Mapping[str, Any]) -> list[str]:
+    """Whose spread between exams the intervals and the smallest detectable change suppose, where it was learned."""
+    words = document.get("repeatability", "")
+    return [f"{words[0].upper()}{words[1:]}; the figures above are for such exams."] if words else []
 
 
 def _model_line(document: Mapping[str, Any]) -> str:

@@ -51,14 +51,9 @@ def size_sentences(exam: Exam) -> Iterator[str]:
     document, size = exam.main.document if exam.pooled is None else exam.pooled, largest(exam)
     if size is None:
         return
-    spread, share = exam.figures.get("between_map_sd"), _percent(size)
+    share = _percent(size)
     yield f"The largest diameter is about {size['median']:.1f} mm (the middle of its probable values)."
-    alike = ""
-    if spread is not None:
-        alike = f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
-        if exam.pooled is not None:
-            alike = f"; exams of a lump are taken to differ by {100 * spread:.0f} %, learned from these maps"
-    yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{alike}."
+    yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{_supposed(exam)}."
     if document.get("another_exam") is not None:
         other, sd = document["another_exam"]["max_size_mm"], document["another_exam"]["between_map_sd"]
         apart = f"If exams of a lump differ by {100 * sd:.0f} %, as those of patients did in the published trial"
@@ -76,11 +71,33 @@ def size_sentences(exam: Exam) -> Iterator[str]:
         yield shape_text(exam.figures)
 
 
+def _supposed(exam: Exam) -> str:
+    """What the size's interval supposes of the spread between exams, and where that is from."""
+    spread = exam.figures.get("between_map_sd")
+    if spread is None:
+        return ""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    at_site = document.get("repeatability") or exam.figures.get("repeatability")
+    if at_site and exam.pooled is None:
+        return f"; {at_site}"
+    told = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"
+    if at_site:
+        return f"{told}, by these maps and this site's other exams"
+    stated = document["provenance"]["settings"].get("between_map_sd")
+    if stated is not None:
+        return f"{told}, as was stated"
+    if exam.pooled is not None:
+        return f"{told}, learned from these maps"
+    return f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
+
+
 def nothing_sentences(exam: Exam) -> Iterator[str]:
     """Why there is no size, what would help, and what was covered."""
     document = exam.main.document if exam.pooled is None else exam.pooled
     if exam.main.document["reason_code"] in UNDETECTED:
-        yield f"No lump was found in the area that was covered: {covered_text(exam.main.tactile_map)}."
+        tactile_map = exam.main.tactile_map
+        area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
+        yield f"No lump was found in the area that was covered{area}."
         chance = exam.main.document["detected_probability"]
         if chance is not None:
             yield f"Probability that the likeliest rise on the map is a lump: {chance_text(chance)}."
@@ -119,7 +136,11 @@ def short_place(mass: ExamMass) -> str:
 def why_no_clock(exam: Exam) -> str:
     """Why the page tells no place by the clock, where a patient was scanned; empty where it does."""
     tactile_map = exam.main.tactile_map
-    if tactile_map.patient_from_plane is None or any(mass.place is not None for mass in exam.main.masses):
+    if (
+        tactile_map is None
+        or tactile_map.patient_from_plane is None
+        or any(mass.place is not None for mass in exam.main.masses)
+    ):
         return ""
     lacks = ["nipple"] if tactile_map.nipple_mm is None else []
     lacks += [] if any(scan.get("side") in ("left", "right") for scan in exam.scans) else ["side"]
@@ -157,7 +178,16 @@ def caution_sentences(exam: Exam) -> list[str]:
 
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     """Rows of the table on how good the exam was."""
-    tactile_map = exam.main.tactile_map
+    if exam.main.tactile_map is not None:
+        yield from _scan_rows(exam.main.tactile_map)
+    yield "array calibration", _age(exam)
+    calibration = exam.main.document["provenance"]["settings"].get("size_calibration")
+    if calibration:
+        yield "size calibration", str(calibration)[:60]
+
+
+def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """Rows on what was scanned, and how."""
     quality = tactile_map.quality
     yield "covered", covered_text(tactile_map)
     if reach := reach_text(tactile_map):
@@ -174,10 +204,6 @@ def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     if tactile_map.masked_taxels:
         yield "taxels", f"{len(tactile_map.masked_taxels)} left out as faulty"
     yield "landmarks", _landmarks(tactile_map)
-    yield "array calibration", _age(exam)
-    calibration = exam.main.document["provenance"]["settings"].get("size_calibration")
-    if calibration:
-        yield "size calibration", str(calibration)[:60]
 
 
 def covered_text(tactile_map: TactileMap) -> str:
