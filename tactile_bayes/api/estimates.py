@@ -125,6 +125,9 @@ class SizeEstimate(Sized):
         shapes = {name: draws for name in _SHAPES if (draws := self._of_shape(name)) is not None}
         return {**super()._columns(), **shapes}
 
+    def _groups(self) -> dict[str, Any]:
+        return {name: (group.arrays, group.notes) for name, group in self.outcome.groups().items()}
+
     @cached_property
     def answer(self) -> Answer:
         """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""

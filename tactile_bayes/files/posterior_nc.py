@@ -178,7 +178,7 @@ def read_estimate(path: Path) -> dict[str, Any]:
     if "estimate" not in attributes:
         what = "holds draws without their estimate, as earlier versions wrote it"
         raise BadDataError(what, way_out="give its map, or write it again with `estimate -o`", path=str(path))
-    document = parse_json(attributes["estimate"])
+    document: Any = parse_json(attributes["estimate"])
     check_document(document, "estimate.schema.json", path=path)
     found: dict[str, Any] = document
     return found

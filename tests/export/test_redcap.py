@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from export_files import exported
 
-from tactile_bayes.export.redcap import COMPLETE
+from tactile_bayes.exports.redcap import COMPLETE
 
 # REDCap's help: 18 columns; names of lower-case letters, digits and underscores that begin with a letter, at most 26
 # characters advised; field types; validation types; a choice is "CODE, LABEL", parted by " | ".
