@@ -87,7 +87,7 @@ def test_an_estimate_without_its_map_has_a_page_that_says_what_it_lacks(folder: 
     run_here("report", "a.nc", "a.json", "-o", "with_map.html", "--force", cwd=folder)
     lines = with_map.read_text().splitlines()
     told = [
-        line for line in lines if "diameter is about" in line or "of the xiphoid and" in line and "<tr>" not in line
+        line for line in lines if "diameter is about" in line or ("of the xiphoid and" in line and "<tr>" not in line)
     ]
     assert len(told) == 3
     assert all(line in page for line in told)
