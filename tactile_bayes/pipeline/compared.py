@@ -64,7 +64,8 @@ def compare_answers(
         When the maps were normalised in several ways, one was made with another head than the calibration's, or the
         site's repeatability is of sizes by another calibration.
     UsageError
-        When there are fewer than two visits, days do not fit, or the calibration cannot pool maps.
+        When there are fewer than two visits, two maps are of one scan, days do not fit, or the calibration cannot pool
+        maps.
     """
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.report.compare_document import compare_document
@@ -76,6 +77,7 @@ def compare_answers(
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
     every = list(chain.from_iterable(visits))
     path, calibration = common_calibration(every, settings, names=list(chain.from_iterable(names)))
+    _refuse_repeated(visits, list(chain.from_iterable(names)))
     digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
     check_repeatability(settings, calibration, digests)
     compared = _compared(visits, calibration, settings, comparing)
@@ -251,6 +253,14 @@ def _place(answer: Answer) -> Place | None:
         return None
     x, y = centre["x"], centre["y"]
     return Place(np.array([x["median"], y["median"]]), np.diag([x["sd"] ** 2, y["sd"] ** 2]))
+
+
+def _refuse_repeated(visits: Sequence[Sequence[Answer]], names: Sequence[str]) -> None:
+    """Refuse two maps of one scan: they are no two exams, and less apart than those would be."""
+    from tactile_bayes.files.provenance import repeated_scans
+
+    for index, earlier in repeated_scans([_scans([one]) for one in chain.from_iterable(visits)]).items():
+        raise UsageError(f"{names[index]} and {names[earlier]} are of one scan; give one map of each scan")
 
 
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:

@@ -169,6 +169,10 @@ def caution_sentences(exam: Exam) -> list[str]:
             found.insert(0, f"Caution: the fat under the head is {depths} mm deep on two maps: are they of one mass?")
         if any(len(one.masses) > 1 for one in exam.maps):
             found.insert(0, "To check: a map shows several masses; was every map sized at the same one?")
+        told_of_maps = [
+            f"Caution: {text}." for one in exam.pooled["maps"] for text in one.get("broken_assumptions", [])
+        ]
+        found = [*(text for text in told_of_maps if text not in found), *found]
         apart = [one["map"] for one in exam.pooled["maps"] if one["outlying"]]
         found += [f"To check: apart from the others: {', '.join(apart)}."] if apart else []
     told = list(dict.fromkeys(found))
@@ -194,7 +198,7 @@ def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         yield "reaches", reach
     if "mean_pressure_kpa" in quality:
         window = tactile_map.recipe.pressure_window_kpa
-        asked = "" if window is None else f" (wanted {window[0]:g} to {window[1]:g})"
+        asked = "" if window is None else f" (wanted {window[0]:g} to {window[1]:g} kPa)"
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
         yield "pressure", f"mean {quality['mean_pressure_kpa']:.1f} kPa, nine frames in ten {ends}{asked}"
     if "frames_total" in quality:
