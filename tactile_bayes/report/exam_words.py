@@ -9,15 +9,18 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.geometry import apply
-from tactile_bayes.mapping.clock_face import clock_text
+from tactile_bayes.mapping.clock_face import SIDES, clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
+from tactile_bayes.report.lump_place import side_of
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
 
 UNDETECTED: Final = ("undetected", "empty")
 MOST_CAUTIONS: Final = 2
+MIDDLE_MM: Final = 20.0
+"""So far from the xiphoid a lump is on that side of the body, whatever is wrong with the landmarks' direction."""
 _OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
@@ -175,9 +178,21 @@ def caution_sentences(exam: Exam) -> list[str]:
         found = [*(text for text in told_of_maps if text not in found), *found]
         apart = [one["map"] for one in exam.pooled["maps"] if one["outlying"]]
         found += [f"To check: apart from the others: {', '.join(apart)}."] if apart else []
-    told = list(dict.fromkeys(found))
+    told = list(dict.fromkeys([*_side_in_doubt(exam), *found]))
     more = len(told) - MOST_CAUTIONS
     return [*told[:MOST_CAUTIONS], f"And {more} more: see `estimate -v`."] if more > 0 else told
+
+
+def _side_in_doubt(exam: Exam) -> Iterator[str]:
+    """Caution where the landmarks put the lump on the other side of the body than the scans say."""
+    side = side_of(exam.scans)
+    lump = exam.main.masses[0].patient_mm if exam.main.masses else None
+    if side not in SIDES or lump is None or abs(lump[0]) < MIDDLE_MM:
+        return
+    other = "right" if lump[0] > 0 else "left"
+    if other != side:
+        place = f"the landmarks put the lump {abs(lump[0]):.0f} mm to the patient's {other} of the xiphoid"
+        yield f"Caution: the scan says {side} breast, and {place}: side or landmarks are wrong."
 
 
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:

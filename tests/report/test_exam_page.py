@@ -311,6 +311,16 @@ def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() ->
     assert page.named("svg", **{"class": "dial"}) == []
 
 
+def test_a_lump_on_the_other_side_of_the_body_than_the_scan_says_is_a_caution() -> None:
+    """The demo's lump lies to the patient's right of the xiphoid, where a left breast is not."""
+    words = {side: Page(exam_page(exam(({"side": side},)))).words for side in ("left", "right", "phantom", "")}
+    told = (
+        "Caution: the scan says left breast, and the landmarks put the lump 43 mm to the patient's right of the xiphoid"
+    )
+    assert told in words.pop("left")
+    assert all("landmarks put the lump" not in text for text in words.values())
+
+
 def test_a_nipple_off_the_map_is_pointed_to() -> None:
     tactile_map, document = demo()
     far = replace(tactile_map, nipple_mm=tactile_map.nipple_mm + np.array([200.0, 0.0, 0.0]))
