@@ -200,7 +200,7 @@ def test_a_scan_is_no_second_visit_and_no_second_exam(folder: Path) -> None:
     made = read_map(folder / "again.nc")
     finer = replace(made, mean=made.mean + 0.001)  # the same scan, mapped another way
     scans = [{"sha256": f"{0:064x}", "subject": "p1", "side": "left"}]
-    write_map(folder / "again.nc", finer, provenance=Provenance("test", {}, scans=scans))
+    write_map(folder / "again.nc", finer, provenance=Provenance("test", {}, scans=scans), force=True)
     for words in (("a0.nc", "--with", "again.nc"), ("a0.nc", "again.nc", "--with", "grown0.nc")):
         done = run(folder, *words)
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -294,6 +294,7 @@ def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     with_lump, without = exam().maps[0], without_lump().maps[0]
     size = {name: with_lump.document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
     pooled = {**size, "reason": "", "figures": with_lump.document["diagnostics"], "fat_apart_mm": None}
+    pooled["provenance"] = with_lump.document["provenance"]
     pooled["maps"] = [{"map": f"map {n}", "outlying": False} for n in (1, 2)]
     both = Exam((without, with_lump), pooled, SCANS)
     assert both.main is with_lump
@@ -315,7 +316,7 @@ def test_a_lump_on_the_other_side_of_the_body_than_the_scan_says_is_a_caution() 
     """The demo's lump lies to the patient's right of the xiphoid, where a left breast is not."""
     words = {side: Page(exam_page(exam(({"side": side},)))).words for side in ("left", "right", "phantom", "")}
     told = (
-        "Caution: the scan says left breast, and the landmarks put the lump 43 mm to the patient's right of the xiphoid"
+        "Caution: the scan says left breast, and the landmarks put the lump 60 mm to the patient's right of the xiphoid"
     )
     assert told in words.pop("left")
     assert all("landmarks put the lump" not in text for text in words.values())
