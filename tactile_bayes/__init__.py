@@ -8,8 +8,10 @@
 - `compare`: from the maps of two visits to the change of a mass's size
 - `calibrate_size`, `validate`: from tables to a size calibration, or to a trial's report
 - `calibrate_repeatability`: from a campaign's folder to the spread between exams of one mass at its site
+- `export`: from maps and estimates to DICOM, FHIR, NRRD and CSV
 - `record`: from devices to a scan
-- `Map`, `SizeEstimate`, `PooledSize`, `Comparison`, `TrialResult`, `Draws`: what they return; `errors`: what they raise
+- `Map`, `SizeEstimate`, `PooledSize`, `Comparison`, `TrialResult`, `ExportedFiles`, `Draws`: what they return;
+  `errors`: what they raise
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Comparison",
     "Draws",
+    "ExportedFiles",
     "Map",
     "PooledSize",
     "SizeEstimate",
@@ -33,6 +36,7 @@ __all__ = [
     "demo_scan",
     "errors",
     "estimate",
+    "export",
     "pool",
     "read_map",
     "read_scan",
@@ -44,6 +48,7 @@ __all__ = [
 _HOME = {
     "Comparison": "api.comparisons",
     "Draws": "api.draws",
+    "ExportedFiles": "api.exporting",
     "Map": "api.maps",
     "PooledSize": "api.estimates",
     "SizeEstimate": "api.estimates",
@@ -55,6 +60,7 @@ _HOME = {
     "demo_map": "api.maps",
     "demo_scan": "api.maps",
     "estimate": "api.estimates",
+    "export": "api.exporting",
     "pool": "api.estimates",
     "read_map": "api.maps",
     "read_scan": "api.maps",

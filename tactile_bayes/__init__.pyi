@@ -6,6 +6,8 @@ from tactile_bayes.api.estimates import PooledSize as PooledSize
 from tactile_bayes.api.estimates import SizeEstimate as SizeEstimate
 from tactile_bayes.api.estimates import estimate as estimate
 from tactile_bayes.api.estimates import pool as pool
+from tactile_bayes.api.exporting import ExportedFiles as ExportedFiles
+from tactile_bayes.api.exporting import export as export
 from tactile_bayes.api.maps import Map as Map
 from tactile_bayes.api.maps import build_map as build_map
 from tactile_bayes.api.maps import demo_map as demo_map

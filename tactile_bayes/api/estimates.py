@@ -125,6 +125,9 @@ class SizeEstimate(Sized):
         shapes = {name: draws for name in _SHAPES if (draws := self._of_shape(name)) is not None}
         return {**super()._columns(), **shapes}
 
+    def _groups(self) -> dict[str, Any]:
+        return {name: (group.arrays, group.notes) for name, group in self.outcome.groups().items()}
+
     @cached_property
     def answer(self) -> Answer:
         """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""
@@ -194,7 +197,7 @@ class SizeEstimate(Sized):
         """
         if self.status != "estimate":
             raise UsageError(f"there are no draws to write: {self.why}")
-        self.outcome.write(path_of(path), force=force)
+        self.outcome.write(path_of(path), document=self.answer.document, force=force)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -78,7 +78,7 @@ class Sized:
         return pandas.DataFrame({"chain": chain, "draw": draw, **values})
 
     def to_arviz(self) -> Any:
-        """The draws as arviz has them, one group ``posterior``.
+        """The draws as arviz has them, with the groups that `save` writes beside them for the estimate of a map.
 
         Raises
         ------
@@ -90,7 +90,11 @@ class Sized:
         columns = self._columns()
         if not columns:
             raise UsageError(f"there are no draws: {self.why}")
-        return inference_data({name: draws.values for name, draws in columns.items()})
+        return inference_data({name: draws.values for name, draws in columns.items()}, self._groups())
+
+    def _groups(self) -> dict[str, Any]:
+        """Arrays and notes of the groups besides ``posterior``."""
+        return {}
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self._words()}>"

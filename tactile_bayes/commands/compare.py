@@ -75,6 +75,11 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
     "--settings", "settings_file", metavar="FILE.toml", type=_FILE,
     help="As `estimate`; between_map_sd states the spread between exams of a visit."
 )  # fmt: skip
+@click.option(
+    "--repeatability", metavar="SITE.json", type=_FILE,
+    help="Spread between exams of one mass at this site, from `calibrate repeatability`. Default: two intervals, for "
+    "exams as alike as simulated ones and as the paper's."
+)  # fmt: skip
 @seed_option(_DEFAULTS.seed)
 @click.option(
     "--interval",
@@ -101,6 +106,7 @@ def command(
     size_calibration: str | None,
     method: str,
     settings_file: Path | None,
+    repeatability: Path | None,
     seed: int,
     interval: float,
     as_json: bool,
@@ -118,7 +124,7 @@ def command(
 
     Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92
     """
-    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.schema import check_document, dump_json
     from tactile_bayes.files.shipped import size_calibration_path
@@ -130,7 +136,14 @@ def command(
         same_mass=same_mass,
         registration_mm=registration_mm,
     )
-    settings = settings_of(settings_file, calibration=size_calibration, method=method, seed=seed, interval=interval)
+    settings = settings_of(
+        settings_file,
+        calibration=size_calibration,
+        method=method,
+        seed=seed,
+        interval=interval,
+        repeatability=repeatability_in(repeatability),
+    )
     visits = [first, *groups_of(later)]
     _check_maps(visits, settings)
     comparing.check_visits(len(visits))

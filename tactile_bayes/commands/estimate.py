@@ -231,16 +231,16 @@ def _one_map(
         outcome = estimate_file(
             path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
         )
-    tactile_map, estimate = outcome.tactile_map, outcome.estimate
+    tactile_map, estimate, answer = outcome.tactile_map, outcome.estimate, answer_of(outcome)
     if output and estimate.status == "estimate":
-        outcome.write(output, force=force)
+        outcome.write(output, document=answer.document, force=force)
     if any(figures):
         from tactile_bayes.report.estimate_figures import draw_figures
         from tactile_bayes.report.figure_title import named_exam
 
         name = named_exam(path.stem, outcome.provenance.scans)
         draw_figures(tactile_map, estimate, *figures, name=name, probability=settings.interval, force=force)
-    return answer_of(outcome)
+    return answer
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:

@@ -14,7 +14,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
-    from tactile_bayes.export.run import Exported
+    from tactile_bayes.exports.run import Exported
 
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 # Name of the part of an identity, metavar, help.
@@ -78,7 +78,9 @@ def command(
 
     Example: tactile-bayes export map.nc estimate.json --to dicom --study-date 2026-11-24T10:30 -o exam
     """
-    from tactile_bayes.export.run import export, refuse_untaken
+    from tactile_bayes.exports.exam import read_exam
+    from tactile_bayes.exports.run import export, refuse_untaken
+    from tactile_bayes.exports.worklist import identity_of
     from tactile_bayes.files.atomic import refuse_existing
 
     if not files and dictionary is None:
@@ -93,55 +95,25 @@ def command(
         if path is not None:
             refuse_existing(path, force=force)
     if files and output is not None:
-        exported = export(files, to=to, identity=_identity(worklist, given), id_from_scan=patient_id_from_scan)
+        who = identity_of(worklist, given)
+        exported = export(map(read_exam, files), to=to, identity=who, id_from_scan=patient_id_from_scan)
         _write(exported, output, force=force)
     if dictionary is not None:
         _write_dictionary(dictionary, force=force)
     click.echo(RESEARCH_USE)
 
 
-def _identity(worklist: Path | None, given: dict[str, str]) -> Any:
-    from tactile_bayes.export.identity import Identity
-
-    if worklist is None:
-        return Identity(**given)
-    from tactile_bayes.export.worklist import read_worklist
-
-    return read_worklist(worklist).with_options(given)
-
-
 def _write(exported: Exported, output: Path, *, force: bool) -> None:
-    from tactile_bayes.files.atomic import write_bytes
+    from tactile_bayes.exports.writing import write_exported
 
-    if "" not in exported.files:
-        _prepare_folder(output, set(exported.files), force=force)
-    for name, data in exported.files.items():
-        path = output / name if name else output
-        write_bytes(path, data, force=force)
-        click.echo(f"{path}: {len(data)} bytes")
+    for path in write_exported(exported, output, force=force):
+        click.echo(f"{path}: {path.stat().st_size} bytes")
     for note in exported.notes:
         click.echo(f"note: {note}", err=True)
 
 
-def _prepare_folder(folder: Path, names: set[str], *, force: bool) -> None:
-    """Make the folder, and refuse one in which the files would stand beside those of another export."""
-    from tactile_bayes.files.atomic import refuse_existing, unwritable
-
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        others = sorted({path.name for path in folder.glob("*.dcm")} - names)
-    except FileExistsError:
-        raise UsageError(f"{folder} is no folder; give the name of one for the DICOM files") from None
-    except OSError as error:
-        raise unwritable(folder, error) from None
-    if others:
-        raise UsageError(f"{folder} holds {others[0]} of another export; give another folder")
-    for name in sorted(names):
-        refuse_existing(folder / name, force=force)
-
-
 def _write_dictionary(path: Path, *, force: bool) -> None:
-    from tactile_bayes.export.redcap import dictionary_csv
+    from tactile_bayes.exports.redcap import dictionary_csv
     from tactile_bayes.files.atomic import write_text
 
     write_text(path, dictionary_csv(), force=force)

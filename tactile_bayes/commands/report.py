@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath, also_read
@@ -14,6 +15,7 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 
 _FILE = FilePath()
+_OF_ESTIMATE = ("size_calibration", "settings_file", "repeatability", "seed", "interval")
 _LONGEST = {"title": 60, "name": 50}
 
 
@@ -38,7 +40,7 @@ def _day(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
 
 
 @click.command("report")
-@click.argument("files", metavar="MAP.nc... [ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
+@click.argument("files", metavar="MAP.nc... [POST.nc|ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
 @click.option("-o", "--output", metavar="EXAM.html", required=True, type=_FILE, help="Page to write.")
 @click.option(
     "--pdf", metavar="EXAM.pdf", type=_FILE, help="Also print it to PDF, by an installed Chromium or WeasyPrint."
@@ -52,6 +54,12 @@ def _day(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
     help="Calibration from widths to sizes, as of `estimate`. Default: the one that fits the maps.",
 )
 @click.option("--settings", "settings_file", metavar="FILE.toml", type=_FILE, help="Settings, as of `estimate`.")
+@click.option(
+    "--repeatability",
+    metavar="SITE.json",
+    type=_FILE,
+    help="Spread between exams of one mass at this site, as of `estimate`. Default: two intervals.",
+)
 @seed_option(1)
 @click.option(
     "--interval",
@@ -61,7 +69,10 @@ def _day(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
     help="Probability of the intervals.",
 )
 @FORCE
+@click.pass_context
 def command(
+    ctx: click.Context,
+    /,
     *,
     files: tuple[Path, ...],
     output: Path,
@@ -71,6 +82,7 @@ def command(
     day: str,
     size_calibration: str | None,
     settings_file: Path | None,
+    repeatability: Path | None,
     seed: int,
     interval: float,
     force: bool,
@@ -78,15 +90,16 @@ def command(
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.
 
     The page is one HTML file that loads nothing and prints to one side of A4. Several maps are repeats of one mass:
-    they are pooled into one size. With the JSON that `estimate --json` printed for a map nothing is computed again.
-    The page names the codes of the scan's session, and a name or a date only where they are given.
+    they are pooled into one size. With what `estimate` wrote for a map (-o POST.nc, or --json) nothing is computed
+    again; without the map such a page has no picture, and says so. The page names the codes of the scan's session, and
+    a name or a date only where they are given.
 
     Example: tactile-bayes report map.nc -o exam.html
     """
-    from tactile_bayes.commands.settings_file import settings_of
+    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
     from tactile_bayes.files.atomic import refuse_existing, write_bytes, write_text
     from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.pipeline.exam_report import Given, read_exam
+    from tactile_bayes.pipeline.exam_report import ExamFiles, Given, read_exam
     from tactile_bayes.report.exam_page import exam_page
     from tactile_bayes.report.exam_words import headline
     from tactile_bayes.report.printed import find_printer
@@ -94,16 +107,28 @@ def command(
     for path in (output, pdf):
         if path is not None:
             refuse_existing(path, force=force)
-    if (size_calibration or settings_file) and any(path.suffix.lower() == ".json" for path in files):
-        raise UsageError("an estimate's JSON has settings of its own; leave out --size-calibration and --settings")
+    sorted_files = ExamFiles.sort(files)
+    if sorted_files.estimates:
+        _refuse_settings(ctx)
     printer = None if pdf is None else find_printer()
     options: dict[str, Any] = {"calibration": size_calibration, "seed": seed, "interval": interval}
+    options["repeatability"] = repeatability_in(repeatability)
     settings = settings_of(settings_file, **options)
     also_read(None if size_calibration is None else size_calibration_path(size_calibration))
-    exam = read_exam(files, settings, Given(title, name, day), notice=lambda line: click.echo(line, err=True))
+    exam = read_exam(sorted_files, settings, Given(title, name, day), notice=lambda line: click.echo(line, err=True))
     page = exam_page(exam)
     write_text(output, page, force=force)
+    if exam.main.tactile_map is None:
+        click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)
     if pdf is not None and printer is not None:
         write_bytes(pdf, printer(page), force=force)
     click.echo(f"{output}: {headline(exam)}")
     click.echo(RESEARCH_USE)
+
+
+def _refuse_settings(ctx: click.Context) -> None:
+    """Refuse options of the estimate where an estimate is given: they would change nothing."""
+    for name in _OF_ESTIMATE:
+        if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
+            raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")

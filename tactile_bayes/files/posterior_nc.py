@@ -15,6 +15,7 @@ from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
 from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
+from tactile_bayes.files.schema import check_document
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.inference_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
@@ -31,6 +32,7 @@ def write_posterior(
     *,
     provenance: Provenance,
     groups: Mapping[str, DrawGroup] | None = None,
+    document: Mapping[str, Any] | None = None,
     force: bool = False,
 ) -> None:
     """Write the draws of an estimate atomically; equal draws give equal bytes, see `netcdf_bytes`.
@@ -39,6 +41,8 @@ def write_posterior(
     ----------
     groups
         What goes beside the draws, see `inference_groups`.
+    document
+        The estimate's JSON object, which `read_estimate` gives back.
 
     Raises
     ------
@@ -73,6 +77,8 @@ def write_posterior(
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in figures.items() if _plain(v)}),
     }
+    if document is not None:
+        attributes["estimate"] = json.dumps(document)
     write_bytes(path, _posterior_bytes(variables, attributes, groups or {}), force=force)
 
 
@@ -154,6 +160,34 @@ def read_posterior(path: Path) -> PosteriorDraws:
     figures = diagnostics if isinstance(diagnostics, dict) else {}
     scans = scans_of(parse_json(attributes.get("provenance", "{}")))
     return PosteriorDraws(attributes.get("method", ""), draws, figures, scans)
+
+
+def read_estimate(path: Path) -> dict[str, Any]:
+    """The estimate's JSON object, as ``estimate --json`` prints it, from its posterior's file.
+
+    Raises
+    ------
+    BadDataError
+        When the file is no posterior, is of several maps or of an earlier version, or is damaged.
+    """
+    with open_netcdf(path, way_out="give what `estimate` wrote with -o") as file:
+        group = file.group("posterior")
+        attributes = {} if group is None else group.attributes()
+    if attributes.get("method") == "pooled":
+        raise BadDataError("holds a size pooled from several maps", way_out="give the maps", path=str(path))
+    if "estimate" not in attributes:
+        what = "holds draws without their estimate, as earlier versions wrote it"
+        raise BadDataError(what, way_out="give its map, or write it again with `estimate -o`", path=str(path))
+    document: Any = parse_json(attributes["estimate"])
+    check_document(document, "estimate.schema.json", path=path)
+    found: dict[str, Any] = document
+    return found
+
+
+def is_posterior(path: Path) -> bool:
+    """Whether a netCDF file holds a posterior, of this program or another, and no map."""
+    with open_netcdf(path, way_out="give a map, or what `estimate` wrote with -o") as file:
+        return file.group("posterior") is not None
 
 
 def _plain(value: object) -> bool:

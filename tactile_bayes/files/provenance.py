@@ -62,3 +62,14 @@ def scans_of(document: object) -> tuple[dict[str, str], ...]:
     return tuple(
         {name: one[name] for name in known if isinstance(one.get(name), str)} for one in scans if isinstance(one, dict)
     )
+
+
+def repeated_scans(exams: Sequence[Sequence[Mapping[str, str]]]) -> dict[int, int]:
+    """Which exams are of a scan that an earlier one is of, by its digest: index of the exam, and of the earlier one."""
+    seen: dict[str, int] = {}
+    found: dict[int, int] = {}
+    for index, scans in enumerate(exams):
+        for digest in (scan["sha256"] for scan in scans if scan.get("sha256")):
+            if seen.setdefault(digest, index) != index:
+                found.setdefault(index, seen[digest])
+    return found

@@ -58,12 +58,26 @@ def convergence(draws: FloatArray) -> dict[str, float]:
     }
 
 
-def inference_data(draws: Mapping[str, FloatArray]) -> Any:
-    """Convert draws to `arviz.InferenceData` with one group, ``posterior``.
+Arrays = Mapping[str, tuple[tuple[str, ...], FloatArray]]
+
+
+def inference_data(
+    draws: Mapping[str, FloatArray], groups: Mapping[str, tuple[Arrays, Mapping[str, str]]] | None = None
+) -> Any:
+    """Convert draws to `arviz.InferenceData`: a group ``posterior``, and those given.
 
     Parameters
     ----------
     draws
         (chain, draw) arrays by name.
+    groups
+        Of each other group the names of axes and values by variable, and its attributes.
     """
-    return arviz.from_dict(posterior=dict(draws))
+    import xarray
+
+    posterior = {name: (("chain", "draw"), values) for name, values in draws.items()}
+    datasets = {}
+    for name, (arrays, notes) in {"posterior": (posterior, {}), **(groups or {})}.items():
+        dataset = xarray.Dataset(dict(arrays), attrs=dict(notes))
+        datasets[name] = dataset.assign_coords({axis: np.arange(size) for axis, size in dataset.sizes.items()})
+    return arviz.InferenceData(**datasets)

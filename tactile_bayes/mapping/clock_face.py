@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any, Final
@@ -45,6 +46,22 @@ class ClockPosition:
     distance_sd_mm: float
     angle_deg: float
     angle_sd_deg: float
+
+    @classmethod
+    def of_dict(cls, document: Mapping[str, Any] | None) -> ClockPosition | None:
+        """The position that `as_dict` wrote; None for none, and behind the nipple, where no direction is kept."""
+        if document is None or document["clock_hours"]["median"] is None:
+            return None
+        hours, distance = document["clock_hours"], document["distance_mm"]
+        reach, wide = _deviations(hours["probability"]), _deviations(distance["probability"])
+        across = (hours["high"] - hours["median"]) % 12.0
+        return cls(
+            side=document["side"],
+            distance_mm=distance["median"],
+            distance_sd_mm=(distance["high"] - distance["median"]) / wide,
+            angle_deg=hours["median"] * _DEGREES_PER_HOUR % 360.0,
+            angle_sd_deg=across * _DEGREES_PER_HOUR / reach,
+        )
 
     @property
     def hours(self) -> float:

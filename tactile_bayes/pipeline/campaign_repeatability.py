@@ -103,12 +103,12 @@ def _resized(document: dict[str, Any], size: SizePosterior, settings: Settings) 
     """The estimate's JSON object with the sizes, their sources and their provenance replaced."""
     from tactile_bayes.report.estimate_document import rounded, size_diagnostics
     from tactile_bayes.report.quantities import ANOTHER_EXAM
-    from tactile_bayes.size.posterior import EXTREMES, SIZES
+    from tactile_bayes.size.posterior import SIZES
 
     found = settings.repeatability
     assert found is not None
     sizes = {name: size.summarise(name, probability=settings.interval).as_dict() for name in SIZES}
-    own = {name: sizes[name] for name in EXTREMES} | {ANOTHER_EXAM: None}
+    own = {**sizes, ANOTHER_EXAM: None}
     masses = [{**mass, **own} if mass["reported"] else mass for mass in document["masses"]]
     diagnostics = {**document["diagnostics"], **size_diagnostics(size), "repeatability": found.words()}
     diagnostics["convergence"] = {

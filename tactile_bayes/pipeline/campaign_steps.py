@@ -293,7 +293,7 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
     check_document(document, "estimate.schema.json", path=Path("the report"))
     writes: Writes = {ESTIMATE: lambda path: write_text(path, dump_json(document), force=True)}
     if outcome.estimate.status == "estimate":
-        writes[POSTERIOR] = lambda path: outcome.write(path, force=True)
+        writes[POSTERIOR] = lambda path: outcome.write(path, document=document, force=True)
     shape = answer.shape
     if shape is not None:
         writes[SHAPE] = lambda path: write_shape(path, shape, force=True)

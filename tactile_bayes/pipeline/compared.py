@@ -11,6 +11,7 @@ from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.pipeline.comparing import Comparing
 from tactile_bayes.pipeline.one_map import Answer, size_priors
 from tactile_bayes.pipeline.pooled import common_calibration
+from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.records import dataclass
 
@@ -60,9 +61,11 @@ def compare_answers(
     Raises
     ------
     BadDataError
-        When the maps were normalised in several ways, or one was made with another head than the calibration's.
+        When the maps were normalised in several ways, one was made with another head than the calibration's, or the
+        site's repeatability is of sizes by another calibration.
     UsageError
-        When there are fewer than two visits, days do not fit, or the calibration cannot pool maps.
+        When there are fewer than two visits, two maps are of one scan, days do not fit, or the calibration cannot pool
+        maps.
     """
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.report.compare_document import compare_document
@@ -74,8 +77,10 @@ def compare_answers(
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
     every = list(chain.from_iterable(visits))
     path, calibration = common_calibration(every, settings, names=list(chain.from_iterable(names)))
+    _refuse_repeated(visits, list(chain.from_iterable(names)))
+    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
+    check_repeatability(settings, calibration, digests)
     compared = _compared(visits, calibration, settings, comparing)
-    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {}))
     scans = [scan for one in visits for scan in _scans(one)]
     provenance = Provenance("compare", _recorded(settings, comparing), digests, seed=settings.seed, scans=scans)
     document = compare_document(
@@ -86,6 +91,7 @@ def compare_answers(
         grown_by=comparing.grown_by,
         probability=settings.interval,
         provenance=provenance,
+        repeatability=settings.repeatability,
     )
     return ComparedOutcome(compared, document)
 
@@ -249,6 +255,14 @@ def _place(answer: Answer) -> Place | None:
     return Place(np.array([x["median"], y["median"]]), np.diag([x["sd"] ** 2, y["sd"] ** 2]))
 
 
+def _refuse_repeated(visits: Sequence[Sequence[Answer]], names: Sequence[str]) -> None:
+    """Refuse two maps of one scan: they are no two exams, and less apart than those would be."""
+    from tactile_bayes.files.provenance import repeated_scans
+
+    for index, earlier in repeated_scans([_scans([one]) for one in chain.from_iterable(visits)]).items():
+        raise UsageError(f"{names[index]} and {names[earlier]} are of one scan; give one map of each scan")
+
+
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
     from tactile_bayes.files.provenance import scans_of
 
@@ -263,6 +277,7 @@ def _recorded(settings: Settings, comparing: Comparing) -> dict[str, Any]:
         "interval": settings.interval,
         "scene": settings.scene,
         "between_map_sd": settings.between_map_sd,
+        **repeatability_setting(settings),
         "days": None if comparing.days is None else list(comparing.days),
         "grown_by": list(comparing.grown_by),
         "same_mass": comparing.same_mass,

@@ -1,4 +1,4 @@
-"""The page of an exam from files: maps are estimated, an estimate's JSON is taken as it is, repeats are pooled."""
+"""The page of an exam from files: maps are estimated, an estimate is taken as it is, repeats are pooled."""
 
 from __future__ import annotations
 
@@ -39,13 +39,56 @@ class EstimatedMap:
     scans: Scans
 
 
-def read_exam(paths: Sequence[Path], settings: Settings, given: Given, *, notice: Notice | None = None) -> Exam:
-    """Read maps, or one map and the JSON of its estimate, and put a page's exam together.
+@dataclass(frozen=True, slots=True)
+class ExamFiles:
+    """Files of a page: maps, and estimates as JSON or as a posterior's file."""
+
+    maps: tuple[Path, ...]
+    estimates: tuple[Path, ...]
+
+    @classmethod
+    def sort(cls, paths: Sequence[Path]) -> ExamFiles:
+        """Tell maps from estimates, in any order.
+
+        Raises
+        ------
+        BadDataError
+            When a file is neither.
+        UsageError
+            When a file is given twice, or several estimates are.
+        """
+        twice = [path for index, path in enumerate(paths) if path in paths[:index]]
+        if twice:
+            raise UsageError(f"{twice[0]} is given twice; give each file once")
+        estimates = tuple(path for path in paths if _is_json(path) or _is_posterior(path))
+        maps = tuple(path for path in paths if path not in estimates)
+        if len(estimates) > 1 or (estimates and len(maps) > 1):
+            raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
+        return cls(maps, estimates)
+
+
+def _is_json(path: Path) -> bool:
+    return path.suffix.lower() == ".json"
+
+
+def _is_posterior(path: Path) -> bool:
+    from tactile_bayes.files.kinds import HDF5_MAGIC
+    from tactile_bayes.files.posterior_nc import is_posterior
+    from tactile_bayes.files.reading import open_input
+
+    with open_input(path) as file:
+        netcdf = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
+    return netcdf and is_posterior(path)
+
+
+def read_exam(files: ExamFiles, settings: Settings, given: Given, *, notice: Notice | None = None) -> Exam:
+    """Read maps, or an estimate and its map, and put a page's exam together.
 
     Parameters
     ----------
-    paths
-        Maps of one mass; or one map and what ``estimate --json`` printed for it, in any order.
+    files
+        Maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote with
+        ``-o``.
     notice
         Called with a line that a user may want to read while waiting.
 
@@ -53,18 +96,10 @@ def read_exam(paths: Sequence[Path], settings: Settings, given: Given, *, notice
     ------
     BadDataError
         When a file is not what it must be, or the maps are of different exams.
-    UsageError
-        When a file is given twice, no map is given, or a JSON goes with none of them.
     """
-    maps = [path for path in paths if path.suffix.lower() != ".json"]
-    documents = [path for path in paths if path.suffix.lower() == ".json"]
-    twice = [path for index, path in enumerate(paths) if path in paths[:index]]
-    if twice:
-        raise UsageError(f"{twice[0]} is given twice; give each file once")
-    if not maps:
-        raise UsageError(f"{documents[0]} is an estimate's JSON; give its map, too")
-    if documents:
-        return _from_document(maps, documents, given)
+    maps = files.maps
+    if files.estimates:
+        return _from_estimate(files.estimates[0], maps[0] if maps else None, given)
     found = [_estimated(path, settings, notice) for path in maps]
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
     return make_exam(found, settings, given, inputs=inputs)
@@ -109,24 +144,36 @@ def _estimated(path: Path, settings: Settings, notice: Notice | None) -> Estimat
     return EstimatedMap(tactile_map, answer_of(outcome), scans)
 
 
-def _from_document(maps: Sequence[Path], documents: Sequence[Path], given: Given) -> Exam:
-    """Exam of one map and its estimate's JSON, which must name the map by its digest."""
+def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
+    """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
     from tactile_bayes.files.atomic import sha256
-    from tactile_bayes.files.documents import load_json
     from tactile_bayes.files.map_nc import read_map_and_scans
-    from tactile_bayes.files.schema import check_document
+    from tactile_bayes.files.provenance import scans_of
 
-    if len(maps) > 1 or len(documents) > 1:
-        raise UsageError("an estimate's JSON goes with one map; several maps are estimated and pooled: give maps alone")
-    (path,), (source,) = maps, documents
-    document: Any = load_json(source, way_out="give what `estimate --json` printed for one map")
-    check_document(document, "estimate.schema.json", path=source)
-    digests = [one.get("sha256") for one in document["provenance"].get("inputs", []) if one.get("role") == "map"]
-    if sha256(path) not in digests:
-        raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
-    tactile_map, scans = read_map_and_scans(path)
+    document = _read_estimate(source)
+    scans: Scans = scans_of(document["provenance"])
+    tactile_map = None
+    if path is not None:
+        digests = [one.get("sha256") for one in document["provenance"].get("inputs", []) if one.get("role") == "map"]
+        if sha256(path) not in digests:
+            raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
+        tactile_map, scans = read_map_and_scans(path)
     shown = exam_map(tactile_map, document, side=side_of(scans))
     return Exam((shown,), None, scans, title=given.title, name=given.name, day=given.day)
+
+
+def _read_estimate(source: Path) -> dict[str, Any]:
+    """An estimate's JSON object, from its JSON or its posterior's file."""
+    from tactile_bayes.files.documents import load_json
+    from tactile_bayes.files.posterior_nc import read_estimate
+    from tactile_bayes.files.schema import check_document
+
+    if not _is_json(source):
+        return read_estimate(source)
+    document: Any = load_json(source, way_out="give what `estimate --json` printed for one map")
+    check_document(document, "estimate.schema.json", path=source)
+    found: dict[str, Any] = document
+    return found
 
 
 def _check_one_exam(scans: Scans) -> None:

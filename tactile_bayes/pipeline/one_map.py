@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.head_shape import HeadShape
     from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.posterior.inference_groups import DrawGroup
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.result import Estimate
     from tactile_bayes.size.calibration import Calibration
@@ -71,18 +72,30 @@ class Outcome:
     settings: Settings
     calibration: Calibration | None = None
 
-    def write(self, path: Path, *, force: bool = False) -> None:
-        """Write all draws, and what goes with them, as netCDF that arviz opens."""
+    def write(self, path: Path, *, document: Mapping[str, Any] | None = None, force: bool = False) -> None:
+        """Write all draws, and what goes with them, as netCDF that arviz opens.
+
+        Parameters
+        ----------
+        document
+            The JSON object of `answer_of`, where it was made already.
+        """
+        from tactile_bayes.files.posterior_nc import write_posterior
+
+        told = document or answer_of(self).document
+        provenance = self.provenance
+        write_posterior(path, self.estimate, provenance=provenance, groups=self.groups(), document=told, force=force)
+
+    def groups(self) -> dict[str, DrawGroup]:
+        """What goes with the draws, see `inference_groups`."""
         import numpy as np
 
-        from tactile_bayes.files.posterior_nc import write_posterior
         from tactile_bayes.posterior.inference_groups import inference_groups
 
         rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
-        groups = inference_groups(
+        return inference_groups(
             self.estimate, calibration=self.calibration, size_priors=size_priors(self.settings), rng=rng
         )
-        write_posterior(path, self.estimate, provenance=self.provenance, groups=groups, force=force)
 
 
 def answer_file(path: Path, *, settings: Settings) -> Answer:

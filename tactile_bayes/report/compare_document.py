@@ -16,6 +16,7 @@ from tactile_bayes.size.trend import VOLUME, Trend, doubling_days, straight_line
 if TYPE_CHECKING:
     from tactile_bayes.size.change import Change, JointSizes
     from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.repeatability import Repeatability
     from tactile_bayes.size.same_mass import Apart
 
 SCHEMA: Final = "tactile-bayes/compare/1"
@@ -34,6 +35,7 @@ def compare_document(
     grown_by: Sequence[float],
     probability: float,
     provenance: Provenance,
+    repeatability: Repeatability | None = None,
 ) -> dict[str, Any]:
     """JSON object of a comparison, see data_schema/compare.schema.json.
 
@@ -45,6 +47,8 @@ def compare_document(
         Time of each visit; None where it is not known.
     grown_by
         Shares of the diameter.
+    repeatability
+        Of the site, where the comparison used one.
     """
     joint = compared.joint
     changes: list[dict[str, Any]] = []
@@ -68,6 +72,7 @@ def compare_document(
         "changes": changes,
         "trend": None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
         "between_map_sd": None if joint is None else nine_digits(joint.between_map_sd),
+        **({} if repeatability is None else {"repeatability": repeatability.words()}),
         "fat_mm": None if used is None or used.fat_mm is None else nine_digits(used.fat_mm),
         "by_place_used": None if used is None else used.knows_places,
         "left_out": [] if used is None else used.omissions(),

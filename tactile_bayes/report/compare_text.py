@@ -24,7 +24,7 @@ def compare_summary(document: Mapping[str, Any]) -> str:
     lines += [_visit_line(one) for one in shown]
     lines += _place_line(document["places"][-1])
     lines += [_change_line(last), _odds_line(last), _verdict_line(last)]
-    lines += _rate_lines(document, last)[:1] + _another_line(last)
+    lines += _rate_lines(document, last)[:1] + _site_line(document) + _another_line(last)
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
@@ -42,7 +42,7 @@ def compare_text(document: Mapping[str, Any]) -> str:
         lines += _rate_lines({"trend": None}, change) + _another_line(change)
     lines += [""] if document["trend"] is not None else []
     lines += _trend_lines(document["trend"])
-    lines.append(_model_line(document))
+    lines += [*_site_line(document), _model_line(document)]
     if document["left_out"]:
         lines.append(f"Left out: {'; '.join(document['left_out'])}.")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
@@ -81,7 +81,8 @@ def _place_line(place: Mapping[str, Any], *, name: bool = False) -> list[str]:
 
 def _change_line(change: Mapping[str, Any]) -> str:
     q, pair = change["percent"], f"Change of the diameter, visit {change['earlier']} to {change['later']}"
-    return f"{pair}: {q['median']:+.0f} % ({q['low']:+.0f} to {q['high']:+.0f} %, {_share(q)} interval)."
+    median, low, high = (_signed(q[name]) for name in ("median", "low", "high"))
+    return f"{pair}: {median} % ({low} to {high} %, {_share(q)} interval)."
 
 
 def _odds_line(change: Mapping[str, Any]) -> str:
@@ -129,9 +130,15 @@ def _another_line(change: Mapping[str, Any]) -> list[str]:
     if another is None:
         return []
     q, spread = another["percent"], 100 * another["between_map_sd"]
-    odds = f"{q['low']:+.0f} to {q['high']:+.0f} %, probability of growth {_odds(another['probability_grown'])}"
+    odds = f"{_signed(q['low'])} to {_signed(q['high'])} %, probability of growth {_odds(another['probability_grown'])}"
     lost = change["verdict"] != "no_change_shown" and another["verdict"] == "no_change_shown"
     return [f"If exams of one mass differ by {spread:.0f} %: {odds}{': no change shown then' if lost else ''}."]
+
+
+def _site_line(document: Mapping[str, Any]) -> list[str]:
+    """Whose spread between exams the intervals and the smallest detectable change suppose, where it was learned."""
+    words = document.get("repeatability", "")
+    return [f"{words[0].upper()}{words[1:]}; the figures above are for such exams."] if words else []
 
 
 def _model_line(document: Mapping[str, Any]) -> str:
@@ -139,6 +146,11 @@ def _model_line(document: Mapping[str, Any]) -> str:
     depth = "" if document["fat_mm"] is None else f"; fat under the head {document['fat_mm']:.1f} mm deep at all visits"
     place = "; how the lump feels under each part of the head is used" if document["by_place_used"] else ""
     return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}{place}."
+
+
+def _signed(percent: float) -> str:
+    """Whole percent with its sign; none has no sign."""
+    return f"{round(percent):+d}" if round(percent) else "0"
 
 
 def _odds(probability: float) -> str:

@@ -68,7 +68,12 @@ def estimate_document(
         ],
         "other_rises": [rise.as_dict() for rise in estimate.other_rises],
         "masses": masses_document(
-            estimate.masses, tactile_map, probability=probability, quantities=quantities, reason=estimate.reason
+            estimate.masses,
+            tactile_map,
+            probability=probability,
+            quantities=quantities,
+            reason=estimate.reason,
+            scans=provenance.scans,
         ),
         "left_out": list(estimate.left_out),
         "prior": prior.as_dict(),

@@ -58,9 +58,12 @@ class ExamMass:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExamMap:
-    """One map of an exam, with the estimate's JSON object and its masses, the reported one first."""
+    """One map of an exam, with the estimate's JSON object and its masses, the reported one first.
 
-    tactile_map: TactileMap
+    `tactile_map` is None where only the estimate is at hand.
+    """
+
+    tactile_map: TactileMap | None
     document: Mapping[str, Any]
     masses: tuple[ExamMass, ...]
 
@@ -118,7 +121,7 @@ class Exam:
         return found
 
 
-def exam_map(tactile_map: TactileMap, document: Mapping[str, Any], *, side: str) -> ExamMap:
+def exam_map(tactile_map: TactileMap | None, document: Mapping[str, Any], *, side: str) -> ExamMap:
     """A map with its masses, from what `estimate --json` says of it.
 
     Parameters
@@ -129,7 +132,7 @@ def exam_map(tactile_map: TactileMap, document: Mapping[str, Any], *, side: str)
     return ExamMap(tactile_map, document, tuple(_masses(tactile_map, document, side)))
 
 
-def _masses(tactile_map: TactileMap, document: Mapping[str, Any], side: str) -> Iterator[ExamMass]:
+def _masses(tactile_map: TactileMap | None, document: Mapping[str, Any], side: str) -> Iterator[ExamMass]:
     """The reported mass first, then the others in the JSON's order."""
     listed = document.get("masses")
     number = 1
@@ -147,7 +150,7 @@ def _masses(tactile_map: TactileMap, document: Mapping[str, Any], side: str) -> 
             yield _placed(i, centre, tactile_map, side, **words)
 
 
-def _reported(number: int, tactile_map: TactileMap, document: Mapping[str, Any], side: str) -> ExamMass:
+def _reported(number: int, tactile_map: TactileMap | None, document: Mapping[str, Any], side: str) -> ExamMass:
     point, angle = document["centre_mm"], document["angle_deg"]
     sized = document["max_size_mm"] is not None
     another = document.get("another_exam")
@@ -156,6 +159,7 @@ def _reported(number: int, tactile_map: TactileMap, document: Mapping[str, Any],
         (point["x"]["median"], point["y"]["median"]),
         tactile_map,
         side,
+        told=document,
         centre_sd_mm=(point["x"]["sd"], point["y"]["sd"]),
         axes_mm=(document["d_x_mm"]["median"], document["d_y_mm"]["median"]) if sized else None,
         angle_deg=0.0 if angle is None else angle["median"],
@@ -168,15 +172,18 @@ def _reported(number: int, tactile_map: TactileMap, document: Mapping[str, Any],
     )
 
 
-def _listed(one: Mapping[str, Any], tactile_map: TactileMap, side: str) -> ExamMass:
-    """A mass besides the reported one; its ellipse's axes are not told, so it is drawn as a circle of its size."""
-    largest, another = one["max_size_mm"], one["another_exam"]
+def _listed(one: Mapping[str, Any], tactile_map: TactileMap | None, side: str) -> ExamMass:
+    """A mass besides the reported one; a circle of its size where an older estimate does not tell the axes."""
+    largest, another, angle = one["max_size_mm"], one["another_exam"], one.get("angle_deg")
+    along, across = (one.get(name) or largest for name in ("d_x_mm", "d_y_mm"))
     return _placed(
         one["number"],
         (one["centre_mm"]["x"], one["centre_mm"]["y"]),
         tactile_map,
         side,
-        axes_mm=None if largest is None else (largest["median"], largest["median"]),
+        told=one,
+        axes_mm=None if largest is None else (along["median"], across["median"]),
+        angle_deg=0.0 if angle is None else angle["median"],
         largest=largest,
         smallest=one["min_size_mm"],
         another=None if another is None else another["max_size_mm"],
@@ -189,12 +196,26 @@ def _listed(one: Mapping[str, Any], tactile_map: TactileMap, side: str) -> ExamM
 def _placed(
     number: int,
     centre_mm: tuple[float, float],
-    tactile_map: TactileMap,
+    tactile_map: TactileMap | None,
     side: str,
     *,
+    told: Mapping[str, Any] | None = None,
     centre_sd_mm: tuple[float, float] = (0.0, 0.0),
     **facts: Any,
 ) -> ExamMass:
+    """A mass with its place: by the map, or as its estimate has `told` it where that is all there is."""
+    if tactile_map is None:
+        said = told or {}
+        place = ClockPosition.of_dict(said.get("position"))
+        return ExamMass(number, centre_mm, place=place, patient_mm=_point(said.get("centre_patient_mm")), **facts)
     covariance = np.diag(np.square(centre_sd_mm))
     place = clock_position(tactile_map, centre_mm, side=side, covariance_mm2=covariance)
     return ExamMass(number, centre_mm, place=place, patient_mm=patient_mm(tactile_map, *centre_mm), **facts)
+
+
+def _point(point: Mapping[str, Any] | None) -> tuple[float, float] | None:
+    """x and y in mm of an estimate's JSON; of a quantity its median."""
+    if point is None:
+        return None
+    x, y = (point[axis]["median"] if isinstance(point[axis], Mapping) else point[axis] for axis in "xy")
+    return float(x), float(y)

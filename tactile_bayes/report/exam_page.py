@@ -29,6 +29,10 @@ from tactile_bayes.report.exam_words import (
 )
 
 TITLE: Final = "Tactile exam"
+NO_MAP: Final = (
+    "The map is not at hand: this page shows no picture of it, and does not say what was covered nor how hard was "
+    "pressed. Given the map too, it does."
+)
 MOST_REPEATS: Final = 5
 MOST_MASSES: Final = 4
 _LONGEST: Final = 400
@@ -120,6 +124,9 @@ def _crowded(exam: Exam) -> bool:
 def _picture(exam: Exam) -> Iterator[str]:
     """The map, as large as it is where the page has room, with its colours and what the lines are."""
     tactile_map = exam.main.tactile_map
+    if tactile_map is None:
+        yield f'<p class="caution">{html.escape(NO_MAP)}</p>'
+        return
     height_mm = _LOWER_MM if _crowded(exam) else _PICTURE_MM[1]
     frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
     yield f'<div class="picture">{exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")}</div>'

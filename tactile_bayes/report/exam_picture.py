@@ -79,9 +79,15 @@ class Frame:
         return cell * across, cell * down
 
 
+def _map_of(exam: ExamMap) -> TactileMap:
+    """The map that a picture is of; what is drawn has one."""
+    assert exam.tactile_map is not None
+    return exam.tactile_map
+
+
 def colour_limits(exam: ExamMap) -> tuple[float, float]:
     """Values at the ends of the colours: a rib beside the lump does not take them all, noise alone is no lump."""
-    tactile_map, document = exam.tactile_map, exam.document
+    tactile_map, document = _map_of(exam), exam.document
     well = tactile_map.covered & ~tactile_map.few
     values = tactile_map.mean[well if well.any() else tactile_map.covered]
     if not values.size:
@@ -119,9 +125,9 @@ def exam_picture(exam: ExamMap, frame: Frame, *, label: str, small: bool = False
 
 def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> list[str]:
     """Small pictures of repeat maps, all to one scale, by which each has room in a width and a height."""
-    sizes = [Frame(one.tactile_map, 1.0).size_mm for one in maps]
+    sizes = [Frame(_map_of(one), 1.0).size_mm for one in maps]
     scale = min(1.0, *(room / size for one in sizes for room, size in zip(room_mm, one, strict=True)))
-    frames = [Frame(one.tactile_map, scale) for one in maps]
+    frames = [Frame(_map_of(one), scale) for one in maps]
     return [
         exam_picture(one, frame, label=f"Repeat map {number}", small=True)
         for number, (one, frame) in enumerate(zip(maps, frames, strict=True), start=1)
@@ -131,15 +137,16 @@ def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> 
 def colour_bar(exam: ExamMap) -> str:
     """Inline SVG of the colours with the values at their ends."""
     low, high = colour_limits(exam)
-    covered = exam.tactile_map.covered
-    more = " or more" if covered.any() and float(exam.tactile_map.mean[covered].max()) > high else ""
+    tactile_map = _map_of(exam)
+    covered = tactile_map.covered
+    more = " or more" if covered.any() and float(tactile_map.mean[covered].max()) > high else ""
     steps = _coloured(np.linspace(0.0, 1.0, _BAR_STEPS)[None], (0.0, 1.0))[0]
     width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
     boxes = "".join(
         f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
         for i, colour in enumerate(steps)
     )
-    words = html.escape(exam.tactile_map.recipe.value_words)
+    words = html.escape(tactile_map.recipe.value_words)
     return (
         '<svg class="bar" role="img" aria-label="Colours of the map" viewBox="0 0 80 8.5" width="80mm" height="8.5mm">'
         f'{boxes}<rect x="14" y="0.5" width="{_BAR_MM:g}" height="3" fill="none" stroke="#333" stroke-width="0.15"/>'
@@ -155,7 +162,7 @@ def _value(value: float) -> str:
 
 def _cells(exam: ExamMap, frame: Frame) -> str:
     """The map's values as an embedded PNG; cells with few readings are striped, those without any are grey."""
-    tactile_map, (width, height) = exam.tactile_map, frame.size_mm
+    tactile_map, (width, height) = frame.tactile_map, frame.size_mm
     values = frame.view.screen(np.where(tactile_map.covered, tactile_map.mean, np.nan))
     step = -(-max(values.shape) // _MOST_PIXELS)
     pixels = _coloured(values[::step, ::step], colour_limits(exam))
@@ -260,7 +267,7 @@ def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
         for one in exam.document["candidates"]:
             x, y = frame.at((one["x_mm"], one["y_mm"]))
             yield _stroked(f"M{x - 1:.2f} {y - 1:.2f}l2 2m0 -2l-2 2", 0.3, kind="looked-at")
-    nipple = exam.tactile_map.nipple_mm
+    nipple = frame.tactile_map.nipple_mm
     if nipple is not None:
         yield from _nipple((float(nipple[0]), float(nipple[1])), frame)
     if frame.view.notch is not None:

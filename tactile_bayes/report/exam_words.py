@@ -9,15 +9,18 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.geometry import apply
-from tactile_bayes.mapping.clock_face import clock_text
+from tactile_bayes.mapping.clock_face import SIDES, clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
+from tactile_bayes.report.lump_place import side_of
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
 
 UNDETECTED: Final = ("undetected", "empty")
 MOST_CAUTIONS: Final = 2
+MIDDLE_MM: Final = 20.0
+"""So far from the xiphoid a lump is on that side of the body, whatever is wrong with the landmarks' direction."""
 _OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
@@ -51,14 +54,9 @@ def size_sentences(exam: Exam) -> Iterator[str]:
     document, size = exam.main.document if exam.pooled is None else exam.pooled, largest(exam)
     if size is None:
         return
-    spread, share = exam.figures.get("between_map_sd"), _percent(size)
+    share = _percent(size)
     yield f"The largest diameter is about {size['median']:.1f} mm (the middle of its probable values)."
-    alike = ""
-    if spread is not None:
-        alike = f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
-        if exam.pooled is not None:
-            alike = f"; exams of a lump are taken to differ by {100 * spread:.0f} %, learned from these maps"
-    yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{alike}."
+    yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{_supposed(exam)}."
     if document.get("another_exam") is not None:
         other, sd = document["another_exam"]["max_size_mm"], document["another_exam"]["between_map_sd"]
         apart = f"If exams of a lump differ by {100 * sd:.0f} %, as those of patients did in the published trial"
@@ -76,11 +74,33 @@ def size_sentences(exam: Exam) -> Iterator[str]:
         yield shape_text(exam.figures)
 
 
+def _supposed(exam: Exam) -> str:
+    """What the size's interval supposes of the spread between exams, and where that is from."""
+    spread = exam.figures.get("between_map_sd")
+    if spread is None:
+        return ""
+    document = exam.main.document if exam.pooled is None else exam.pooled
+    at_site = document.get("repeatability") or exam.figures.get("repeatability")
+    if at_site and exam.pooled is None:
+        return f"; {at_site}"
+    told = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"
+    if at_site:
+        return f"{told}, by these maps and this site's other exams"
+    stated = document["provenance"]["settings"].get("between_map_sd")
+    if stated is not None:
+        return f"{told}, as was stated"
+    if exam.pooled is not None:
+        return f"{told}, learned from these maps"
+    return f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
+
+
 def nothing_sentences(exam: Exam) -> Iterator[str]:
     """Why there is no size, what would help, and what was covered."""
     document = exam.main.document if exam.pooled is None else exam.pooled
     if exam.main.document["reason_code"] in UNDETECTED:
-        yield f"No lump was found in the area that was covered: {covered_text(exam.main.tactile_map)}."
+        tactile_map = exam.main.tactile_map
+        area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
+        yield f"No lump was found in the area that was covered{area}."
         chance = exam.main.document["detected_probability"]
         if chance is not None:
             yield f"Probability that the likeliest rise on the map is a lump: {chance_text(chance)}."
@@ -119,7 +139,11 @@ def short_place(mass: ExamMass) -> str:
 def why_no_clock(exam: Exam) -> str:
     """Why the page tells no place by the clock, where a patient was scanned; empty where it does."""
     tactile_map = exam.main.tactile_map
-    if tactile_map.patient_from_plane is None or any(mass.place is not None for mass in exam.main.masses):
+    if (
+        tactile_map is None
+        or tactile_map.patient_from_plane is None
+        or any(mass.place is not None for mass in exam.main.masses)
+    ):
         return ""
     lacks = ["nipple"] if tactile_map.nipple_mm is None else []
     lacks += [] if any(scan.get("side") in ("left", "right") for scan in exam.scans) else ["side"]
@@ -148,23 +172,48 @@ def caution_sentences(exam: Exam) -> list[str]:
             found.insert(0, f"Caution: the fat under the head is {depths} mm deep on two maps: are they of one mass?")
         if any(len(one.masses) > 1 for one in exam.maps):
             found.insert(0, "To check: a map shows several masses; was every map sized at the same one?")
+        told_of_maps = [
+            f"Caution: {text}." for one in exam.pooled["maps"] for text in one.get("broken_assumptions", [])
+        ]
+        found = [*(text for text in told_of_maps if text not in found), *found]
         apart = [one["map"] for one in exam.pooled["maps"] if one["outlying"]]
         found += [f"To check: apart from the others: {', '.join(apart)}."] if apart else []
-    told = list(dict.fromkeys(found))
+    told = list(dict.fromkeys([*_side_in_doubt(exam), *found]))
     more = len(told) - MOST_CAUTIONS
     return [*told[:MOST_CAUTIONS], f"And {more} more: see `estimate -v`."] if more > 0 else told
 
 
+def _side_in_doubt(exam: Exam) -> Iterator[str]:
+    """Caution where the landmarks put the lump on the other side of the body than the scans say."""
+    side = side_of(exam.scans)
+    lump = exam.main.masses[0].patient_mm if exam.main.masses else None
+    if side not in SIDES or lump is None or abs(lump[0]) < MIDDLE_MM:
+        return
+    other = "right" if lump[0] > 0 else "left"
+    if other != side:
+        place = f"the landmarks put the lump {abs(lump[0]):.0f} mm to the patient's {other} of the xiphoid"
+        yield f"Caution: the scan says {side} breast, and {place}: side or landmarks are wrong."
+
+
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     """Rows of the table on how good the exam was."""
-    tactile_map = exam.main.tactile_map
+    if exam.main.tactile_map is not None:
+        yield from _scan_rows(exam.main.tactile_map)
+    yield "array calibration", _age(exam)
+    calibration = exam.main.document["provenance"]["settings"].get("size_calibration")
+    if calibration:
+        yield "size calibration", str(calibration)[:60]
+
+
+def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+    """Rows on what was scanned, and how."""
     quality = tactile_map.quality
     yield "covered", covered_text(tactile_map)
     if reach := reach_text(tactile_map):
         yield "reaches", reach
     if "mean_pressure_kpa" in quality:
         window = tactile_map.recipe.pressure_window_kpa
-        asked = "" if window is None else f" (wanted {window[0]:g} to {window[1]:g})"
+        asked = "" if window is None else f" (wanted {window[0]:g} to {window[1]:g} kPa)"
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
         yield "pressure", f"mean {quality['mean_pressure_kpa']:.1f} kPa, nine frames in ten {ends}{asked}"
     if "frames_total" in quality:
@@ -174,10 +223,6 @@ def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     if tactile_map.masked_taxels:
         yield "taxels", f"{len(tactile_map.masked_taxels)} left out as faulty"
     yield "landmarks", _landmarks(tactile_map)
-    yield "array calibration", _age(exam)
-    calibration = exam.main.document["provenance"]["settings"].get("size_calibration")
-    if calibration:
-        yield "size calibration", str(calibration)[:60]
 
 
 def covered_text(tactile_map: TactileMap) -> str:

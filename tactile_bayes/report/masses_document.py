@@ -11,8 +11,9 @@ from tactile_bayes.geometry import apply
 from tactile_bayes.inference.summary import Quantity, nine_digits
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.result import Mass
+from tactile_bayes.report.lump_place import lump_place
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, estimate_quantities
-from tactile_bayes.size.posterior import EXTREMES
+from tactile_bayes.size.posterior import SIZES
 
 MassDocument = Mapping[str, Any]
 
@@ -24,6 +25,7 @@ def masses_document(
     probability: float,
     quantities: Mapping[str, Quantity],
     reason: str,
+    scans: Sequence[Mapping[str, str]] = (),
 ) -> list[dict[str, Any]]:
     """JSON objects of a map's masses, numbered in their order; see data_schema/estimate.schema.json.
 
@@ -31,22 +33,20 @@ def masses_document(
     ----------
     quantities, reason
         Of the reported mass, as the estimate has them.
+    scans
+        The scans at the beginning, which say which breast it is.
     """
-    return [
-        _mass(
-            number,
-            mass,
-            tactile_map,
-            quantities if mass.reported else estimate_quantities(mass.estimate, tactile_map, probability=probability),
-            reason if mass.reported else mass.estimate.reason,
-        )
-        for number, mass in enumerate(masses, start=1)
-    ]
+    found = []
+    for number, mass in enumerate(masses, start=1):
+        own = quantities if mass.reported else estimate_quantities(mass.estimate, tactile_map, probability=probability)
+        place = lump_place(mass.estimate.map_posterior, tactile_map, scans)
+        why = reason if mass.reported else mass.estimate.reason
+        position = None if place is None else place.as_dict(probability)
+        found.append({"number": number, **_mass(mass, tactile_map, own, why), "position": position})
+    return found
 
 
-def _mass(
-    number: int, mass: Mass, tactile_map: TactileMap, quantities: Mapping[str, Quantity], reason: str
-) -> dict[str, Any]:
+def _mass(mass: Mass, tactile_map: TactileMap, quantities: Mapping[str, Quantity], reason: str) -> dict[str, Any]:
     estimate = mass.estimate
 
     def one(name: str) -> dict[str, Any] | None:
@@ -54,13 +54,13 @@ def _mass(
 
     patient = patient_mm(tactile_map, mass.x_mm, mass.y_mm)
     return {
-        "number": number,
         "reported": mass.reported,
         "centre_mm": {"x": nine_digits(mass.x_mm), "y": nine_digits(mass.y_mm)},
         "centre_patient_mm": None if patient is None else {"x": nine_digits(patient[0]), "y": nine_digits(patient[1])},
         "detected_probability": nine_digits(mass.probability),
         "amplitude": one("amplitude"),
-        **{name: one(name) for name in EXTREMES},
+        **{name: one(name) for name in SIZES},
+        "angle_deg": one("angle_deg"),
         ANOTHER_EXAM: another_exam(estimate.size, quantities),
         "reason": reason if estimate.size is None else "",
         "reason_code": estimate.code,
@@ -94,6 +94,8 @@ def mass_words(mass: MassDocument, here: MassDocument | None) -> str:
     if here is not None:
         away = np.hypot(x - here["centre_mm"]["x"], y - here["centre_mm"]["y"])
         place += f", {away:.0f} mm from mass {here['number']}"
+    if mass.get("position") is not None:
+        place += f" ({mass['position']['text']})"
     size = mass["max_size_mm"]
     if size is None:
         told = f"no size: {mass['reason']}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.inference.summary import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
@@ -67,7 +67,7 @@ def pooled_document(
         **sizes,
         ANOTHER_EXAM: _another_exam(size, probability),
         "supposing": supposed_document(size, largest),
-        "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
+        "maps": _with_repeated([_map(i, name, documents[i], pooled) for i, name in enumerate(names)], documents),
         "variance_share": None if size is None else {k: nine_digits(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: nine_digits(value) for name, value in size.figures.items()},
         "left_out": _omitted(used, documents),
@@ -109,6 +109,14 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
         "outlying": index in pooled.outlying,
         "broken_assumptions": list(document["diagnostics"].get("broken_assumptions", [])),
     }
+
+
+def _with_repeated(maps: list[dict[str, Any]], documents: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The maps; one of a scan that an earlier map is of says so among its broken assumptions."""
+    for index, earlier in repeated_scans([scans_of(one["provenance"]) for one in documents]).items():
+        words = f"a map of the same scan as {maps[earlier]['map']} is no repeat: the interval is too narrow"
+        maps[index]["broken_assumptions"].append(words)
+    return maps
 
 
 def pooled_summary(document: Mapping[str, Any]) -> str:

@@ -16,13 +16,13 @@ from settings_files import settings
 import tactile_bayes as tb
 from tactile_bayes.commands.visits_command import numbered
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.map_nc import write_map
+from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document
 from tactile_bayes.geometry import rigid
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare_document import verdict
-from tactile_bayes.report.compare_text import compare_summary
+from tactile_bayes.report.compare_text import _signed, compare_summary
 
 FAST = ("--method", "laplace")
 MASS = (-70.0, 80.0)
@@ -193,6 +193,30 @@ def test_a_posterior_is_refused_and_its_map_is_asked_for(folder: Path) -> None:
     done = run(folder, "a1.nc", "--with", "post.nc")
     assert done.returncode == 3
     assert "post.nc: is a posterior, not a map; give the map that it was estimated from" in done.stderr
+
+
+def test_a_scan_is_no_second_visit_and_no_second_exam(folder: Path) -> None:
+    write(folder / "again.nc", sigma=4.0, seed=0, subject="p1", side="left")
+    made = read_map(folder / "again.nc")
+    finer = replace(made, mean=made.mean + 0.001)  # the same scan, mapped another way
+    scans = [{"sha256": f"{0:064x}", "subject": "p1", "side": "left"}]
+    write_map(folder / "again.nc", finer, provenance=Provenance("test", {}, scans=scans), force=True)
+    for words in (("a0.nc", "--with", "again.nc"), ("a0.nc", "again.nc", "--with", "grown0.nc")):
+        done = run(folder, *words)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert "again.nc and a0.nc are of one scan; give one map of each scan" in done.stderr
+    pooled = run_here("estimate", "--pool", "a0.nc", "again.nc", *FAST, cwd=folder)
+    told = "CAUTION: again.nc: a map of the same scan as a0.nc is no repeat: the interval is too narrow."
+    assert told in pooled.stdout
+    assert "no repeat" not in run_here("estimate", "--pool", "a0.nc", "a1.nc", *FAST, cwd=folder).stdout
+    run_here("report", "a0.nc", "again.nc", "-o", "again.html", cwd=folder)
+    page = (folder / "again.html").read_text()
+    assert "Caution: a map of the same scan as map 1 is no repeat: the interval is too narrow." in page
+
+
+@pytest.mark.parametrize(("percent", "text"), [(-0.3, "0"), (0.4, "0"), (-1.2, "-1"), (12.6, "+13")])
+def test_a_change_of_nothing_has_no_sign(percent: float, text: str) -> None:
+    assert _signed(percent) == text
 
 
 @pytest.mark.parametrize("later", ["grown0.nc", "bare0.nc"])

@@ -12,6 +12,7 @@ from in_process import run_here
 from repeated_exams import shape, write_done, write_exam, write_repeats
 
 import tactile_bayes as tb
+from tactile_bayes.files.schema import check_document
 from tactile_bayes.files.shipped import size_calibration_path
 
 FAST = ("--method", "laplace")
@@ -86,6 +87,42 @@ def test_a_pooled_size_has_it_as_the_prior_of_its_maps(site: Path, tmp_path: Pat
     assert "at this site, by 10 masses and 30 exams" in told
     found = tb.pool([tmp_path / "map.nc", tmp_path / "two.nc"], method="laplace", repeatability=tmp_path / "site.json")
     assert found.document["max_size_mm"] == document["max_size_mm"]
+
+
+def test_a_comparison_is_at_the_sites_repeatability(site: Path, tmp_path: Path) -> None:
+    """With one exam a visit the variance of the change has twice that of an exam, which sites of 8 and 2 % give."""
+    for name in ("map.nc", "site.json"):
+        shutil.copy(site / name, tmp_path)
+    run_here("simulate", DEMO / "scene.toml", "--seed", 2, "-o", "two.mcap", cwd=tmp_path)
+    run_here("map", "two.mcap", "-o", "two.nc", cwd=tmp_path)
+    write_repeats(tmp_path / "alike", 10, spread=0.02)
+    run_here("calibrate", "repeatability", "alike", "-o", "alike.json", cwd=tmp_path)
+    words = ("compare", "map.nc", "--with", "two.nc", *FAST)
+    found, spread = {}, {}
+    for name in ("site", "alike"):
+        done = run_here(*words, "--repeatability", f"{name}.json", "--json", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        document = json.loads(done.stdout)
+        check_document(document, "compare.schema.json", path=Path(name))
+        spread[name] = json.loads((tmp_path / f"{name}.json").read_text())["between_map_sd"]
+        assert document["between_map_sd"] == pytest.approx(spread[name], rel=0.1)
+        assert document["provenance"]["settings"]["repeatability"]["masses"] == 10
+        assert "repeatability" in [one["role"] for one in document["provenance"]["inputs"]]
+        (found[name],) = document["changes"]
+        assert found[name]["another_exam"] is None
+    least = {name: np.log1p(one["smallest_detectable_percent"] / 100) / 1.96 for name, one in found.items()}
+    apart = 2 * (spread["site"] ** 2 - spread["alike"] ** 2)
+    assert least["site"] ** 2 - least["alike"] ** 2 == pytest.approx(apart, rel=0.15)
+    plain = run_here(*words, cwd=tmp_path).stdout
+    assert "If exams of one mass differ by" in plain
+    told = run_here(*words, "--repeatability", "site.json", cwd=tmp_path).stdout
+    assert "at this site, by 10 masses and 30 exams; the figures above are for such exams." in told
+    assert "If exams of one mass differ by" not in told
+    by_python = tb.compare(tmp_path / "map.nc", tmp_path / "two.nc", method="laplace", repeatability=site / "site.json")
+    assert by_python.document["changes"][0] == found["site"]
+    refused = run_here(*words, "--repeatability", "site.json", "--size-calibration", "eq6", cwd=tmp_path)
+    assert (refused.returncode, refused.stderr.count("\n")) == (3, 1)
+    assert "the repeatability is of sizes by solid" in refused.stderr
 
 
 def test_python_learns_and_uses_it(site: Path, tmp_path: Path) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from in_process import run_here
+from repeated_exams import write_repeats
 
 from tactile_bayes.commands import report as command
 from tactile_bayes.files.map_nc import read_map, write_map
@@ -33,7 +36,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_repeat(place, "a.nc", seed=1, subject="P1", side="left")
     write_repeat(place, "b.nc", seed=2, subject="P1", side="left")
     write_repeat(place, "other.nc", seed=3, subject="P2", side="left")
-    (place / "a.json").write_text(run_here("estimate", "a.nc", "--json", cwd=place).stdout)
+    (place / "a.json").write_text(run_here("estimate", "a.nc", "--json", "-o", "post.nc", cwd=place).stdout)
+    run_here("estimate", "--pool", "a.nc", "b.nc", "-o", "both.nc", cwd=place)
+    shutil.copy(place / "post.nc", place / "old.nc")
+    with h5py.File(place / "old.nc", "r+") as file:
+        del file["posterior"].attrs["estimate"]
     return place
 
 
@@ -62,6 +69,58 @@ def test_the_json_of_an_estimate_gives_the_same_page_without_estimating(
     assert (folder / "both.html").read_bytes() == (folder / "alone.html").read_bytes()
 
 
+def test_a_posterior_gives_the_page_of_its_estimate(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactile_bayes.pipeline.exam_report.estimate_one", None)
+    run_here("report", "a.json", "a.nc", "-o", "by_json.html", cwd=folder)
+    done = run_here("report", "a.nc", "post.nc", "-o", "by_posterior.html", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert (folder / "by_posterior.html").read_bytes() == (folder / "by_json.html").read_bytes()
+
+
+@pytest.mark.parametrize("estimate", ["post.nc", "a.json"])
+def test_an_estimate_without_its_map_has_a_page_that_says_what_it_lacks(folder: Path, estimate: str) -> None:
+    words = ("report", estimate, "-o", "no_map.html", "--force")
+    done = run_here(*words, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "note: without its map the page has no picture and no coverage; give MAP.nc too\n"
+    page, with_map = (folder / "no_map.html").read_text(), folder / "with_map.html"
+    run_here("report", "a.nc", "a.json", "-o", "with_map.html", "--force", cwd=folder)
+    lines = with_map.read_text().splitlines()
+    told = [
+        line for line in lines if "diameter is about" in line or ("of the xiphoid and" in line and "<tr>" not in line)
+    ]
+    assert len(told) == 3
+    assert all(line in page for line in told)
+    assert "The map is not at hand: this page shows no picture of it" in page
+    for absent in ('class="map"', "<th>covered</th>", "<th>pressure</th>", 'class="bar"'):
+        assert absent not in page
+        assert absent in with_map.read_text()
+    for text in ("array calibration", "size calibration", "Research use only"):
+        assert text in page
+
+
+def test_the_page_says_whose_spread_between_exams_the_interval_supposes(folder: Path) -> None:
+    (folder / "own.toml").write_text("between_map_sd = 0.07\n")
+    run_here("report", "a.nc", "--settings", "own.toml", "-o", "stated.html", cwd=folder)
+    stated = (folder / "stated.html").read_text()
+    assert "exams of a lump are taken to differ by 7 %, as was stated." in stated
+    assert "simulated bodies do" not in stated
+    write_repeats(folder / "out", 10)
+    run_here("calibrate", "repeatability", "out", "-o", "site.json", cwd=folder)
+    done = run_here("report", "a.nc", "--repeatability", "site.json", "-o", "site.html", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "at this site, by 10 masses and 30 exams." in (folder / "site.html").read_text()
+    run_here("report", "a.nc", "b.nc", "--repeatability", "site.json", "-o", "sites.html", cwd=folder)
+    assert "by these maps and this site&#x27;s other exams" in (folder / "sites.html").read_text()
+    assert "simulated bodies do" in run_page(folder)
+
+
+def run_page(folder: Path) -> str:
+    """The page of the map alone, with two intervals."""
+    run_here("report", "a.nc", "-o", "plain.html", "--force", cwd=folder)
+    return (folder / "plain.html").read_text()
+
+
 def test_repeats_are_pooled_and_shown_small(folder: Path) -> None:
     done = run_here("report", "a.nc", "b.nc", "-o", "two.html", cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -84,12 +143,17 @@ def test_a_session_in_a_file_that_was_made_by_hand_cannot_hurt_the_page(folder: 
 
 
 REFUSED = [
-    (("a.json",), 2, "a.json is an estimate's JSON; give its map, too"),
     (("a.json", "b.nc"), 3, "a.json: is not the estimate of b.nc; give the map it names"),
-    (("a.nc", "b.nc", "a.json"), 2, "an estimate's JSON goes with one map"),
+    (("post.nc", "b.nc"), 3, "post.nc: is not the estimate of b.nc; give the map it names"),
+    (("a.nc", "b.nc", "a.json"), 2, "an estimate goes with one map"),
+    (("post.nc", "a.json"), 2, "an estimate goes with one map"),
+    (("both.nc",), 3, "both.nc: holds a size pooled from several maps; give the maps"),
+    (("old.nc",), 3, "old.nc: holds draws without their estimate, as earlier versions wrote it; give its map"),
     (("a.nc", "a.nc"), 2, "a.nc is given twice; give each file once"),
     (("a.nc", "other.nc"), 3, "the maps differ in subject (P1, P2); give the maps of one mass"),
-    (("a.nc", "a.json", "--size-calibration", "eq6"), 2, "an estimate's JSON has settings of its own; leave out"),
+    (("a.nc", "a.json", "--size-calibration", "eq6"), 2, "an estimate has settings of its own; leave out --size"),
+    (("a.nc", "post.nc", "--interval", "0.95"), 2, "an estimate has settings of its own; leave out --interval"),
+    (("post.nc", "--settings", "a.json"), 2, "an estimate has settings of its own; leave out --settings"),
     (("a.nc", "--date", "1.3.2026"), 2, "--date '1.3.2026' is no date; give it as YEAR-MONTH-DAY"),
     (("a.nc", "--title", "x" * 61), 2, "--title is of 61 letters or not printable; give up to 60 letters"),
     (("a.nc", "--name", "a\nb"), 2, "--name is of 3 letters or not printable"),

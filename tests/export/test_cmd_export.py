@@ -115,14 +115,14 @@ def test_a_missing_extra_is_named_with_its_command(
 
 def test_the_command_offers_every_format() -> None:
     from tactile_bayes.commands import export
-    from tactile_bayes.export import run
+    from tactile_bayes.exports import run
 
     assert export._FORMATS == run.FORMATS
     assert tuple(name for name, _, _ in export._IDENTITY) == run.TAKES["dicom"]
 
 
 def test_the_guide_lists_the_codes_of_the_own_scheme() -> None:
-    from tactile_bayes.export.codes import OWN
+    from tactile_bayes.exports.codes import OWN
     from tests.conftest import ROOT
 
     guide = (ROOT / "docs" / "guides" / "export.md").read_text(encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,18 @@ def test_identity_is_as_given_and_what_nobody_gave_is_empty(files: dict[str, Any
     assert "S01" not in str(nobody), "the scan's subject is no patient ID unless told"
 
 
+@contextmanager
+def image_of(path: Path) -> Iterator[Any]:
+    """An image as highdicom reads it.
+
+    It is looked up by a database in memory that highdicom does not close: from Python 3.13 on that is a warning, which
+    comes whenever the garbage is collected, so in some other test.
+    """
+    image = hd.imread(path)
+    with closing(image._db_con):
+        yield image
+
+
 @pytest.mark.parametrize("degrees", [0.0, 80.0, 200.0, 280.0])
 def test_values_lie_at_their_places_in_the_patient(degrees: float, tmp_path: Path) -> None:
     """highdicom's affine of the image against the program's transforms, for all four quarter turns of the picture."""
@@ -79,8 +92,8 @@ def test_values_lie_at_their_places_in_the_patient(degrees: float, tmp_path: Pat
     scans = ({"sha256": "a" * 64, "side": "right", "posture": "sitting"},)
     write_map(tmp_path / "m.nc", one, provenance=Provenance("test", {}, scans=scans))
     exported(tmp_path, "m.nc", *DATED, "-o", tmp_path / "out")
-    image = hd.imread(tmp_path / "out" / "map.dcm")
-    volume = image.get_volume(apply_real_world_transform=False)
+    with image_of(tmp_path / "out" / "map.dcm") as image:
+        volume = image.get_volume(apply_real_world_transform=False)
     assert image.SharedFunctionalGroupsSequence[0].FrameAnatomySequence[0].FrameLaterality == "R"
     assert one.patient_from_plane is not None
     for row, column in ((0, 50), (23, 26), (50, 50), (10, 7)):

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from export_files import exported
 
-from tactile_bayes.export.exam import findings_of
+from tactile_bayes.exports.exam import findings_of
 
 bundles = pytest.importorskip("fhir.resources.R4B.bundle")
 

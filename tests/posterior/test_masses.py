@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import run_here
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from posterior_maps import bump_values, correlated_field, grid_map
 
 import tactile_bayes as tb
+from tactile_bayes.api.estimates import SizeEstimate
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import Outcome, estimate_one
+from tactile_bayes.pipeline.one_map import Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.posterior.masses import with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
@@ -138,6 +141,38 @@ def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
     assert found.masses[0].reported
     assert "mass 2" in [text.get_text() for text in found.plot_map().axes[0].texts]
     assert "mass 1" not in [text.get_text() for text in tb.estimate(tb.demo_map()).plot_map().axes[0].texts]
+
+
+def test_a_mass_besides_the_reported_one_has_its_axes_their_angle_and_its_ellipse() -> None:
+    """The second bump is 5.5 by 3.2 mm wide, its long axis 35 degrees from x towards y."""
+    rng = np.random.default_rng(1)
+    half = {"half_mm": 35.0}
+    values = bump_values(**half, x=WIDE[0], y=WIDE[1], sigma_x=7.5, sigma_y=7.5, amplitude=0.4)
+    values += bump_values(
+        **half, x=NARROW[0], y=NARROW[1], sigma_x=5.5, sigma_y=3.2, angle_deg=35.0, amplitude=0.4, level=0.0
+    )
+    values += 0.005 * correlated_field(rng, len(values), length_cells=3.0)
+    noisy = values + 0.005 * rng.standard_normal(values.shape)
+    found = found_on(grid_map(noisy, normalise="gain"))
+    document = answer_of(found).document
+    assert document is not None
+    check_document(document, "estimate.schema.json", path=Path("two.json"))
+    reported, second = document["masses"]
+    for name in ("d_x_mm", "d_y_mm", "angle_deg"):
+        assert reported[name] == document[name], name  # which are the first mass's
+    along, across, angle = (second[name] for name in ("d_x_mm", "d_y_mm", "angle_deg"))
+    assert angle["low"] < 35.0 < angle["high"] < 55.0
+    assert across["low"] < across["median"] < across["high"] < along["median"] < along["high"]
+    assert second["max_size_mm"]["median"] == pytest.approx(along["median"], rel=0.03)
+    assert second["position"] is None  # no nipple was touched
+    (drawn,) = (one for one in draw_map(found).axes[0].patches if isinstance(one, Ellipse) and not one.get_label())
+    long, short = sorted((drawn.get_width(), drawn.get_height()), reverse=True)
+    assert (long, short) == pytest.approx((along["median"], across["median"]), rel=1e-6)
+    assert drawn.angle % 180.0 == pytest.approx(angle["median"], abs=0.01)
+
+
+def draw_map(outcome: Outcome) -> Figure:
+    return SizeEstimate(outcome).plot_map()
 
 
 def test_both_masses_of_a_shared_scan_are_listed_and_hold(shared_data: Path, tmp_path: Path) -> None:

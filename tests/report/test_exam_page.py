@@ -269,10 +269,32 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
     assert len(page.named("path", **{"class": "centre"})) == 2
 
 
+def test_a_second_mass_is_drawn_as_its_ellipse_and_as_a_circle_by_an_older_estimate() -> None:
+    tactile_map, document = demo()
+    size = document["max_size_mm"]
+    axes = {"d_x_mm": size, "d_y_mm": {**size, "median": size["median"] / 2}, "angle_deg": {"median": 90.0}}
+    first = {**unsized(""), "number": 1, "reported": True}
+    second = {**unsized(""), "centre_mm": {"x": 0.0, "y": 0.0}, "max_size_mm": size, "min_size_mm": size}
+
+    def extents(mass: dict[str, Any]) -> tuple[float, float]:
+        both = {**document, "masses": [first, mass]}
+        page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
+        path = page.named("path", **{"class": "size"})[1]["d"]
+        points = np.array([[float(n) for n in pair.split()] for pair in path.strip("MZ").split("L")])
+        return float(np.ptp(points[:, 0])), float(np.ptp(points[:, 1]))
+
+    (frame,) = Page(exam_page(exam())).named("svg", **{"class": "map"})
+    scale = (float(frame["viewbox"].split()[2]) - 10) / (tactile_map.mean.shape[1] * tactile_map.recipe.cell_mm)
+    long = scale * size["median"]
+    assert extents({**second, **axes}) == pytest.approx((long / 2, long), rel=0.01)
+    assert extents(second) == pytest.approx((long, long), rel=0.01)
+
+
 def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     with_lump, without = exam().maps[0], without_lump().maps[0]
     size = {name: with_lump.document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
     pooled = {**size, "reason": "", "figures": with_lump.document["diagnostics"], "fat_apart_mm": None}
+    pooled["provenance"] = with_lump.document["provenance"]
     pooled["maps"] = [{"map": f"map {n}", "outlying": False} for n in (1, 2)]
     both = Exam((without, with_lump), pooled, SCANS)
     assert both.main is with_lump
@@ -288,6 +310,16 @@ def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() ->
     assert "of the xiphoid and" in page.words
     assert "No clock position: the scan names no nipple and no side." in page.words
     assert page.named("svg", **{"class": "dial"}) == []
+
+
+def test_a_lump_on_the_other_side_of_the_body_than_the_scan_says_is_a_caution() -> None:
+    """The demo's lump lies to the patient's right of the xiphoid, where a left breast is not."""
+    words = {side: Page(exam_page(exam(({"side": side},)))).words for side in ("left", "right", "phantom", "")}
+    told = (
+        "Caution: the scan says left breast, and the landmarks put the lump 60 mm to the patient's right of the xiphoid"
+    )
+    assert told in words.pop("left")
+    assert all("landmarks put the lump" not in text for text in words.values())
 
 
 def test_a_nipple_off_the_map_is_pointed_to() -> None:

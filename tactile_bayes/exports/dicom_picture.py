@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from tactile_bayes.export.dicom_file import EXPLICIT_LITTLE_ENDIAN, MANUFACTURER, Study, add_study
-from tactile_bayes.export.exam import EstimateFile, MapFile
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.picture import map_picture
+from tactile_bayes.exports.dicom_file import EXPLICIT_LITTLE_ENDIAN, MANUFACTURER, Study, add_study
+from tactile_bayes.exports.exam import EstimateFile, MapFile
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.picture import map_picture
 from tactile_bayes.presets import RESEARCH_USE
 
 SERIES: Final = 2

@@ -9,14 +9,14 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes import __version__
-from tactile_bayes.export import codes
-from tactile_bayes.export.codes import Code
-from tactile_bayes.export.dicom_file import MANUFACTURER, MODEL, Study, add_study, coded, declare_scheme
-from tactile_bayes.export.dicom_map import PARAMETRIC_MAP, frame_of_reference
-from tactile_bayes.export.exam import EstimateFile, Finding, MapFile
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.place import lps_from_plane, on_plane
-from tactile_bayes.export.uids import content_uid
+from tactile_bayes.exports import codes
+from tactile_bayes.exports.codes import Code
+from tactile_bayes.exports.dicom_file import MANUFACTURER, MODEL, Study, add_study, coded, declare_scheme
+from tactile_bayes.exports.dicom_map import PARAMETRIC_MAP, frame_of_reference
+from tactile_bayes.exports.exam import EstimateFile, Finding, MapFile
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.place import lps_from_plane, on_plane
+from tactile_bayes.exports.uids import content_uid
 from tactile_bayes.presets import RESEARCH_USE
 
 SERIES: Final = 3

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.export.dicom_file import dicom_bytes, study_of
-from tactile_bayes.export.dicom_map import frame_of_reference, parametric_map
-from tactile_bayes.export.dicom_picture import secondary_capture
-from tactile_bayes.export.dicom_report import structured_report
-from tactile_bayes.export.exam import EstimateFile, MapFile
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.identity import Identity
+from tactile_bayes.exports.dicom_file import dicom_bytes, study_of
+from tactile_bayes.exports.dicom_map import frame_of_reference, parametric_map
+from tactile_bayes.exports.dicom_picture import secondary_capture
+from tactile_bayes.exports.dicom_report import structured_report
+from tactile_bayes.exports.exam import EstimateFile, MapFile
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.identity import Identity
 
 VALUES, PICTURE, REPORT = "map", "picture", "report"
 

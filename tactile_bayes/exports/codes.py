@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from tactile_bayes.export.uids import content_uid
+from tactile_bayes.exports.uids import content_uid
 
 
 class Code(NamedTuple):

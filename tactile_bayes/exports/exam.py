@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.export.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
+from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.kinds import HDF5_MAGIC
@@ -167,7 +168,7 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
     listed = document if isinstance(document, list) else [document]
     if not listed:
         raise BadDataError("is an empty list", way_out=_WAY_OUT, path=str(path))
-    return [_of_document(one, path) for one in listed]
+    return [estimate_of(one, path) for one in listed]
 
 
 def _read_map(path: Path) -> MapFile:
@@ -190,7 +191,14 @@ def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
     }
 
 
-def _of_document(document: object, path: Path) -> EstimateFile:
+def estimate_of(document: object, path: Path) -> EstimateFile:
+    """An estimate from its JSON object; `path` is what messages call it.
+
+    Raises
+    ------
+    BadDataError
+        When it is no estimate.
+    """
     schema = document.get("schema") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(schema, str) or schema not in _SCHEMAS:
         from tactile_bayes.files.kinds import schema_kind
@@ -282,10 +290,12 @@ def _map_digests(provenance: object) -> tuple[str, ...]:
 
 
 def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
-    """Sizes of a posterior's draws, with the interval of the estimate that wrote them."""
-    from tactile_bayes.files.posterior_nc import read_posterior
+    """The estimate that a posterior's file holds, or of an earlier or pooled one the sizes of its draws."""
+    from tactile_bayes.files.posterior_nc import read_estimate, read_posterior
     from tactile_bayes.inference.summary import summarise
 
+    if "estimate" in attributes:
+        return replace(estimate_of(read_estimate(path), path), kind="posterior", digest=sha256(path))
     held = read_posterior(path)
     provenance = parse_json(attributes.get("provenance", "{}"), name="provenance")
     if not isinstance(provenance, dict):

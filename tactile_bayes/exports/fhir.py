@@ -8,12 +8,12 @@ from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, one_line
-from tactile_bayes.export import codes
-from tactile_bayes.export.codes import FHIR_SYSTEMS, Code
-from tactile_bayes.export.exam import EstimateFile, Finding, size_words
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.identity import Identity
-from tactile_bayes.export.uids import content_uuid
+from tactile_bayes.exports import codes
+from tactile_bayes.exports.codes import FHIR_SYSTEMS, Code
+from tactile_bayes.exports.exam import EstimateFile, Finding, size_words
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.identity import Identity
+from tactile_bayes.exports.uids import content_uuid
 from tactile_bayes.files.schema import dump_json
 from tactile_bayes.presets import RESEARCH_USE
 

@@ -6,13 +6,13 @@ import contextlib
 import logging
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.identity import Identity
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.identity import Identity
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.keys import refuse_unknown
 from tactile_bayes.files.reading import read_bytes
@@ -34,6 +34,19 @@ _ATTRIBUTES: Final = {
     "study_uid": "StudyInstanceUID",
 }
 _TAG: Final = re.compile(r"[0-9A-Fa-f]{8}")
+
+
+def identity_of(worklist: Path | None, given: Mapping[str, str]) -> Identity:
+    """The identity that a worklist gives, where there is one, with what is given besides.
+
+    Raises
+    ------
+    BadDataError
+        As of `read_worklist`.
+    UsageError
+        When both say something else.
+    """
+    return Identity(**given) if worklist is None else read_worklist(worklist).with_options(given)
 
 
 def read_worklist(path: Path) -> Identity:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.export.exam import MapFile
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.place import lps_from_plane, on_plane
+from tactile_bayes.exports.exam import MapFile
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.place import lps_from_plane, on_plane
 from tactile_bayes.presets import RESEARCH_USE
 
 

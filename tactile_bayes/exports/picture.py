@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.export.exam import EstimateFile, MapFile
+from tactile_bayes.exports.exam import EstimateFile, MapFile
 
 _MOST_NOTE: Final = 400
 """Characters that have a place above the figure."""

@@ -9,11 +9,11 @@ from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import UsageError
-from tactile_bayes.export.codes import OWN_SCHEME, OWN_SCHEME_NAME, OWN_SCHEME_UID, Code
-from tactile_bayes.export.exam import MapFile
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.identity import Identity, Moment
-from tactile_bayes.export.uids import content_uid
+from tactile_bayes.exports.codes import OWN_SCHEME, OWN_SCHEME_NAME, OWN_SCHEME_UID, Code
+from tactile_bayes.exports.exam import MapFile
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.identity import Identity, Moment
+from tactile_bayes.exports.uids import content_uid
 from tactile_bayes.records import dataclass
 
 MANUFACTURER: Final = "tactile_bayes (research software)"

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final, Literal, get_args
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.export.exam import EstimateFile, MapFile, check_pairs, read_exam
-from tactile_bayes.export.identity import Identity
+from tactile_bayes.exports.exam import EstimateFile, MapFile, check_pairs
+from tactile_bayes.exports.identity import Identity
 from tactile_bayes.records import dataclass
 
 Format = Literal["dicom", "fhir", "nrrd", "csv"]
@@ -58,13 +58,15 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def export(paths: Sequence[Path], *, to: Format, identity: Identity, id_from_scan: bool = False) -> Exported:
+def export(
+    files: Iterable[MapFile | Sequence[EstimateFile]], *, to: Format, identity: Identity, id_from_scan: bool = False
+) -> Exported:
     """Export maps and estimates.
 
     Parameters
     ----------
-    paths
-        Maps, estimates (JSON) and posteriors, in any order.
+    files
+        As `read_exam` gives them for maps, estimates (JSON) and posteriors, in any order.
     identity
         Of patient and study; what the format does not hold is left out.
     id_from_scan
@@ -74,10 +76,8 @@ def export(paths: Sequence[Path], *, to: Format, identity: Identity, id_from_sca
     ------
     UsageError
         When the files do not fit the format or each other, or something that the format needs is missing.
-    BadDataError
-        When a file is damaged or of another kind.
     """
-    maps, estimates = _sorted(paths)
+    maps, estimates = _sorted(files)
     check_pairs(maps, estimates)
     given = {name: value for name, value in identity.given.items() if name in TAKES[to]}
     if to == "csv":
@@ -89,10 +89,9 @@ def export(paths: Sequence[Path], *, to: Format, identity: Identity, id_from_sca
     return _dicom(maps, estimates, who) if to == "dicom" else _fhir(maps, estimates, who)
 
 
-def _sorted(paths: Sequence[Path]) -> tuple[list[MapFile], list[EstimateFile]]:
+def _sorted(files: Iterable[MapFile | Sequence[EstimateFile]]) -> tuple[list[MapFile], list[EstimateFile]]:
     maps, estimates = list[MapFile](), list[EstimateFile]()
-    for path in paths:
-        found = read_exam(path)
+    for found in files:
         if isinstance(found, MapFile):
             maps.append(found)
         else:
@@ -133,7 +132,7 @@ def _one_estimate(estimates: Sequence[EstimateFile], to: Format) -> EstimateFile
 
 
 def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
-    from tactile_bayes.export.dicom import VALUES, dicom_files
+    from tactile_bayes.exports.dicom import VALUES, dicom_files
 
     if not maps:
         raise UsageError(f"a DICOM report refers to its map; give it too: export MAP.nc {estimates[0].path} --to dicom")
@@ -152,7 +151,7 @@ def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity:
 
 
 def _fhir(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
-    from tactile_bayes.export.fhir import bundle_json
+    from tactile_bayes.exports.fhir import bundle_json
 
     _refuse_maps(maps, estimates, "fhir")
     text = bundle_json(_one_estimate(estimates, "fhir"), identity)
@@ -170,7 +169,7 @@ def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to:
 
 
 def _nrrd(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], *, id_from_scan: bool) -> Exported:
-    from tactile_bayes.export.nrrd_map import nrrd_bytes
+    from tactile_bayes.exports.nrrd_map import nrrd_bytes
 
     if id_from_scan:
         raise UsageError("nrrd files hold no patient; leave out --patient-id-from-scan")
@@ -184,7 +183,7 @@ def _nrrd(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], *, id_from
 def _csv(
     maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity, *, id_from_scan: bool
 ) -> Exported:
-    from tactile_bayes.export.redcap import records_csv
+    from tactile_bayes.exports.redcap import records_csv
 
     _refuse_maps(maps, estimates, "csv")
     return Exported({"": records_csv(estimates, identity, id_from_scan=id_from_scan).encode()})

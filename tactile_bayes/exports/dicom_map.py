@@ -6,12 +6,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from tactile_bayes.export.codes import BREAST, PRESSURE, RELATIVE_PRESSURE
-from tactile_bayes.export.dicom_file import Study, add_study, coded, declare_scheme, item, laterality
-from tactile_bayes.export.exam import MapFile
-from tactile_bayes.export.extras import required
-from tactile_bayes.export.place import ImagePlane, image_plane, lps_from_plane
-from tactile_bayes.export.uids import content_uid
+from tactile_bayes.exports.codes import BREAST, PRESSURE, RELATIVE_PRESSURE
+from tactile_bayes.exports.dicom_file import Study, add_study, coded, declare_scheme, item, laterality
+from tactile_bayes.exports.exam import MapFile
+from tactile_bayes.exports.extras import required
+from tactile_bayes.exports.place import ImagePlane, image_plane, lps_from_plane
+from tactile_bayes.exports.uids import content_uid
 from tactile_bayes.presets import RESEARCH_USE
 
 PARAMETRIC_MAP: Final = "1.2.840.10008.5.1.4.1.1.30"
