@@ -1,6 +1,6 @@
 """Sizes estimated from scans of known lumps, through the commands a user would type.
 
-Usage: python -m benchmarks.known_scans DIRECTORY [--method importance] [--phantoms | --size-calibration NAME] [--known-seat]
+    python -m benchmarks.known_scans DIRECTORY [--method NAME] [--phantoms | --size-calibration NAME] [--known-seat]
 
 DIRECTORY holds ``phantoms.csv`` and ``scans/`` with ``*.npz`` and ``truth.csv`` (one row a lump). Nothing is tuned to
 them: every option has its default, and the calibration is the one that comes with the program. ``--phantoms`` learns
