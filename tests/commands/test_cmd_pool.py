@@ -138,7 +138,7 @@ def test_maps_that_do_not_tell_the_depth_of_the_fat_are_pooled_without_and_say_s
     head, fat, bodies = pooled["left_out"]
     assert "the map does not name its head" in head
     assert fat.startswith("the depth of the fat")
-    assert bodies.startswith("bodies unlike the calibration's (lumps 8 to 100 times as stiff as fat")
+    assert bodies.startswith("bodies unlike the calibration's (lumps 6 to 100 times as stiff as fat")
     assert f"Left out: {head}; the depth of the fat" in pooled_text(pooled)
     assert "Fat under the head 12.3 mm deep" in pooled_text(pooled | {"fat_mm": 12.3, "left_out": []})
 

@@ -118,7 +118,7 @@ def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder
     assert set(document("--known", "stiffness_ratio", "30")["supposing"]) == {"centred", "resting"}
     whole = run_here("estimate", "clear.nc", "--method", "laplace", "-v", cwd=folder).stdout
     assert "Were the lump soft (11 times as stiff as fat): " in whole
-    assert "bodies unlike the calibration's (lumps 8 to 100 times as stiff as fat" in whole
+    assert "bodies unlike the calibration's (lumps 6 to 100 times as stiff as fat" in whole
 
 
 def crowded() -> tuple[Estimate, dict]:
