@@ -164,7 +164,9 @@ def _draw_cells(axes: Axes, values: FloatArray, origin_mm: FloatArray, **how: An
 
 
 def _name_axes(axes: Axes, *, in_patient: bool) -> None:
-    words = ("left of the xiphoid (mm)", "above the xiphoid (mm)") if in_patient else ("-x (mm)", "y (mm)")
+    words = ("-x (mm)", "y (mm)")
+    if in_patient:
+        words = ("to the patient's left of the xiphoid (mm)", "above the xiphoid (mm)")
     axes.set_xlabel(words[0], fontsize=8)
     axes.set_ylabel(words[1], fontsize=8)
     axes.tick_params(labelsize=7)

@@ -115,7 +115,7 @@ def _lump(
     elif "centre_patient_mm.x" in quantities:
         x, y = (quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")
         parts.append(
-            f"{abs(x):.0f} mm {'right' if x >= 0 else 'left'} of the xiphoid and "
+            f"{abs(x):.0f} mm to the patient's {'right' if x >= 0 else 'left'} of the xiphoid and "
             f"{abs(y):.0f} mm {'above' if y >= 0 else 'below'} it"
         )
     if "centre_mm.x" in quantities:

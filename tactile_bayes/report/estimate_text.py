@@ -45,7 +45,7 @@ ROWS = (
     ("angle_deg", "angle of the ellipse", "deg"),
     ("centre_mm.x", "centre on the map, x", "mm"),
     ("centre_mm.y", "centre on the map, y", "mm"),
-    ("centre_patient_mm.x", "centre right of the xiphoid, x", "mm"),
+    ("centre_patient_mm.x", "patient's right of xiphoid, x", "mm"),
     ("centre_patient_mm.y", "centre above the xiphoid, y", "mm"),
 )
 NEAR_LEVEL = 0.02
