@@ -17,6 +17,9 @@ Buerkner, Gabry & Vehtari (2021), Computational Statistics 36:1243 (non-factoris
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
 from math import lgamma, log, pi
 
 import numpy as np
@@ -44,18 +47,14 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
     window, fixed = target.window, _fixed_columns(target)
     templates = [window.of_cells(one.full()) for one in target.scene.templates(theta, window)]
-    cosines = _cosines(target)
-    inverse, h = np.full((len(theta), len(window.cells)), -np.inf), 0
-    for columns in target.fields:
-        low = cosines @ columns.field.turn
-        for index in range(len(columns.shares)):
-            precision = _Precision(1.0 / window.variance, low, columns, index)
-            for m in np.flatnonzero(log_share[:, h] > log(LEAST_SHARE)):
-                regressors = np.stack([*fixed, *(one[m] for one in templates)])
-                found = _without_each(precision, regressors, window.cells.value)
-                # p(field | the others) is its share over the cell's density under it
-                inverse[m] = np.logaddexp(inverse[m], log_share[m, h] - found)
-            h += 1
+    inverse = np.full((len(theta), len(window.cells)), -np.inf)
+    for h, precision_of_field in enumerate(_fields(target)):
+        precision = precision_of_field()
+        for m in np.flatnonzero(log_share[:, h] > log(LEAST_SHARE)):
+            regressors = np.stack([*fixed, *(one[m] for one in templates)])
+            found = _without_each(precision, regressors, window.cells.value)
+            # p(field | the others) is its share over the cell's density under it
+            inverse[m] = np.logaddexp(inverse[m], log_share[m, h] - found)
     return -inverse
 
 
@@ -74,21 +73,19 @@ def predictive_values(target: CollapsedTarget, theta: FloatArray, rng: np.random
     evidence, window = target.by_field(theta), target.window
     share = np.exp(evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]).cumsum(axis=1)
     chosen = (share < share[:, -1:] * rng.uniform(size=(len(theta), 1))).sum(axis=1)
-    fixed, cosines, middle = _fixed_columns(target), _cosines(target), window.cells.value.mean()
+    fixed, middle = _fixed_columns(target), window.cells.value.mean()
     templates = [window.of_cells(one.full()) for one in target.scene.templates(theta, window)]
-    drawn, h = np.empty((len(theta), len(window.cells))), 0
-    for columns in target.fields:
-        low = cosines @ columns.field.turn
-        for index in range(len(columns.shares)):
-            of_field, h = np.flatnonzero(chosen == h), h + 1
-            if not of_field.size:
-                continue
-            precision = _Precision(1.0 / window.variance, low, columns, index)
-            root = np.linalg.cholesky(precision.dense())
-            noise = np.linalg.solve(root.T, rng.standard_normal((len(low), len(of_field)))).T
-            for m, errors in zip(of_field, noise, strict=True):
-                regressors = np.stack([*fixed, *(one[m] for one in templates)])
-                drawn[m] = middle + _predicted(precision, regressors, window.cells.value - middle, errors, rng)
+    drawn = np.empty((len(theta), len(window.cells)))
+    for h, precision_of_field in enumerate(_fields(target)):
+        of_field = np.flatnonzero(chosen == h)
+        if not of_field.size:
+            continue
+        precision = precision_of_field()
+        root = np.linalg.cholesky(precision.dense())
+        noise = np.linalg.solve(root.T, rng.standard_normal((len(window.cells), len(of_field)))).T
+        for m, errors in zip(of_field, noise, strict=True):
+            regressors = np.stack([*fixed, *(one[m] for one in templates)])
+            drawn[m] = middle + _predicted(precision, regressors, window.cells.value - middle, errors, rng)
     return drawn
 
 
@@ -109,18 +106,23 @@ def _predicted(
 def fitted_values(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
     """(n,) values of the model without noise at a (p,) shape, by generalised least squares in the likeliest field."""
     window, at = target.window, theta[None]
-    likeliest, h = int(np.argmax(target.by_field(at)[0])), 0
+    likeliest = int(np.argmax(target.by_field(at)[0]))
     templates = [window.of_cells(one.full())[0] for one in target.scene.templates(at, window)]
     regressors = np.stack([*_fixed_columns(target), *templates])
-    for columns in target.fields:
-        if likeliest < h + len(columns.shares):
-            break
-        h += len(columns.shares)
-    precision = _Precision(1.0 / window.variance, _cosines(target) @ columns.field.turn, columns, likeliest - h)
+    precision = next(islice(_fields(target), likeliest, None))()
     middle = window.cells.value.mean()
     across = precision.times(regressors)
     solved = np.linalg.solve(across @ regressors.T, across @ (window.cells.value - middle))
     return np.asarray(middle + solved @ regressors)
+
+
+def _fields(target: CollapsedTarget) -> Iterator[Callable[[], _Precision]]:
+    """What makes the precision of each field and share, in the order of `CollapsedTarget.by_field`."""
+    cosines = _cosines(target)
+    for columns in target.fields:
+        low = cosines @ columns.field.turn
+        for index in range(len(columns.shares)):
+            yield partial(_Precision, 1.0 / target.window.variance, low, columns, index)
 
 
 def _cosines(target: CollapsedTarget) -> FloatArray:
