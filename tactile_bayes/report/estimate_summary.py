@@ -19,6 +19,7 @@ from tactile_bayes.report.estimate_text import (
     tracker_share,
     warnings,
 )
+from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.masses_document import MassDocument, mass_lines, numbered
 from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
 from tactile_bayes.report.scene_text import scene_line
@@ -113,11 +114,7 @@ def _lump(
     if place is not None:
         parts.append(place.text())
     elif "centre_patient_mm.x" in quantities:
-        x, y = (quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")
-        parts.append(
-            f"{abs(x):.0f} mm to the patient's {'right' if x >= 0 else 'left'} of the xiphoid and "
-            f"{abs(y):.0f} mm {'above' if y >= 0 else 'below'} it"
-        )
+        parts.append(from_xiphoid(*(quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")))
     if "centre_mm.x" in quantities:
         parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*(quantities[f"centre_mm.{a}"].median for a in "xy")))
     text = ", ".join(parts)

@@ -13,7 +13,7 @@ from tactile_bayes.mapping.clock_face import SIDES, clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
-from tactile_bayes.report.lump_place import side_of
+from tactile_bayes.report.lump_place import from_xiphoid, side_of
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
 
@@ -132,7 +132,7 @@ def short_place(mass: ExamMass) -> str:
     if mass.place is not None:
         return _capital(mass.place.text())
     if mass.patient_mm is not None:
-        return _capital(_from_xiphoid(*mass.patient_mm))
+        return _capital(from_xiphoid(*mass.patient_mm))
     return "At ({:.0f}, {:.0f}) mm on the map".format(*mass.centre_mm)
 
 
@@ -265,11 +265,6 @@ def _between(low: float, high: float, words: tuple[str, str]) -> str:
     if high <= 0:
         return f"{-high:.0f} to {-low:.0f} mm {words[0]}"
     return f"{-low:.0f} mm {words[0]} to {high:.0f} mm {words[1]}"
-
-
-def _from_xiphoid(x_mm: float, y_mm: float) -> str:
-    across = f"{abs(x_mm):.0f} mm to the patient's {'right' if x_mm >= 0 else 'left'}"
-    return f"{across} of the xiphoid and {abs(y_mm):.0f} mm {'above' if y_mm >= 0 else 'below'} it"
 
 
 def _landmarks(tactile_map: TactileMap) -> str:

@@ -40,3 +40,9 @@ def place_line(place: ClockPosition, probability: float) -> str:
     hours, (near, far) = place.hours_between(probability), place.distance_between(probability)
     clock = "" if hours is None else f" {clock_text(hours[0])} to {clock_text(hours[1])} o'clock and"
     return f"Place: {place.text()}; {100 * probability:g} % interval{clock} {near:.0f} to {far:.0f} mm."
+
+
+def from_xiphoid(x_mm: float, y_mm: float) -> str:
+    """A place in the patient's axes, in words."""
+    across = f"{abs(x_mm):.0f} mm to the patient's {'right' if x_mm >= 0 else 'left'}"
+    return f"{across} of the xiphoid and {abs(y_mm):.0f} mm {'above' if y_mm >= 0 else 'below'} it"
