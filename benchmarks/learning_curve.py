@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.normal import skewed_score
 from tactile_bayes.pipeline.size_calibration import FORMS, population_learner, rows_of_one_way
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import Recipe
@@ -56,14 +57,43 @@ def main() -> None:
         for form in given.forms:
             learn = partial(population_learner(form), recipe=Recipe(way, "free", 20.0, noise="field"))
             held = [_held_out(table, learn, ways, number, given.seed + i) for i in range(given.repeats)]
-            found = [
-                tuple(np.concatenate(parts) for parts in zip(*one, strict=True)) for one in zip(*held, strict=True)
-            ]
-            for known, (error, variance, _) in zip(ways, found, strict=True):
-                print(f"{number:5d} {form:17s} {_figures(error, variance)}{_words(known)}", flush=True)
-    for known, (error, variance, body) in zip(ways, found, strict=True):
+            found = [Sized.joined(one) for one in zip(*held, strict=True)]
+            for known, sized in zip(ways, found, strict=True):
+                print(f"{number:5d} {form:17s} {sized.figures()}{_words(known)}", flush=True)
+    for known, sized in zip(ways, found, strict=True):
         print(f"by classes{_words(known)}")
-        _by_class(table, error, variance, body)
+        _by_class(table, sized)
+
+
+@dataclass(frozen=True, slots=True)
+class Sized:
+    """Bodies that took no part: (b,) ln of sized over true size, stated variance and skewness, and their numbers."""
+
+    error: FloatArray
+    variance: FloatArray
+    skewness: FloatArray
+    body: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Sized]) -> Sized:
+        """Those of several draws of bodies."""
+        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__match_args__))
+
+    def rows(self, members: FloatArray) -> Sized:
+        """Some of them."""
+        return Sized(*(getattr(self, name)[members] for name in Sized.__match_args__))
+
+    def figures(self) -> str:
+        """Errors and intervals in words."""
+        sd = np.sqrt(self.variance)
+        low, high = (sd * skewed_score(np.full(len(sd), z), self.skewness) for z in (-_NORMAL_95, _NORMAL_95))
+        held = (low < -self.error) & (-self.error < high)
+        off = np.expm1(self.error)
+        return (
+            f"{len(sd):5d} bodies  MAE {100 * np.mean(np.abs(off)):5.2f} %  bias {100 * np.mean(off):+5.2f} %  "
+            f"held {100 * np.mean(held):5.1f} %  SD of standardised errors {(self.error / sd).std():.2f}  "
+            f"median half width {50 * np.median(np.exp(high) - np.exp(low)):.1f} %"
+        )
 
 
 def _words(known: Sequence[str]) -> str:
@@ -76,21 +106,21 @@ def _held_out(
     ways: Sequence[Sequence[str]],
     number: int,
     seed: int,
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """(b,) log errors, their variances and the bodies' numbers, of those that took no part, for each known set."""
+) -> list[Sized]:
+    """The bodies that took no part, sized with each set of known properties."""
     bodies = np.unique(table.body)
     taught = np.random.default_rng(seed).permutation(bodies)[:number]
     calibration = learn(table.rows(np.isin(table.body, taught)))
     rest = np.setdiff1d(bodies, taught)
     exams = [table.rows(table.body == one) for one in rest]
     sized = (np.array([size_error(calibration, one, known=known) for one in exams]) for known in ways)
-    return [(found[:, 0], found[:, 1], rest) for found in sized]
+    return [Sized(*found.T, rest) for found in sized]
 
 
 def size_error(
     calibration: BodyCalibration, exams: PopulationTable, *, known: Sequence[str] = ()
-) -> tuple[float, float]:
-    """Log error of one body by the mean of its exams, and the variance that the calibration states.
+) -> tuple[float, float, float]:
+    """Log error of one body by the mean of its exams, and the variance and skewness that the calibration states.
 
     Parameters
     ----------
@@ -107,9 +137,10 @@ def size_error(
     told = {name: float(exams.unknowns[name][0]) for name in known}
     told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
     own_sd = np.sqrt(np.maximum(body**2 - at.other_sd**2, 0.0))
-    expected, left = known_body(at, told, *middle, own_sd)
-    variance = left[0] + at.other_sd**2 + error[0] + exam / len(exams)
-    return float(size.mean() + expected[0] - np.log(exams.d_mm[0])), float(variance)
+    left = known_body(at, told, *middle, own_sd)
+    variance = left.variance[0] + at.other_sd**2 + error[0] + exam / len(exams)
+    skewness = left.skewness[0] * (left.variance[0] / variance) ** 1.5
+    return float(size.mean() + left.expected[0] - np.log(exams.d_mm[0])), float(variance), float(skewness)
 
 
 def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...] | None]:
@@ -119,20 +150,10 @@ def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...
     return [tuple(one) if np.isfinite(one).all() else None for one in figures]
 
 
-def _figures(error: FloatArray, variance: FloatArray) -> str:
-    standard = error / np.sqrt(variance)
-    return (
-        f"{len(error):5d} bodies  MAE {100 * np.mean(np.abs(np.expm1(error))):5.2f} %  "
-        f"bias {100 * np.mean(np.expm1(error)):+5.2f} %  held {100 * np.mean(np.abs(standard) < _NORMAL_95):5.1f} %  "
-        f"SD of standardised errors {standard.std():.2f}  median half width "
-        f"{100 * np.median(np.expm1(_NORMAL_95 * np.sqrt(variance))):.1f} %"
-    )
-
-
-def _by_class(table: PopulationTable, error: FloatArray, variance: FloatArray, body: FloatArray) -> None:
+def _by_class(table: PopulationTable, sized: Sized) -> None:
     """The last form's figures for soft, centred, deep and faint lumps, and for clear ones."""
     first = {one: int(np.flatnonzero(table.body == one)[0]) for one in np.unique(table.body)}
-    row = np.array([first[one] for one in body])
+    row = np.array([first[one] for one in sized.body])
     stiffness, seat = np.exp(table.unknowns["stiffness_ratio"][row]), table.unknowns["seat"][row]
     ratio = np.exp(table.unknowns["depth_mm"][row]) / table.d_mm[row]
     amplitude = np.exp(table.log_amplitude[row])
@@ -150,7 +171,7 @@ def _by_class(table: PopulationTable, error: FloatArray, variance: FloatArray, b
     }
     for name, members in classes.items():
         if members.sum() > 1:
-            print(f"{name:37s} {_figures(error[members], variance[members])}")
+            print(f"{name:37s} {sized.rows(members).figures()}")
 
 
 if __name__ == "__main__":

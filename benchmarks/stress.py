@@ -4,8 +4,8 @@
     python -m benchmarks.stress table FOLDER
 
 `simulate` scans each body once without stress and once under every one of `STRESSES`, by `benchmarks.stress_frames`;
-two more bodies without stress for each serve to set the flags' limits. Scans and reports are kept in the folder, and an
-interrupted run goes on where it stopped. A body takes about 40 s.
+two more bodies without stress for each serve to set the flags' limits. Scans are kept in the folder, and an interrupted
+run goes on where it stopped; `table` maps and sizes them by the present program. A body takes about 40 s.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.stress_frames import Physics, VaryingLayers, stressed_scan
-from tactile_bayes.errors import TactileBayesError
+from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.population import BodyPrior, draw_mass
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
@@ -149,7 +149,7 @@ def document_of(scan: Scan) -> dict[str, Any]:
 
 
 def simulate(folder: Path, bodies: int) -> None:
-    """Make what is missing of the scans and reports."""
+    """Make what is missing of the scans."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, body in jobs(bodies):
         path = folder / f"{body:04d}-{name.replace(' ', '_')}.pickle"
@@ -158,7 +158,7 @@ def simulate(folder: Path, bodies: int) -> None:
         try:
             scene, scan = scan_of(name, body)
             kept: dict[str, Any] = {"name": name, "body": body, "d_mm": scene.solid_lumps[0].d_mm, "scene": scene}
-            kept |= {"scan": scan, "document": document_of(scan)}
+            kept["scan"] = scan
         except TactileBayesError as error:
             kept = {"name": name, "body": body, "error": str(error)}
         partial = path.with_suffix(".part")
@@ -199,8 +199,11 @@ outside the calibration's range; a head profile that gives no depth of fat."""
 
 
 def exam_of(kept: dict[str, Any]) -> Exam:
-    """Figures of a kept scan and report; the map is built anew, so that flags are those of the present program."""
-    document, quality = kept["document"], build_map(kept["scan"]).quality
+    """Figures of a kept scan, mapped and sized anew: by the present program and its calibrations."""
+    if "error" in kept:
+        raise BadDataError(kept["error"])
+    document = document_of(kept["scan"])
+    quality = document["quality"]
     diagnostics, true = document.get("diagnostics") or {}, kept["d_mm"]
     spoken = {
         "lag": any("opposite" in text for text in broken_assumptions(quality)),
@@ -232,10 +235,10 @@ def exams_in(folder: Path) -> list[Exam]:
     found = []
     for path in sorted(folder.glob("*.pickle")):
         kept = pickle.loads(path.read_bytes())
-        if "error" in kept:
-            print(f"{kept['name']}, body {kept['body']}: {kept['error']}")
-            continue
-        found.append(exam_of(kept))
+        try:
+            found.append(exam_of(kept))
+        except TactileBayesError as error:
+            print(f"{kept['name']}, body {kept['body']}: {error}")
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
-from tactile_bayes.files.shipped import is_shipped
+from tactile_bayes.files.shipped import SHIPPED, is_shipped
 from tactile_bayes.files.size_parts_json import array_of, number
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.eq6 import (
@@ -54,13 +55,22 @@ def write_size_calibration(
 
 
 def read_size_calibration(path: Path) -> Calibration:
-    """Read a size calibration of any form.
+    """Read a size calibration of any form; one that comes with the program is read once in a process.
 
     Raises
     ------
     BadDataError
         When the file is not one, or a field breaks the schema.
     """
+    return _shipped(path) if is_shipped(path) else _read(path)
+
+
+@lru_cache(maxsize=len(SHIPPED))
+def _shipped(path: Path) -> Calibration:
+    return _read(path)
+
+
+def _read(path: Path) -> Calibration:
     document: Any = load_json(path)
     if isinstance(document, dict) and document.get("form") == "site":
         from tactile_bayes.files import size_site_json as site

@@ -23,6 +23,7 @@ def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
         **({} if hidden.by_place is None else {"by_place": numbers(hidden.by_place)}),
         **({"inverted": list(hidden.inverted)} if hidden.inverted else {}),
         **({"most_sd": number(hidden.most_sd)} if np.isfinite(hidden.most_sd) else {}),
+        **({"skewness": number(hidden.skewness)} if hidden.skewness else {}),
     }
 
 
@@ -47,6 +48,7 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
         by_place=by_place,
         inverted=tuple(document.get("inverted", ())),
         most_sd=float(document.get("most_sd", np.inf)),
+        skewness=float(document.get("skewness", 0.0)),
     )
 
 

@@ -171,6 +171,11 @@ class BodyCalibration:
         return {} if self.hidden is None else {name: self.hidden.share(name) for name in self.hidden.names}
 
     @property
+    def is_skewed(self) -> bool:
+        """Whether B is longer above than below."""
+        return self.hidden is not None and self.hidden.skewness > 0.0
+
+    @property
     def coefficients(self) -> int:
         """How many the form has."""
         raise NotImplementedError

@@ -18,6 +18,9 @@ INVERTED = ("stiffness_ratio",)
 
 Files of earlier versions have them by the logarithm; each file says what it has.
 """
+SKEWED_BY = "stiffness_ratio"
+"""The property that makes B skewed: its inverse is, of lumps whose stiffness is spread evenly by its logarithm."""
+MOST_SKEWNESS = 1.0
 MOST_SHARE = 0.9
 """Share of B's variance that all properties together tell at most.
 
@@ -90,6 +93,8 @@ class HiddenTerms:
         Those that enter by their inverse.
     most_sd
         SD(B) beyond which these properties explain no more of B: of faint and deep lumps it is the map that is unlike.
+    skewness
+        Of B: its third central moment over the cube of SD(B). It goes with `SKEWED_BY`.
     """
 
     names: tuple[str, ...]
@@ -100,6 +105,7 @@ class HiddenTerms:
     by_place: FloatArray | None = None
     inverted: tuple[str, ...] = ()
     most_sd: float = float("inf")
+    skewness: float = 0.0
 
     def share(self, *names: str) -> float:
         """Share of B's variance removed by knowing these properties, at most `MOST_SHARE`."""
@@ -119,6 +125,12 @@ class HiddenTerms:
         at = self.names.index(name)
         off = self._entered(name, value) - features @ self.expected[at]
         return float(abs(off) / np.sqrt(self.covariance[at, at]))
+
+    def skewness_left(self, known: Mapping[str, float], left: FloatArray) -> FloatArray:
+        """(n,) skewness of what is left of B, given (n,) the share of its variance that is left."""
+        if SKEWED_BY in known:
+            return np.zeros_like(left)
+        return np.asarray(np.minimum(self.skewness * np.maximum(left, 1.0 - MOST_SHARE) ** -1.5, MOST_SKEWNESS))
 
     def at_depth(self, contraction: FloatArray) -> HiddenTerms:
         """The terms at one depth of fat, by the matrix that takes what is linear in the features to that depth."""

@@ -25,11 +25,14 @@ from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import OVAL_SD, Elongation, ShapePrior, elongation, shown_share, turn_matrix
 from tactile_bayes.size.posterior import SizePosterior, shares
 from tactile_bayes.size.site_shift import site_log_shift, site_variance
-from tactile_bayes.size.supposed import known_body, suppositions
+from tactile_bayes.size.supposed import BodyLeft, known_body, suppositions
 
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
-"""Of the points: ln d given tau and the spread of B, these two, oval or round, and the two components of an oval."""
+"""Of the points: ln d given all else, tau, the spread of B, oval or round, and the two components of an oval.
+
+Where B is skewed, its score is one more.
+"""
 MOST_INVALID = 0.05
 IRREGULAR_SD = 0.15
 """SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
@@ -171,8 +174,8 @@ def pooled_size(
 
     Notes
     -----
-    Given tau and the spread of B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau,
-    the spread of B and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
+    Given tau and B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau, the spread of
+    B, its skewed score and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
     maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
     """
     calibration = calibration.at_fat([one.profile for one in maps]).at_places([one.by_place for one in maps])
@@ -181,9 +184,9 @@ def pooled_size(
     log_size = by_map if used is maps else [corrected_log_size(calibration, m) for m in maps]
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
     oval, shown = _elongation(maps, list(log_size), calibration, priors.shape)
-    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
+    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS + calibration.is_skewed, rng)
     terms = np.stack([calibration.terms(m.log_amplitude, m.log_width) for m in used])
-    half = oval.at(points[:, 3:])
+    half = oval.at(points[:, 3:DIMENSIONS])
     figures = {
         "oval_probability": oval.probability,
         "oval_half_log_ratio": oval.magnitude,
@@ -219,7 +222,7 @@ class _Pool:
         The calibration's terms.
     centre, noise : (k,) arrays
         Its mean and variance.
-    points : (n, `DIMENSIONS`) array
+    points : (n, `DIMENSIONS`) or (n, `DIMENSIONS` + 1) array
     half : (n, 2) array
         Half log axis ratio of the lump, in two components.
     form_sd
@@ -243,12 +246,13 @@ class _Pool:
         tau = between.at(self.points[:, 1], self.centre, self.noise)
         weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
         weight /= weight.sum(axis=0)
-        z, score = normal_quantile(self.points[:, [0, 2]].T)
-        known, variances = self._left_open(tau=tau, weight=weight, score=score)
+        z, score, body = normal_quantile(self.points[:, [0, 2, -1]].T)
+        known, own, variances = self._left_open(tau=tau, weight=weight, score=score)
         map_part = np.sum(weight * self.by_map, axis=0)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
-        mean = map_part + known + longer
-        sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
+        mean = map_part + known + own.drawn(body) + longer
+        left = np.maximum(sum(variances.values()) - own.skewed_variance, 0.0)
+        sd = np.sqrt(left + (OVAL_SD * longer) ** 2)
         log_largest, log_smallest = self._evened(mean, sd, z, longer)
         wide = self.half[:, 0] >= 0
         share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
@@ -264,8 +268,8 @@ class _Pool:
 
     def _left_open(
         self, *, tau: FloatArray, weight: FloatArray, score: FloatArray
-    ) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Distribution of ln d given each draw of the maps, a normal: its mean, and its variances by source.
+    ) -> tuple[FloatArray, BodyLeft, dict[str, FloatArray]]:
+        """Distribution of ln d given each draw of the maps: its mean, what is left of B, and all variances by source.
 
         Parameters
         ----------
@@ -282,13 +286,17 @@ class _Pool:
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
         other_sd = self.calibration.other_sd
         own_sd = np.sqrt(np.maximum(body_sd**2 - other_sd**2, 0.0))
-        expected, left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
-        return expected + shift, {
-            "between_maps": np.sum(weight**2, axis=0) * tau**2,
-            "calibration": error,
-            "body": left + other_sd**2 + self.form_sd**2,
-            **site_variance(self.calibration.site, middle_width),
-        }
+        left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
+        return (
+            left.expected + shift,
+            left,
+            {
+                "between_maps": np.sum(weight**2, axis=0) * tau**2,
+                "calibration": error,
+                "body": left.variance + other_sd**2 + self.form_sd**2,
+                **site_variance(self.calibration.site, middle_width),
+            },
+        )
 
     def _evened(
         self, mean: FloatArray, sd: FloatArray, z: FloatArray, longer: FloatArray

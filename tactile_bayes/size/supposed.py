@@ -14,6 +14,7 @@ import numpy as np
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.normal import normal_score, skewed_score
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.body_calibration import BodyCalibration
 
@@ -38,15 +39,21 @@ class Supposition:
     name, value
         The property, by the names of `HiddenTerms`, and its value.
     log_shift
-        By which ln d moves.
-    sd_ratio
-        SD of ln d with it, over that without.
+        By which the median of ln d moves.
+    sds, skewness
+        Of ln d without and with it.
     """
 
     name: str
     value: float
     log_shift: float
-    sd_ratio: float
+    sds: tuple[float, float]
+    skewness: tuple[float, float]
+
+    @property
+    def sd_ratio(self) -> float:
+        """SD of ln d with it, over that without."""
+        return self.sds[1] / self.sds[0] if self.sds[0] > 0 else 1.0
 
     @property
     def change(self) -> float:
@@ -55,7 +62,16 @@ class Supposition:
 
     def moved(self, size_mm: float, *, median_mm: float) -> float:
         """Size where one of a distribution with this median comes to lie: the median itself, or an interval's end."""
-        return float(median_mm * np.exp(self.log_shift + self.sd_ratio * np.log(size_mm / median_mm)))
+        (before, after), (skewed, left) = self.sds, self.skewness
+        above = np.log(size_mm / median_mm) / before if before > 0 else 0.0
+        score = normal_score(np.array(above + _median_score(skewed)), np.array(skewed))
+        moved = after * (skewed_score(score, np.array(left)) - _median_score(left))
+        return float(median_mm * np.exp(self.log_shift + moved))
+
+
+def _median_score(skewness: float) -> float:
+    """Median of a skewed distribution with mean 0 and SD 1."""
+    return float(skewed_score(np.zeros(()), np.array(skewness)))
 
 
 def suppositions(
@@ -74,18 +90,53 @@ def suppositions(
     body_sd = calibration.body_and_error(calibration.terms(*at), *at, np.zeros(1))[0]
     own_sd = np.sqrt(np.maximum(body_sd**2 - calibration.other_sd**2, 0.0))
     names, found = () if calibration.hidden is None else calibration.hidden.names, {}
-    before, left_before = known_body(calibration, known, *at, own_sd)
+    before = known_body(calibration, known, *at, own_sd)
     features = calibration.features(*at)[0]
     for label, (name, value) in SUPPOSED.items():
         low, high = calibration.bodies.get(name, (value, value))
         if name not in names or name in known or not low <= value <= high:
             continue
         if calibration.hidden is not None and calibration.hidden.score(name, value, features) <= LIKELY_SDS:
-            expected, left = known_body(calibration, {**known, name: value}, *at, own_sd)
-            gone = float((left_before - left)[0]) / variance if variance > 0 else 0.0
-            ratio = float(np.sqrt(np.clip(1.0 - gone, 0.0, 1.0)))
-            found[label] = Supposition(name, value, float((expected - before)[0]), ratio)
+            left = known_body(calibration, {**known, name: value}, *at, own_sd)
+            found[label] = _supposition(name, value, before, left, variance=variance)
     return found
+
+
+def _supposition(name: str, value: float, before: BodyLeft, left: BodyLeft, *, variance: float) -> Supposition:
+    """What one more known property does to a size whose logarithm has this variance without it."""
+    gone = float((before.variance - left.variance)[0])
+    variances = variance, float(np.clip(variance - gone, 0.0, variance))
+    skewness = [
+        float((one.skewness * one.variance**1.5)[0]) / whole**1.5 if whole > 0 else 0.0
+        for one, whole in zip((before, left), variances, strict=True)
+    ]
+    sds = float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
+    shift = float((left.expected - before.expected)[0])
+    shift += sds[1] * _median_score(skewness[1]) - sds[0] * _median_score(skewness[0])
+    return Supposition(name, value, shift, sds, (skewness[0], skewness[1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyLeft:
+    """Distribution of B, given what is known of a body.
+
+    Parameters
+    ----------
+    expected, variance, skewness : (n,) arrays
+    """
+
+    expected: FloatArray
+    variance: FloatArray
+    skewness: FloatArray
+
+    @property
+    def skewed_variance(self) -> FloatArray:
+        """(n,) its variance where it is skewed; 0 where it is a normal, as the rest of ln d is."""
+        return np.where(self.skewness > 0.0, self.variance, 0.0)
+
+    def drawn(self, score: FloatArray) -> FloatArray:
+        """(n,) B about its mean at (n,) normal scores, where it is skewed."""
+        return np.asarray(np.sqrt(self.skewed_variance) * skewed_score(score, self.skewness))
 
 
 def known_body(
@@ -94,8 +145,8 @@ def known_body(
     log_amplitude: FloatArray,
     log_width: FloatArray,
     own_sd: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of B given known properties.
+) -> BodyLeft:
+    """B given known properties.
 
     Parameters
     ----------
@@ -107,9 +158,10 @@ def known_body(
     UsageError
         When the calibration knows nothing of a property.
     """
+    hidden, none = calibration.hidden, np.zeros(len(log_width))
     if not known:
-        return np.zeros(len(log_width)), own_sd**2
-    hidden = calibration.hidden
+        skewness = none if hidden is None else hidden.skewness_left({}, none + 1.0)
+        return BodyLeft(none, own_sd**2, skewness)
     names = () if hidden is None else hidden.names
     for name in known:
         if name not in names:
@@ -117,4 +169,6 @@ def known_body(
     assert hidden is not None
     expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
     explained_sd = np.minimum(own_sd, hidden.most_sd)
-    return expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2
+    left = own_sd**2 - hidden.share(*known) * explained_sd**2
+    skewness = hidden.skewness_left(known, np.divide(left, own_sd**2, out=none + 1.0, where=own_sd > 0))
+    return BodyLeft(expected * explained_sd, left, skewness)

@@ -22,9 +22,9 @@ INSIDE: Final = 0.99
 """Share of the table's maps that count as inside it: its largest leverage is an outlier's, ten times what is left."""
 INSIDE_BY_PLACE: Final = 0.95
 """The same for the figures by place: beside a rib that the map does not show, they and sizes by them are wrong."""
-OTHER_SD: Final = 0.05
-"""Of bodies unlike the population's: 3 % for their tissue and neighbours, 4 % for a lump higher or flatter than it is
-wide, which no map shows (records 0105 and 0118)."""
+OTHER_SD: Final = 0.04
+"""Of bodies unlike the population's: another tissue, neighbours, a lump higher or flatter than it is wide, which no map
+shows (record 0119)."""
 
 
 def learn_fat_process(table: PopulationTable, *, other_sd: float = OTHER_SD) -> FatProcess | None:
@@ -71,13 +71,14 @@ def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> Fat
     rows, fitted, exam = fit_process(found.maps, ProcessRows.of(found, places))
     features = monomials(found.values, POWERS)
     mean = np.concatenate([fitted.mean, fitted.log_spread, exam[:1]])
-    body, body_sd = -fitted.left_out(rows.data.mean_log_d)[0], np.exp(rows.spread @ fitted.log_spread)
+    error, variance = fitted.left_out(rows.data.mean_log_d)
+    left_out = {"body": -error, "body_sd": np.exp(rows.spread @ fitted.log_spread), "variance": variance}
     by_place = None if places is None else rows.x[:, -len(BY_PLACE) :]
     return FatProcess(
         **found.fields(features, inside=INSIDE),
         mean=mean,
         covariance=_covariance(rows, fitted, exam),
-        hidden=hidden_terms(found.maps, rows.data, body=body, body_sd=body_sd, features=features, by_place=by_place),
+        hidden=hidden_terms(found.maps, rows.data, **left_out, features=features, by_place=by_place),
         fit=_figures(found.maps, rows, fitted, exam),
         kernel=fitted.kernel,
         other_sd=other_sd,

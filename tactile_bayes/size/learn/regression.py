@@ -180,9 +180,18 @@ class BodyRegression:
         return np.asarray(total + prior)
 
     def bodies_left_out(self, mode: FloatArray) -> dict[str, FloatArray]:
-        """``body`` and ``body_sd`` of `hidden.hidden_terms`, (groups,) arrays."""
-        left_out = -left_out_errors(self.mean_terms, self.mean_log_d)
-        return {"body": left_out, "body_sd": np.exp(mode[-3] + mode[-2] * self.mean_u)}
+        """``body``, ``body_sd`` and ``variance`` of `hidden.hidden_terms`, (groups,) arrays."""
+        return {
+            "body": -left_out_errors(self.mean_terms, self.mean_log_d),
+            "body_sd": np.exp(mode[-3] + mode[-2] * self.mean_u),
+            "variance": self.left_out_variance(mode),
+        }
+
+    def left_out_variance(self, mode: FloatArray) -> FloatArray:
+        """(groups,) variance of ln d of each body left out, by the learned spreads."""
+        spread = np.exp(2 * (mode[-3] + mode[-2] * self.mean_u))
+        spread = spread + (np.exp(2 * mode[-1]) + self.mean(self.map_variance)) / self.exams
+        return np.asarray(spread / (1.0 - leverages(self.mean_terms)[1]))
 
     def posterior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of k coefficients, ln(sd between bodies), its slope, ln(sd between exams), as normal.
@@ -256,10 +265,7 @@ def error_figures(
 
 def held(data: BodyRegression, mode: FloatArray, error: FloatArray) -> float:
     """Share of held-out bodies whose size lies in the interval of probability `HELD`, by the learned spreads."""
-    leverage = leverages(data.mean_terms)[1]
-    spread = np.exp(2 * (mode[-3] + mode[-2] * data.mean_u))
-    spread = spread + (np.exp(2 * mode[-1]) + data.mean(data.map_variance)) / data.exams
-    return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(spread / (1.0 - leverage))))
+    return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(data.left_out_variance(mode))))
 
 
 def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
