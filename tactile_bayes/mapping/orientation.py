@@ -56,7 +56,7 @@ class Orientation:
         return {"left": _opposite(self.right), "right": self.right, "top": self.up, "bottom": _opposite(self.up)}
 
     def side_words(self, axis: str) -> str:
-        """Name a side of the map, given as "+x", "-x", "+y" or "-y": the patient's with landmarks, else the picture's."""
+        """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""
         screen = {self.right: "right", _opposite(self.right): "left", self.up: "top", _opposite(self.up): "bottom"}
         side = screen[axis]
         words = f"the picture's {side}" if self.notch is None else _PATIENT_SIDES[self.edges[side]]

@@ -58,7 +58,9 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
         area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
         return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"
     if not on_map(tactile_map, *centre_mm):
-        reach = " and ".join(f"{name} from {low:g} to {high:g} mm" for name, (low, high) in map_ends(tactile_map).items())
+        reach = " and ".join(
+            f"{name} from {low:g} to {high:g} mm" for name, (low, high) in map_ends(tactile_map).items()
+        )
         place = f"--centre-mm {centre_mm[0]:g} {centre_mm[1]:g}"
         raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
     return f"near ({centre_mm[0]:.1f}, {centre_mm[1]:.1f}) mm"
