@@ -247,6 +247,11 @@ class Scan:
             if shape != taxels:
                 raise BadDataError(f"{name} is for {shape} taxels, counts have {taxels}", way_out="use one head's data")
 
+    def __repr__(self) -> str:
+        n, rows, columns = self.frames.counts.shape
+        marks = "landmarks" if self.landmarks is not None else "no landmarks"
+        return f"<Scan {n} frames of {rows} x {columns} taxels, {len(self.poses.time_s)} poses, {marks}>"
+
     def pressure_kpa(self, start: int = 0, stop: int | None = None) -> FloatArray:
         """Calibrated frames `start` to `stop`: (n, rows, columns) kPa, NaN where saturated."""
         return self.element_calibration.to_kpa(self.frames.counts[start:stop])

@@ -165,8 +165,18 @@ def build_map(scans: Any, **options: Any) -> Map:
             notes += lost
             facts += exam_facts([path_of(one)], read)
         else:
-            loaded.append(getattr(one, "scan", one))
+            loaded.append(_scan_of(one))
     return Map(build(loaded, **options), notes=tuple(notes), scans=tuple(facts))
+
+
+def _scan_of(given: Any) -> Scan:
+    from tactile_bayes.scan import Scan
+
+    scan = getattr(given, "scan", given)
+    if not isinstance(scan, Scan):
+        kind = type(given).__name__
+        raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or bring arrays in with `import`")
+    return scan
 
 
 def simulate(
@@ -222,7 +232,10 @@ def map_of(given: Any) -> Map:
         return read_map(given)
     if isinstance(given, TactileMap):
         return Map(given)
-    raise UsageError(f"a map is wanted, not {type(given).__name__}; build one with build_map, or give a path")
+    way_out = "build one with build_map, or give a path"
+    if isinstance(given, list | tuple):
+        way_out = "give one map after the other, or pool the maps of one mass with pool"
+    raise UsageError(f"a map is wanted, not {type(given).__name__}; {way_out}")
 
 
 def _provenance(made: Map) -> Provenance:

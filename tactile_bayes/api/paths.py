@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import overload
 
+from tactile_bayes.errors import UsageError
+
 PathLike = str | os.PathLike[str]
 
 
@@ -18,5 +20,15 @@ def path_of(given: None) -> None: ...
 
 
 def path_of(given: PathLike | None) -> Path | None:
-    """Convert to a path, with ``~`` as the home folder; None stays None."""
-    return None if given is None else Path(given).expanduser()
+    """Convert to a path, with ``~`` as the home folder; None stays None.
+
+    Raises
+    ------
+    UsageError
+        When it is neither text nor a path.
+    """
+    if given is None:
+        return None
+    if not isinstance(given, str | os.PathLike):
+        raise UsageError(f"a path is wanted, not {type(given).__name__}; give it as text or pathlib.Path")
+    return Path(given).expanduser()

@@ -55,8 +55,9 @@ def command(
     """Import scans, grids and images from other programs.
 
     SRC is an .npz of raw counts and poses (a scan), a scan file to repair (what is intact is kept), or a grid of
-    values (a map): .npz with `mean`, .csv, or a grey .tif, .pgm or .png image. The first row of a grid has the lowest
-    y and the first column the lowest x; pictures of the map show the first row on top, as the file reads.
+    values (a map): .npz with `mean`, .csv (commas, semicolons or tabs), or a grey .tif, .pgm or .png image. The first
+    row of a grid has the lowest y and the first column the lowest x; pictures of the map show the first row on top,
+    as the file reads.
     """
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing

@@ -8,7 +8,6 @@ the centre of the grid, so x and y run from -(n-1)/2 to (n-1)/2 cells.
 
 from __future__ import annotations
 
-import csv
 import io
 import warnings
 from pathlib import Path
@@ -17,15 +16,19 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.grid_table import read_table
 from tactile_bayes.files.npz import load_npz
-from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, TABLE_BYTES, check_limit, decoding, read_bytes, read_text
+from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, check_limit, decoding, read_bytes
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 
 IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
-TABLE_SUFFIXES: Final = (".csv", ".txt")
+TABLE_SUFFIXES: Final = (".csv", ".txt", ".tsv")
 # A map divided by its level has a median near 1; farther off than this, it was not divided.
 _NORMALISED_MEDIAN: Final = (0.2, 5.0)
+_LEAST_SPACING_MM: Final = 0.01
+_MOST_KPA: Final = 1000.0
+"""Median of a grid in kPa: no examination presses with more, and as Pa it is a light touch."""
 
 
 def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "none", units: str = "") -> TactileMap:
@@ -35,8 +38,8 @@ def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "
     ----------
     path
         ``.npz`` with ``mean (ny, nx)`` and, if known, ``count``, ``variance`` (NaN where count is 1) and
-        ``spacing_mm``; a ``.csv`` of numbers, an empty field for a cell without data; or a grey ``.tif``, ``.pgm`` or
-        ``.png`` image.
+        ``spacing_mm``; a table of numbers (see `grid_table`), an empty field for a cell without data; or a grey
+        ``.tif``, ``.pgm`` or ``.png`` image.
     spacing_mm
         Side of the square cells; may be left out when the ``.npz`` holds it.
     normalise
@@ -59,7 +62,7 @@ def read_grid(path: Path, *, spacing_mm: float | None = None, normalise: str = "
         if suffix in IMAGE_SUFFIXES:
             mean = _image(path)
         elif suffix in TABLE_SUFFIXES:
-            mean = _table(path)
+            mean = read_table(path)
         else:
             known = ", ".join((".npz", *TABLE_SUFFIXES, *IMAGE_SUFFIXES))
             way_out = _CONVERT.get(suffix, f"grids are read from {known}; scans from .npz and .mcap")
@@ -75,9 +78,8 @@ _CONVERT = {
     **dict.fromkeys(
         (".h5", ".hdf5"), f"read it with h5py and save its arrays with numpy.savez_compressed as .npz; {_FROM_ARRAYS}"
     ),
-    **dict.fromkeys((".tsv", ".txt", ".dat"), "save the grid as .csv, with commas between cells and points in numbers"),
     ".npy": f"save it with numpy.savez_compressed as .npz; {_FROM_ARRAYS}",
-    ".xlsx": "save the grid as .csv, with commas between cells and points in numbers",
+    **dict.fromkeys((".xlsx", ".xls", ".ods", ".dat"), "save the grid as .csv"),
 }
 
 
@@ -101,6 +103,8 @@ def _spacing(held: np.ndarray[Any, Any] | None, *, given: float | None) -> float
             )
     if not 0 < value < 1000:
         raise BadDataError(f"the spacing is {value:g} mm", way_out="it must be positive, in mm")
+    if value < _LEAST_SPACING_MM:
+        raise BadDataError(f"the spacing is {value:g} mm", way_out="looks like metres, give mm")
     return value
 
 
@@ -110,7 +114,7 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
         raise BadDataError(f"mean has shape {mean.shape}", way_out="it must be (ny, nx)")
     count = _count(arrays.get("count"), mean)
     variance = _variance(arrays.get("variance"), count)
-    _check_level(mean[count > 0], normalise=normalise)
+    _check_level(mean[count > 0], normalise=normalise, units=units)
     return TactileMap(
         mean=np.where(count > 0, mean, np.nan),
         variance=variance,
@@ -182,39 +186,19 @@ def _check_same_shape(array: FloatArray, mean: np.ndarray[Any, Any], *, name: st
         raise BadDataError(f"{name} has shape {array.shape}", way_out=f"it must be {mean.shape}, as mean")
 
 
-def _check_level(values: FloatArray, *, normalise: str) -> None:
-    """Refuse values that cannot have been divided by their level although the caller declares it."""
+def _check_level(values: FloatArray, *, normalise: str, units: str) -> None:
+    """Refuse values that cannot be what the caller declares: divided by their level, or in kPa."""
     median = float(np.median(values))
+    if units.strip().lower() == "kpa" and median > _MOST_KPA:
+        raise BadDataError(
+            f"the median value is {median:.4g} kPa", way_out="looks like Pa, give --units Pa, or divide by 1000"
+        )
     low, high = _NORMALISED_MEDIAN
     if normalise != "none" and not low <= median <= high:
         raise BadDataError(
             f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says",
             way_out="divide by the level first, or give --normalise none",
         )
-
-
-def _table(path: Path) -> FloatArray:
-    text = read_text(path, most=TABLE_BYTES, way_out="give comma-separated numbers")
-    with decoding("is not a table of text", way_out="give comma-separated numbers"):
-        lines = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=""))
-        rows = [row for row in lines if any(field.strip() for field in row)]
-    if not rows:
-        raise BadDataError("is empty", way_out="give comma-separated numbers")
-    for number, row in enumerate(rows, start=1):
-        if len(row) != len(rows[0]):
-            raise BadDataError(
-                f"row {number} has {len(row)} fields, row 1 has {len(rows[0])}", way_out="give every row one length"
-            )
-    return np.array([[_field(text, i, j) for j, text in enumerate(row, 1)] for i, row in enumerate(rows, 1)])
-
-
-def _field(text: str, row: int, column: int) -> float:
-    try:
-        return float(text) if text.strip() else np.nan
-    except ValueError:
-        raise BadDataError(
-            f"row {row}, column {column} holds {text.strip()[:30]!r}", way_out="give numbers only, without a header"
-        ) from None
 
 
 def _image(path: Path) -> FloatArray:

@@ -159,7 +159,7 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
                     row,
                     " + ".join(key["fields"]),
                     f"{_shown_key(value)} has no row in {target.path}",
-                    way_out="add its row there, or correct the key",
+                    way_out="add its row there, correct the key, or leave its readings out",
                 )
 
 
@@ -199,12 +199,24 @@ def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any]) 
             raise BadDataError(f"line 1: the cells are separated by {word}", way_out=way_out, path=str(path))
     for name in header:
         if name not in fields:
-            raise _fault(path, 1, name, "is not known here", way_out=_advice_on_column(name, header, fields))
+            advice = _other_table(header, fields) or _advice_on_column(name, header, fields)
+            raise _fault(path, 1, name, "is not known here", way_out=advice)
         if header.count(name) > 1:
             raise _fault(path, 1, name, "appears more than once", way_out="keep one of them")
     for name, field in fields.items():
         if name not in header and (_is_required(field) or field.get("column") == "required"):
             raise _fault(path, 1, name, "is missing", way_out=f"add it: {field['description']}")
+
+
+def _other_table(header: Sequence[str], fields: Mapping[str, Any]) -> str:
+    """Advice where a header is another table's, such as of trial and excision that were exchanged; else empty."""
+    for kind in ("trial", "excision"):
+        other = {one["name"]: one for one in load_schema(f"{kind}.table.json")["fields"]}
+        needed = {name for name, one in other.items() if _is_required(one)}
+        if list(other) != list(fields) and needed <= set(header) <= set(other):
+            what = "readings" if kind == "trial" else "sizes after excision"
+            return f"this is the table of {what}: give the other one here"
+    return ""
 
 
 def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:

@@ -58,6 +58,9 @@ class SimulatedScan:
     scan: Scan
     truth: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        return f"<SimulatedScan of {self.scan!r}, with its truth>"
+
 
 def record(
     scene: Scene, *, felt: Felt, truth: Mapping[str, Any], rng: np.random.Generator, depth: Depth | None = None

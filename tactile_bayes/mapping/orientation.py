@@ -15,6 +15,12 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 PATIENT_WORDS: Final = "seen facing the patient: head up, patient's left on the right"
 PLANE_WORDS: Final = "no landmarks: seen from outside, y (along the head) up, x to the left"
 GRID_WORDS: Final = "as the imported file reads: first row on top, x to the right, y down"
+_PATIENT_SIDES: Final = {
+    "R": "the patient's right",
+    "L": "the patient's left",
+    "H": "the patient's head",
+    "F": "the patient's feet",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +54,13 @@ class Orientation:
         if self.notch is not None:
             return {"left": "R", "right": "L", "top": "H", "bottom": "F"}
         return {"left": _opposite(self.right), "right": self.right, "top": self.up, "bottom": _opposite(self.up)}
+
+    def side_words(self, axis: str) -> str:
+        """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""
+        screen = {self.right: "right", _opposite(self.right): "left", self.up: "top", _opposite(self.up): "bottom"}
+        side = screen[axis]
+        words = f"the picture's {side}" if self.notch is None else _PATIENT_SIDES[self.edges[side]]
+        return f"{words} ({axis})"
 
     def screen(self, values: NDArray[Any]) -> NDArray[Any]:
         """The (ny, nx) values of a map as the rows of a picture: row 0 on top, column 0 on the left."""

@@ -9,9 +9,10 @@ import numpy as np
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import UsageError
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.orientation import orientation_of
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.lump.cells import covered_share, trusted, window_cells
+from tactile_bayes.posterior.lump.cells import covered_share, map_ends, on_map, trusted, window_cells
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import (
     AT_RIM,
@@ -42,12 +43,7 @@ HOPELESS = 2.0
 """Widths at the mode so many times beyond a limit decide without draws: chains for a stripe of readings took 30 s."""
 MOST_PRIOR_SHARE = 0.5
 """Above this ratio of the posterior's to the prior's SD of a log width the prior, not the map, gives the interval."""
-SIDES = {
-    "the left (-x)": (-1.0, 0.0),
-    "the right (+x)": (1.0, 0.0),
-    "the feet (-y)": (0.0, -1.0),
-    "the head (+y)": (0.0, 1.0),
-}
+SIDES = {"-x": (-1.0, 0.0), "+x": (1.0, 0.0), "-y": (0.0, -1.0), "+y": (0.0, 1.0)}
 
 
 def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
@@ -61,11 +57,9 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
     if centre_mm is None:
         area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
         return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"
-    half = tactile_map.recipe.cell_mm / 2.0
-    ends = [(float(axis[0]) - half, float(axis[-1]) + half) for axis in (tactile_map.x_mm, tactile_map.y_mm)]
-    if not all(low <= at <= high for at, (low, high) in zip(centre_mm, ends, strict=True)):
+    if not on_map(tactile_map, *centre_mm):
         reach = " and ".join(
-            f"{name} from {low:g} to {high:g} mm" for name, (low, high) in zip("xy", ends, strict=True)
+            f"{name} from {low:g} to {high:g} mm" for name, (low, high) in map_ends(tactile_map).items()
         )
         place = f"--centre-mm {centre_mm[0]:g} {centre_mm[1]:g}"
         raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
@@ -144,6 +138,8 @@ def fault_code(tactile_map: TactileMap, candidate: Candidate) -> tuple[str, str]
 def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:
     """Distance in mm by which coverage falls short of `reach_mm` from a centre, per side, where at least a cell.
 
+    The sides are named as a viewer of the map's picture sees them: "the patient's left (-x)" with landmarks.
+
     A side is a quarter turn about its direction. It ends where less than `LEAST_SEEN` of its breadth is covered: a
     flank of which a corner is missing is still seen.
     """
@@ -151,13 +147,13 @@ def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, 
     mask = trusted(tactile_map)
     dx = tactile_map.x_mm[None, :] - centre_mm[0]
     dy = tactile_map.y_mm[:, None] - centre_mm[1]
-    short = {}
-    for name, (x, y) in SIDES.items():
+    short, view = {}, orientation_of(tactile_map)
+    for axis, (x, y) in SIDES.items():
         along, across = dx * x + dy * y, np.abs(dx * y - dy * x)
         sector = across <= along
         reached = _reached(along[sector], mask[sector], cell, reach_mm)
         if reach_mm - reached >= cell:
-            short[name] = reach_mm - reached
+            short[view.side_words(axis)] = reach_mm - reached
     return short
 
 

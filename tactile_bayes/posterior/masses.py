@@ -14,7 +14,7 @@ import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.lump.cells import SMOOTHING_MM
+from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, on_map
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.other_rises import other_rises, without
 from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
@@ -45,7 +45,7 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     found = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
     others = _others_options(options)
     rises = [*other_rises(tactile_map, first, options)]
-    for rise in [*_in_scene(first), *rises]:
+    for rise in [*_in_scene(tactile_map, first), *rises]:
         mass = _sized_at(tactile_map, rise, first, others, estimator)
         if mass is None and rise not in rises:
             mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _hidden(rise))
@@ -88,8 +88,8 @@ def _others_options(options: EstimateOptions) -> EstimateOptions:
     return replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
 
 
-def _in_scene(first: Estimate) -> list[Rise]:
-    """The second lump of the first one's scene, if the evidence put it there."""
+def _in_scene(tactile_map: TactileMap, first: Estimate) -> list[Rise]:
+    """The second lump of the first one's scene, if the evidence put it there and it lies on the map."""
     choice = first.scene
     if choice is None or choice.fit.scene.extra != "second lump":
         return []
@@ -97,6 +97,8 @@ def _in_scene(first: Estimate) -> list[Rise]:
     if not asked.supported:
         return []
     x, y, log_width = (float(value) for value in choice.fit.mode[-3:])
+    if not on_map(tactile_map, x, y):
+        return []  # it stands for what rises at the rim, and `other_rises` judges that
     width = float(np.exp(log_width))
     return [Rise(x, y, None, 0.0, width, width, asked.odds / (1.0 + asked.odds))]
 
@@ -108,6 +110,8 @@ def _sized_at(
 
     None where neither shows a lump.
     """
+    if not on_map(tactile_map, rise.x_mm, rise.y_mm):
+        return Mass(rise.x_mm, rise.y_mm, rise.probability, _beyond(rise))
     given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
     found = _estimated(tactile_map, given, estimator)
     near = first.map_posterior is not None and _reaches(first, rise, options)
@@ -170,6 +174,12 @@ def _hidden(rise: Rise) -> Estimate:
     """A second lump of a scene that is none without that scene."""
     reason = "the map shows it beside the first lump only, not by itself"
     return Estimate("no_estimate", reason, code="unresolved", advice=BOTH, bump=_bump_of(rise))
+
+
+def _beyond(rise: Rise) -> Estimate:
+    """A rise at the rim whose fit has its centre off the map."""
+    advice = "extend the strokes beyond it"
+    return Estimate("no_estimate", "its centre lies off the map", code="window", advice=advice, bump=_bump_of(rise))
 
 
 def _bump_of(rise: Rise) -> ModalBump:

@@ -11,7 +11,7 @@ from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.assessment import Assessment, bump_of
 from tactile_bayes.posterior.correlated.neighbour import LEAST_RISE
-from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, candidate_centres, levelled, smoothed_excess
+from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, candidate_centres, levelled, on_map, smoothed_excess
 from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.result import Estimate, ModalBump, Rise
@@ -47,7 +47,7 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOp
             found = _at_rim(rest, candidates, given, estimate)
         else:
             found = _rise(seen, estimate) if seen.detection.probability >= LEAST_PROBABILITY else None
-        if found is None or _is_known(found, rises, estimate):
+        if found is None or _is_known(found, rises, rest, estimate):
             misses += 1
         else:
             rises.append(found)
@@ -87,7 +87,7 @@ def _places(rest: TactileMap, estimate: Estimate) -> Iterator[tuple[float, float
     height = smoothed_excess(found_on)
     for x, y in candidate_centres(found_on, rim_limit=0):
         row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
-        if height[row, column] > _least_rise(x, y, estimate) and _beside(x, y, estimate):
+        if height[row, column] > _least_rise(x, y, estimate) and _beside(x, y, rest, estimate):
             yield x, y
 
 
@@ -101,22 +101,27 @@ def _least_rise(x: float, y: float, estimate: Estimate) -> float:
     return (LEAST_RISE_FAR if far else LEAST_RISE) * lump.amplitude
 
 
-def _beside(x: float, y: float, estimate: Estimate) -> bool:
+def _beside(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
     """Whether a place is clear of the lump and of its scene's second structure."""
     lump = _lump(estimate)
     if lump is None:
         return True
     away = float(np.hypot(x - lump.x_mm, y - lump.y_mm))
-    return away > BESIDE_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm) and not _in_scene(x, y, estimate)
+    return away > BESIDE_IN_WIDTHS * max(lump.sigma_x_mm, lump.sigma_y_mm) and not _in_scene(x, y, rest, estimate)
 
 
-def _in_scene(x: float, y: float, estimate: Estimate) -> bool:
-    """Whether a place belongs to the second lump or the rib of the lump's scene."""
+def _in_scene(x: float, y: float, rest: TactileMap, estimate: Estimate) -> bool:
+    """Whether a place belongs to the second lump or the rib of the lump's scene.
+
+    A second lump whose centre lies off the map stands for what rises at the rim, which is looked at as elsewhere.
+    """
     if estimate.scene is None or not estimate.scene.fit.scene.extra:
         return False
     fit = estimate.scene.fit
     one, two, log_width = (float(value) for value in fit.mode[-3:])
     if fit.scene.extra == "second lump":
+        if not on_map(rest, one, two):
+            return False
         away = np.hypot(x - one, y - two)
     else:
         middle = fit.target.window.middle
@@ -149,7 +154,7 @@ def _at_rim(
     return Rise(bump.x_mm, bump.y_mm, None, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, chance[1].probability)
 
 
-def _is_known(rise: Rise, rises: list[Rise], estimate: Estimate) -> bool:
+def _is_known(rise: Rise, rises: list[Rise], rest: TactileMap, estimate: Estimate) -> bool:
     """Whether a fit moved to a place already found, or back to the measured lump."""
     again = any(np.hypot(rise.x_mm - one.x_mm, rise.y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
-    return again or not _beside(rise.x_mm, rise.y_mm, estimate)
+    return again or not _beside(rise.x_mm, rise.y_mm, rest, estimate)

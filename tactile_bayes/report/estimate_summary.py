@@ -39,6 +39,7 @@ def estimate_summary(
     probability: float,
     masses: Sequence[MassDocument] = (),
     place: ClockPosition | None = None,
+    side_doubt: str = "",
 ) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
@@ -52,12 +53,14 @@ def estimate_summary(
         As `masses_document` gives them.
     place
         Of the lump about the nipple, where it is known.
+    side_doubt
+        As `lump_place.side_doubt` gives it.
     """
     if estimate.status == "no_estimate":
         body = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
         body += _masses(masses, room=MOST_MASSES)
     else:
-        body = _something(estimate, quantities, probability, masses, place)
+        body = _something(estimate, quantities, probability, masses, place, doubt=side_doubt)
     return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
 
 
@@ -67,9 +70,11 @@ def _something(
     probability: float,
     masses: Sequence[MassDocument],
     place: ClockPosition | None,
+    *,
+    doubt: str,
 ) -> list[str]:
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
-    lines = _cautions(estimate)
+    lines = [*_cautions(estimate), *([f"CAUTION: {doubt}."] if doubt else [])]
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
     table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
     lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))

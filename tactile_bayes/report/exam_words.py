@@ -9,18 +9,16 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.geometry import apply
-from tactile_bayes.mapping.clock_face import SIDES, clock_text
+from tactile_bayes.mapping.clock_face import clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
-from tactile_bayes.report.lump_place import from_xiphoid, side_of
+from tactile_bayes.report.lump_place import from_xiphoid, side_doubt, side_of
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
 
 UNDETECTED: Final = ("undetected", "empty")
 MOST_CAUTIONS: Final = 2
-MIDDLE_MM: Final = 20.0
-"""So far from the xiphoid a lump is on that side of the body, whatever is wrong with the landmarks' direction."""
 _OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
@@ -185,14 +183,9 @@ def caution_sentences(exam: Exam) -> list[str]:
 
 def _side_in_doubt(exam: Exam) -> Iterator[str]:
     """Caution where the landmarks put the lump on the other side of the body than the scans say."""
-    side = side_of(exam.scans)
     lump = exam.main.masses[0].patient_mm if exam.main.masses else None
-    if side not in SIDES or lump is None or abs(lump[0]) < MIDDLE_MM:
-        return
-    other = "right" if lump[0] > 0 else "left"
-    if other != side:
-        place = f"the landmarks put the lump {abs(lump[0]):.0f} mm to the patient's {other} of the xiphoid"
-        yield f"Caution: the scan says {side} breast, and {place}: side or landmarks are wrong."
+    if doubt := side_doubt(side_of(exam.scans), None if lump is None else lump[0]):
+        yield f"Caution: {doubt}."
 
 
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tactile_bayes.mapping.clock_face import ClockPosition, clock_position, clock_text
+from tactile_bayes.mapping.clock_face import SIDES, ClockPosition, clock_position, clock_text
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.lump.posterior import MapPosterior
+
+MIDDLE_MM: Final = 20.0
+"""So far from the xiphoid a lump is on that side of the body, whatever is wrong with the landmarks' direction."""
 
 
 def side_of(scans: Sequence[Mapping[str, str]]) -> str:
@@ -33,6 +36,25 @@ def lump_place(
         side=side_of(scans),
         covariance_mm2=np.cov(x_mm, y_mm),
     )
+
+
+def side_doubt(side: str, right_mm: float | None) -> str:
+    """Sentence where the landmarks put a lump on the other side of the body than the scan says; empty where not.
+
+    Parameters
+    ----------
+    side
+        As `side_of` gives it.
+    right_mm
+        The lump's distance from the xiphoid to the patient's right; None without landmarks.
+    """
+    if side not in SIDES or right_mm is None or abs(right_mm) < MIDDLE_MM:
+        return ""
+    other = "right" if right_mm > 0 else "left"
+    if other == side:
+        return ""
+    place = f"the landmarks put the lump {abs(right_mm):.0f} mm to the patient's {other} of the xiphoid"
+    return f"the scan says {side} breast, and {place}: side or landmarks are wrong"
 
 
 def place_line(place: ClockPosition, probability: float) -> str:

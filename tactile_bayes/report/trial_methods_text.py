@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from tactile_bayes.trial.figures import Figure
-from tactile_bayes.trial.paired import PairedComparison
+from tactile_bayes.trial.paired import PairedComparison, least_p
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
 _LINES = {
@@ -22,7 +22,8 @@ def method_lines(report: TrialReport) -> Iterator[str]:
     """Text lines, none longer than 150 characters."""
     yield "Detected masses as measurements (size on ex vivo; differences are size - ex vivo):"
     for one in report.modalities.values():
-        yield from _modality_lines(one)
+        lines = list(_modality_lines(one))
+        yield from lines or [f"{one.name}: no lines or limits: too few masses were found, or their sizes do not differ"]
     growing = growing_line(report)
     if growing:
         yield growing
@@ -30,6 +31,7 @@ def method_lines(report: TrialReport) -> Iterator[str]:
         yield _pair_line(pair)
     if report.paired:
         yield "p: sign-flip test by patient on the masses both looked for; p Holm: corrected for all pairs."
+        yield from _least_p_lines(report.paired)
 
 
 def _modality_lines(report: ModalityReport) -> Iterator[str]:
@@ -115,6 +117,14 @@ def _pair_line(pair: PairedComparison) -> str:
     test = "" if pair.p_value is None or pair.p_holm is None else f"; p {pair.p_value:.4f}, p Holm {pair.p_holm:.4f}"
     difference = shown(pair.difference_percent, "+.1f")
     return head + f"MAPE {difference} points, ratio {shown(pair.ratio, '.2f')}{test}"
+
+
+def _least_p_lines(pairs: Sequence[PairedComparison]) -> Iterator[str]:
+    """A line where a pair has so few patients that no difference between modalities could give p < 0.05."""
+    tested = [pair.patients for pair in pairs if pair.p_value is not None]
+    if tested and (least := least_p(max(tested))) >= 0.05:
+        few = f"{max(tested)} patient{'' if max(tested) == 1 else 's'}"
+        yield f"With {few} p cannot be below {least:.2g}: the test says nothing here."
 
 
 def shown(figure: Figure, spec: str) -> str:

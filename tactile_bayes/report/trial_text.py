@@ -78,6 +78,8 @@ def ratio_line(name: str, one: ModalityRatio) -> str:
     """Ratio of errors, with the number of masses it is over."""
     if one.masses == 0:
         return f"{name}: no MAPE ratio: no mass was looked for by both this modality and the tactile one"
+    if one.ratio.value is None:
+        return f"{name}: no MAPE ratio on {_plural(one.masses, 'common mass')}: {one.ratio.reason}"
     line = f"{name}: MAPE {shown(one.ratio, '.2f')} times the tactile one's on {_plural(one.masses, 'common mass')}"
     return f"{line}; {shown(one.ratio_detected, '.2f')} times on the {one.masses_detected} that both found"
 

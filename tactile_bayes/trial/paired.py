@@ -57,6 +57,11 @@ def paired_comparisons(
     return [replace(pair, p_holm=p) for pair, p in zip(pairs, corrected, strict=True)]
 
 
+def least_p(patients: int) -> float:
+    """Smallest two-sided p value that a sign-flip test of so many patients can give: 2 of 2^n patterns."""
+    return min(1.0, 2.0 ** (1 - patients))
+
+
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """Correct p values for their number, leaving None out: Holm (1979), Scand. J. Statist. 6, 65."""
     known = sorted((p, index) for index, p in enumerate(p_values) if p is not None)

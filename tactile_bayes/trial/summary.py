@@ -15,6 +15,7 @@ from tactile_bayes.trial.cautions import cautions
 from tactile_bayes.trial.comparison import ModalityRatio, mape_ratios
 from tactile_bayes.trial.coverage import Coverage, coverage
 from tactile_bayes.trial.figures import Figure
+from tactile_bayes.trial.jackknife import effective_number
 from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
 from tactile_bayes.trial.paired import PairedComparison, paired_comparisons
 from tactile_bayes.trial.plausibility import unit_doubts
@@ -166,6 +167,15 @@ def _stated(reading: Reading) -> tuple[float, float] | None:
     return log_normal(ends.low_mm, ends.high_mm, ends.probability, reading.size_mm, reading.sd_mm)
 
 
+def _detected_interval(sizes: ModalitySizes, *, confidence: float) -> tuple[float, float] | None:
+    """Interval of the share of masses found, for the effective number of patients: masses of one are no new trials."""
+    n = len(sizes.size_mm)
+    if n == 0:
+        return None
+    number = effective_number(np.ones(n), sizes.patient)
+    return clopper_pearson(float(sizes.detected.mean()) * number, number, confidence=confidence)
+
+
 def modality_report(
     sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0, beside: _Beside | None = None
 ) -> ModalityReport:
@@ -176,7 +186,7 @@ def modality_report(
         name=sizes.name,
         n=n,
         detected=detected,
-        detected_interval=clopper_pearson(detected, n, confidence=float(confidence)) if n else None,
+        detected_interval=_detected_interval(sizes, confidence=float(confidence)),
         patients=len(sizes.patients),
         readings=sizes.readings,
         readings_detected=sum(len(group) for group in sizes.replicates_mm),

@@ -264,3 +264,25 @@ def test_a_script_records(tmp_path: Path) -> None:
         report = tb.record(tmp_path / "s.mcap", duration_s=0.5, like=tmp_path / "last.mcap", side="phantom", **given)
     assert report.frames >= 100
     assert tb.read_scan(tmp_path / "s.mcap").session["side"] == "phantom"
+
+
+def test_scans_are_short_to_look_at() -> None:
+    """A notebook printed all counts and times."""
+    assert repr(tb.demo_scan()) == "<Scan 700 frames of 16 x 26 taxels, 840 poses, landmarks>"
+    simulated = repr(tb.simulate(DEMO / "empty.toml", fidelity="empirical-gaussian"))
+    assert simulated.startswith("<SimulatedScan of <Scan ")
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: tb.build_map(np.ones((5, 16, 26))), "a scan is wanted, not ndarray; read one with read_scan"),
+        (lambda: tb.build_map(None), "a scan is wanted, not NoneType"),
+        (lambda: tb.read_scan(3), "a path is wanted, not int"),  # type: ignore[arg-type]
+        (lambda: tb.simulate({"lump": []}), "a path is wanted, not dict"),  # type: ignore[arg-type]
+        (lambda: tb.estimate([tb.demo_map()]), "a map is wanted, not list; give one map after the other, or pool"),
+    ],
+)
+def test_what_is_no_scan_path_or_map_is_one_line(call: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        call()

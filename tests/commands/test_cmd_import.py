@@ -101,7 +101,7 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
         (["g.npz", "-o", "a.mcap"], 3, "`tactile-bayes import --help` says what they are"),
         (["x.mat", "-o", "a.nc"], 3, "scipy.io.loadmat"),
         (["x.h5", "-o", "a.nc"], 3, "h5py"),
-        (["x.tsv", "-o", "a.nc"], 3, "save the grid as .csv"),
+        (["x.xlsx", "-o", "a.nc"], 3, "save the grid as .csv"),
     ],
 )
 def test_mistakes_end_in_one_line_and_their_code(

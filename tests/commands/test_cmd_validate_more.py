@@ -310,3 +310,50 @@ def test_the_model_of_the_next_mass_is_reported(tmp_path: Path) -> None:
     assert all(one["rhat"] <= 1.01 for one in found["diagnostics"].values())
     low, high = (found["modalities"]["tactile"]["mape_percent"][key] for key in ("low", "high"))
     assert 5 < low < high < 40
+
+
+def small(folder: Path, rows: list[tuple[str, int, str, float]], sizes: list[tuple[str, int, float]]) -> tuple:
+    """Words for a trial of so many detected readings (patient, mass, modality, size) and excised masses."""
+    lines = [f"{patient},{mass},{name},1,{size},detected" for patient, mass, name, size in rows]
+    (folder / "trial.csv").write_text("\n".join(["patient,mass,modality,replicate,size_mm,status", *lines]) + "\n")
+    excised = [f"{patient},{mass},{size}" for patient, mass, size in sizes]
+    (folder / "excision.csv").write_text("\n".join(["patient,mass,ex_vivo_mm", *excised]) + "\n")
+    return folder / "trial.csv", "--excision", folder / "excision.csv"
+
+
+def test_masses_of_one_patient_are_no_new_trials_of_whether_masses_are_found(tmp_path: Path) -> None:
+    """Clopper-Pearson for n of n: the low end is 0.025^(1/n) (R: binom.test(5, 5)$conf.int is 0.478 to 1)."""
+    e = [12.0, 19.0, 16.0, 15.0, 10.0]
+    for patients, number in (("AAAAA", 1.0), ("ABCDE", 5.0), ("AABBC", 25 / 9)):
+        rows = [(one, i, "tactile", x + 0.5) for i, (one, x) in enumerate(zip(patients, e, strict=True), 1)]
+        words = small(tmp_path, rows, [(one, i, x) for i, (one, x) in enumerate(zip(patients, e, strict=True), 1)])
+        low, high = document(*words)["modalities"]["tactile"]["detected_interval"]
+        assert (low, high) == (pytest.approx(0.025 ** (1 / number), abs=1e-6), 1.0)
+
+
+def test_a_p_value_that_few_patients_cannot_make_small_says_so(tmp_path: Path) -> None:
+    """The sign-flip test of n patients has 2^n patterns: p is 2/2^n at least, 0.25 of three and 0.03 of six."""
+    for n, told in ((3, True), (6, False)):
+        names = "ABCDEF"[:n]
+        e = [(one, 1, 10.0 + i) for i, one in enumerate(names)]
+        rows = [(one, 1, "tactile", x + 0.5) for one, _, x in e] + [(one, 1, "us", x + 4.0) for one, _, x in e]
+        text = validate(*small(tmp_path, rows, e), "--methods").output
+        assert ("With 3 patients p cannot be below 0.25: the test says nothing here." in text) == told, text
+        assert "; p " in text
+
+
+def test_a_ratio_over_no_error_and_lines_through_one_mass_are_reasons(tmp_path: Path) -> None:
+    e = [("A", 1, 12.0), ("B", 1, 19.0), ("C", 1, 16.0)]
+    exact = [(one, 1, name, x) for one, _, x in e for name in ("tactile", "us")]
+    text = validate(*small(tmp_path, exact, e)).output
+    assert "us: no MAPE ratio on 3 common masses: " in text
+    assert "- times" not in text
+    one = validate(*small(tmp_path, [("A", 1, "tactile", 10.0)], e[:1]), "--methods").output
+    assert "tactile: no lines or limits: too few masses were found, or their sizes do not differ" in one
+
+
+def test_exchanged_tables_and_readings_without_excision_are_told_apart(tmp_path: Path) -> None:
+    assert "this is the table of readings: give the other one here" in refusal(EXCISION, "--excision", TRIAL)
+    assert "this is the table of sizes after excision" in refusal(EXCISION, "--excision", EXCISION)
+    words = small(tmp_path, [("A", 1, "tactile", 10.0), ("B", 1, "tactile", 12.0)], [("A", 1, 11.0)])
+    assert "or leave its readings out" in refusal(*words)

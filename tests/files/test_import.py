@@ -223,6 +223,31 @@ def test_an_empty_field_is_a_cell_without_data(tmp_path: Path) -> None:
     np.testing.assert_array_equal(grid.count, [[1, 0, 1], [1, 1, 0]])
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("semicolons.csv", "\ufeff0,9;;1,234\r\n1;2;3\r\n".encode()),
+        ("points.csv", b"0.9;;1.234\n1;2;3\n"),
+        ("tabs.tsv", b"0,9\t\t1,234\n1\t2\t3\n"),
+        ("unicode.txt", "0.9\t\t1.234\r\n1\t2\t3\r\n".encode("utf-16")),
+        ("plain.csv", b"\n0.9,,1.234\n1,2,3\n\n\n"),
+    ],
+)
+def test_tables_as_spreadsheets_save_them_are_one_grid(tmp_path: Path, name: str, content: bytes) -> None:
+    """A spreadsheet saves by the country: semicolons and decimal commas, tabs, UTF-16, a byte order mark."""
+    (tmp_path / name).write_bytes(content)
+    np.testing.assert_array_equal(
+        read_grid(tmp_path / name, spacing_mm=1.0).mean, [[0.9, np.nan, 1.234], [1.0, 2.0, 3.0]]
+    )
+
+
+def test_a_row_without_data_keeps_its_place(tmp_path: Path) -> None:
+    """It was dropped, and the rows after it moved up by a cell."""
+    (tmp_path / "g.csv").write_text("1,2\n,\n3,4\n")
+    grid = read_grid(tmp_path / "g.csv", spacing_mm=1.0)
+    np.testing.assert_array_equal(grid.mean, [[1.0, 2.0], [np.nan, np.nan], [3.0, 4.0]])
+
+
 ONES = np.ones((2, 2))
 GRID_FAULTS: list[tuple[Arrays, dict[str, Any], type[Exception], str]] = [
     ({"x": ONES}, {"spacing_mm": 1.0}, BadDataError, "lacks mean"),
@@ -231,6 +256,8 @@ GRID_FAULTS: list[tuple[Arrays, dict[str, Any], type[Exception], str]] = [
     ({"mean": ONES, "spacing_mm": 1.0}, {"spacing_mm": 2.0}, UsageError, "the file says"),
     ({"mean": ONES}, {"spacing_mm": -1.0}, BadDataError, "spacing is -1"),
     ({"mean": ONES}, {"spacing_mm": float("nan")}, BadDataError, "spacing is nan"),
+    ({"mean": ONES}, {"spacing_mm": 0.001}, BadDataError, "spacing is 0.001 mm; looks like metres"),
+    ({"mean": 9000 * ONES}, {"spacing_mm": 1.0, "units": "kPa"}, BadDataError, "9000 kPa; looks like Pa"),
     ({"mean": np.ones(4)}, {"spacing_mm": 1.0}, BadDataError, r"shape \(4,\)"),
     ({"mean": ONES * np.inf}, {"spacing_mm": 1.0}, BadDataError, "infinite"),
     ({"mean": ONES * np.nan}, {"spacing_mm": 1.0}, BadDataError, "no cell holds data"),
@@ -260,7 +287,16 @@ def test_every_fault_of_a_grid_is_one_line(
         ("g.csv", b"1,2\n3\n", "row 2 has 1 fields"),
         ("g.csv", b"x,y\n1,2\n", "row 1, column 1 holds 'x'"),
         ("g.csv", b"", "is empty"),
-        ("g.csv", b"\xff\xfe\x00", "not a table|not UTF-8"),
+        ("g.csv", b"\xff\xfe\x00", "not UTF-16 text"),
+        ("g.csv", b"1,2\n\xb5,4\n", "line 2: byte 0xb5 is not UTF-8 text"),
+        ("g.csv", b"Pressure mat,,,\nUnits,kPa\n1,2,3,4\n", "row 1, column 1 holds 'Pressure mat'"),
+        ("g.csv", b"1,2\n3,4\n\n5,6\n7,8\n", "blank line after row 2; give one grid"),
+        ("g.csv", b",0,1,2\n0,9,9,9\n1,9,9,9\n2,9,9,9\n", r"row 1 and column 1 count 0, 1, 2.*header=False"),
+        ("g.csv", b",-1.5,0,1.5\n4,9,9,9\n2,9,9,9\n0,9,9,9\n", "row 1 and column 1 count -1.5, 0, 1.5"),
+        ("g.csv", b"1,2,3,4,5,6,7,8\n9,9,9,9,9,9,9,9\n", "row 1 count 1, 2, 3"),
+        ("g.csv", b"".join(b"%d,9\n" % i for i in range(9)), "column 1 count 0, 1, 2"),
+        ("g.tsv", b"1,234\t2,345\n", r"'1,234', which is 1234 or 1.234; write numbers without commas"),
+        ("g.csv", b"1;2,5;3\n1;2.5.1;3\n", "row 2, column 2 holds '2.5.1'"),
         ("g.tif", b"II*\x00junk", "is not an image|cannot be decoded"),
         ("g.pgm", b"P5 4 4 255\n12", "is not an image|cannot be decoded"),
         ("g.docx", b"", "suffix"),

@@ -16,6 +16,7 @@ from tactile_bayes.hardware.serve import document
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.orientation import orientation_of
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.posterior.abstention import missing_strokes
 from tactile_bayes.report.live_text import live_text
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.scan import Landmarks, Scan
@@ -141,6 +142,30 @@ def test_the_notch_is_never_more_than_an_eighth_of_a_turn_from_straight_up(head_
     across, up = orientation_of(map_of(head_deg)).notch
     assert up >= np.cos(np.pi / 4) - 1e-9
     assert np.hypot(across, up) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("head_deg", "left"), [(70, "-x"), (270, "+x"), (0, "+y"), (180, "-y")])
+def test_the_sides_where_strokes_are_missing_are_the_patients(head_deg, left):
+    """The advice named the plane's axes: with the patient's head along x it sent the examiner to "the feet"."""
+    names = ("left", "right", "head", "feet")
+    up = direction(head_deg)
+    towards = dict(zip(names, (np.cross(INTO_BODY, up), -np.cross(INTO_BODY, up), up, -up), strict=True))
+    tactile_map = map_of(head_deg)
+    x, y = np.meshgrid(tactile_map.x_mm, tactile_map.y_mm)
+    for name in names:
+        cut = x * towards[name][0] + y * towards[name][1] > 4.0
+        short = missing_strokes(replace(tactile_map, count=np.where(cut, 0, 40)), (0.0, 0.0), reach_mm=8.0)
+        assert [words.split(" (")[0] for words in short] == [f"the patient's {name}"]
+        if name == "left":
+            assert list(short) == [f"the patient's left ({left})"]
+
+
+def test_without_landmarks_missing_strokes_are_on_sides_of_the_picture():
+    tactile_map = map_of(None)  # its picture has x to the left
+    count = np.where(tactile_map.x_mm[None, :] > 4.0, 0, np.full(tactile_map.count.shape, 40))
+    assert list(missing_strokes(replace(tactile_map, count=count), (0.0, 0.0), reach_mm=8.0)) == [
+        "the picture's left (+x)"
+    ]
 
 
 def test_an_imported_grid_is_shown_as_its_file_reads():

@@ -41,7 +41,7 @@ def cut(*, right: int) -> np.ndarray:
         (np.full((9, 9), np.nan), "empty", "map a scan"),
         (np.ones((51, 51)), "empty", ""),
         (1 + WHITE, "undetected", "go over the place again"),
-        (cut(right=1), "window", "mm to the right (+x)"),
+        (cut(right=1), "window", "mm to the picture's right (+x)"),
     ],
 )
 def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advice: str) -> None:
@@ -122,8 +122,8 @@ def test_a_measurable_lump_has_neither() -> None:
 @pytest.mark.parametrize("reached", [3, 6, 9])
 def test_missing_strokes_are_counted_from_the_centre(reached: int) -> None:
     short = missing_strokes(grid_map(cut(right=reached)), (0.0, 0.0), reach_mm=12.0)
-    assert list(short) == ["the right (+x)"]
-    assert short["the right (+x)"] == pytest.approx(12.0 - (reached - 0.5), abs=1.0)
+    assert list(short) == ["the picture's right (+x)"]
+    assert short["the picture's right (+x)"] == pytest.approx(12.0 - (reached - 0.5), abs=1.0)
     assert extend_advice(short).startswith("extend the strokes ")
     assert missing_strokes(grid_map(bump_values()), (0.0, 0.0), reach_mm=12.0) == {}
 

@@ -21,9 +21,10 @@ from tactile_bayes.files.schema import check_document
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.one_map import Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.posterior import masses as masses_module
 from tactile_bayes.posterior.masses import with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.result import Estimate, Mass
+from tactile_bayes.posterior.result import Estimate, Mass, Rise
 
 WIDE, NARROW = (-17.0, 2.0), (16.0, 2.0)
 
@@ -188,3 +189,30 @@ def test_both_masses_of_a_shared_scan_are_listed_and_hold(shared_data: Path, tmp
     given = json.loads(run_here(*words, cwd=tmp_path).stdout)
     assert given["scene"]["beside"] is None
     assert [mass["reported"] for mass in given["masses"]] == [False, True]
+
+
+def at_the_rim() -> TactileMap:
+    """A lump, and a rise that the map's edge cuts off: to the scene a second lump whose centre lies beyond."""
+    rng = np.random.default_rng(1)
+    values = bump_values(half_mm=30.0, x=0.0, y=8.0, sigma_x=5.0, sigma_y=5.0, amplitude=0.3)
+    values += bump_values(half_mm=30.0, x=1.0, y=33.0, sigma_x=4.0, sigma_y=4.0, amplitude=0.3, level=0.0)
+    values += 0.005 * correlated_field(rng, len(values), length_cells=3.0)
+    return grid_map(values + 0.005 * rng.standard_normal(values.shape), normalise="gain")
+
+
+def test_a_second_lump_whose_centre_lies_off_the_map_does_not_end_the_estimate() -> None:
+    """It ended in an error about --centre-mm, which nobody had given."""
+    estimate = found_on(at_the_rim()).estimate
+    assert estimate.scene is not None
+    assert estimate.scene.fit.scene.extra == "second lump"
+    assert estimate.scene.fit.mode[-2] > 30.5  # its centre's y; the map ends at 30.5 mm
+    assert estimate.size is not None
+    assert places(estimate.masses) == [(0, 8)]
+
+
+def test_a_rise_whose_centre_lies_off_the_map_is_a_mass_without_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(masses_module, "other_rises", lambda *_: (Rise(0.0, 31.0, None, 0.2, 4.0, 4.0, 0.99),))
+    masses = found_on(at_the_rim()).estimate.masses
+    assert places(masses) == [(0, 8), (0, 31)]
+    assert masses[1].estimate.code == "window"
+    assert masses[1].estimate.reason == "its centre lies off the map"

@@ -16,6 +16,8 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference.summary import summarise
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.pipeline.one_map import answer_of, estimate_one
+from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.posterior.correlated.selection import Structure
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
@@ -225,3 +227,22 @@ def test_sources_of_variance_are_ranked_and_only_large_ones_have_a_remedy() -> N
     assert "strokes" not in lines[1]
     assert width_lines({"map": 100.0})[1] == "What would narrow it: a slower scan with more strokes over the lump."
     assert joined([], most=2, lead="Check: ") == []
+
+
+def test_both_reports_caution_where_the_landmarks_contradict_the_scans_side() -> None:
+    """The lump lies 50 mm to the patient's right of the xiphoid; only the page of an exam said so."""
+    placed = np.eye(4)
+    placed[0, 3] = 60.0
+    tactile_map = replace(mass(1), patient_from_plane=placed)
+    for side, doubted in (("left", True), ("right", False), ("phantom", False)):
+        scans = ({"sha256": "ab" * 32, "side": side},)
+        answer = answer_of(estimate_one(tactile_map, Settings(method="laplace"), scans=scans))
+        for text in (answer.text, answer.full_text):
+            told = text.splitlines()[0]
+            assert (
+                told.startswith(
+                    "CAUTION: the scan says left breast, and the landmarks put the lump 50 mm to the patient's right"
+                )
+                == doubted
+            ), told
+        assert len(answer.text.splitlines()) <= MOST_LINES

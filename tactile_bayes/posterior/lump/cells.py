@@ -121,6 +121,19 @@ def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, rad
     )
 
 
+def map_ends(tactile_map: TactileMap) -> dict[str, tuple[float, float]]:
+    """Ends of the map's outermost cells along x and y, mm."""
+    half = tactile_map.recipe.cell_mm / 2.0
+    axes = {"x": tactile_map.x_mm, "y": tactile_map.y_mm}
+    return {name: (float(axis[0]) - half, float(axis[-1]) + half) for name, axis in axes.items()}
+
+
+def on_map(tactile_map: TactileMap, x_mm: float, y_mm: float) -> bool:
+    """Whether a place lies on the map's cells, covered or not."""
+    ends = map_ends(tactile_map)
+    return ends["x"][0] <= x_mm <= ends["x"][1] and ends["y"][0] <= y_mm <= ends["y"][1]
+
+
 def covered_share(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> float:
     """Share of the disc about `centre_mm` that the map covers, counting what lies beyond its edge as not covered."""
     cell = tactile_map.recipe.cell_mm
