@@ -1,7 +1,7 @@
 """A calibration for another head, learned and held against exams of bodies that it has not seen.
 
     python -m benchmarks.other_head HEAD.json DIR [--bodies BODIES.toml] [--masses 150] [--trial 25]
-        [--exams 2] [--form FORM]
+        [--exams 2] [--form FORM] [--trial-seed N]
 
 By the command line it simulates the bodies (`population`) and learns a calibration (`calibrate size`); a table and maps
 that DIR holds already are kept. Then it scans the trial's masses, from another seed, maps every scan and sizes it
@@ -52,12 +52,12 @@ def learn(head: Path, folder: Path, *, bodies: Path | None, masses: int, form: s
     return size
 
 
-def trial_scenes(head: Head, masses: int, exams: int, priors: tuple[BodyPrior, ExamPrior] | None = None) -> list[Scene]:
+def trial_scenes(
+    head: Head, masses: int, exams: int, *, seed: int = TRIAL_SEED, priors: tuple[BodyPrior, ExamPrior] | None = None
+) -> list[Scene]:
     """Exams of bodies that no calibration has seen, those of a mass one after the other."""
     prior, technique = priors or (BodyPrior(), ExamPrior())
-    drawn = [
-        draw_mass(i, scans=exams, seed=TRIAL_SEED, bodies=prior, exams=technique, head=head) for i in range(masses)
-    ]
+    drawn = [draw_mass(i, scans=exams, seed=seed, bodies=prior, exams=technique, head=head) for i in range(masses)]
     return [scene for scenes in drawn for scene in scenes]
 
 
@@ -131,12 +131,15 @@ def main() -> None:
     parser.add_argument("--masses", type=int, default=150)
     parser.add_argument("--trial", type=int, default=25)
     parser.add_argument("--exams", type=int, default=2)
-    parser.add_argument("--form", default="log-quadratic")
+    parser.add_argument("--form", default="gaussian-process")
+    parser.add_argument("--trial-seed", type=int, default=TRIAL_SEED)
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     size = learn(given.head, given.folder, bodies=given.bodies, masses=given.masses, form=given.form)
     priors = read_bodies(given.bodies) if given.bodies else None
-    scenes = trial_scenes(read_simulated_head(given.head), given.trial, given.exams, priors)
+    scenes = trial_scenes(
+        read_simulated_head(given.head), given.trial, given.exams, seed=given.trial_seed, priors=priors
+    )
     rows = []
     for i, scene in enumerate(scenes):
         path = trial_map(scene, given.folder / f"trial-{i // given.exams + 1}-{i % given.exams + 1}.nc")
