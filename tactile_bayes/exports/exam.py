@@ -264,6 +264,8 @@ def size_words(size: Mapping[str, Any]) -> str:
 def _cautions(document: Mapping[str, Any]) -> Iterable[str]:
     """The report's cautions, which go wherever the size goes."""
     diagnostics = document.get("diagnostics", {})
+    if told := document.get("side_caution"):
+        yield plain_line(told)
     for text in (*_texts(document.get("outside_calibration")), *_texts(diagnostics.get("outside_calibration"))):
         yield f"outside the calibration's range: {text}"
     yield from _texts(diagnostics.get("broken_assumptions"))

@@ -381,6 +381,7 @@ def answer_of(outcome: Outcome) -> Answer:
         place=place,
     )
     told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
+    told["side_caution"] = document["side_caution"]
     text = estimate_summary(estimate, quantities, **told)
     full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE

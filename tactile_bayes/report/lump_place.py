@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tactile_bayes.mapping.clock_face import ClockPosition, clock_position, clock_text
+from tactile_bayes.mapping.clock_face import SIDES, ClockPosition, clock_position, clock_text
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.lump.posterior import MapPosterior
+
+
+MIDDLE_MM: Final = 20.0
+"""So far from the xiphoid a lump is on that side of the body, whatever is wrong with the landmarks' direction."""
 
 
 def side_of(scans: Sequence[Mapping[str, str]]) -> str:
@@ -46,3 +50,22 @@ def from_xiphoid(x_mm: float, y_mm: float) -> str:
     """A place in the patient's axes, in words."""
     across = f"{abs(x_mm):.0f} mm to the patient's {'right' if x_mm >= 0 else 'left'}"
     return f"{across} of the xiphoid and {abs(y_mm):.0f} mm {'above' if y_mm >= 0 else 'below'} it"
+
+
+def side_caution(side: str, patient_mm: tuple[float, float] | None) -> str:
+    """Caution where the landmarks put a lump on the other side of the body than the scans say; empty where they do not.
+
+    Parameters
+    ----------
+    side
+        As `side_of` gives it.
+    patient_mm
+        From the xiphoid to the patient's right and up; None without landmarks or a lump.
+    """
+    if side not in SIDES or patient_mm is None or abs(patient_mm[0]) < MIDDLE_MM:
+        return ""
+    other = "right" if patient_mm[0] > 0 else "left"
+    if other == side:
+        return ""
+    place = f"the landmarks put the lump {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
+    return f"the scan says {side} breast, and {place}: side or landmarks are wrong"
