@@ -195,13 +195,13 @@ def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
 def _read_estimate(source: Path) -> dict[str, Any]:
     """An estimate's JSON object, from its JSON or its posterior's file."""
     from tactile_bayes.files.documents import load_json
+    from tactile_bayes.files.estimate_json import check_estimate
     from tactile_bayes.files.posterior_nc import read_estimate
-    from tactile_bayes.files.schema import check_document
 
     if not _is_json(source):
         return read_estimate(source)
     document: Any = load_json(source, way_out="give what `estimate --json` printed for one map")
-    check_document(document, "estimate.schema.json", path=source)
+    check_estimate(document, "estimate.schema.json", path=source)
     found: dict[str, Any] = document
     return found
 

@@ -271,8 +271,8 @@ def test_a_size_is_drawn_with_its_intervals_named(tmp_path, axes):
         size_figure(draws(0, 15), draws(1, 12), tmp_path / name, intervals=INTERVALS)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert [text.get_text() for text in axes[0].texts] == [
-        "12.0 to 18.0 mm: 95 % interval (equal-tailed)",
-        "9.0 to 15.0 mm: 95 % interval (equal-tailed)",
+        "largest, 12.0 to 18.0 mm: 95 % interval (equal-tailed)",
+        "smallest, 9.0 to 15.0 mm: 95 % interval (equal-tailed)",
     ]
 
 
