@@ -58,7 +58,7 @@ class Outputs:
                 refuse_existing(path, force=self.force)
 
     def write(self, exported: Exported | None) -> tuple[Path, ...]:
-        """Write the files of the export, and the dictionary; each atomically.
+        """Write the files of the export, and the dictionary: all of them, or none.
 
         Raises
         ------
@@ -66,29 +66,33 @@ class Outputs:
             When a file exists and `force` is false, or the folder holds files of another export.
         """
         from tactile_bayes.exports.redcap import dictionary_csv
-        from tactile_bayes.files.atomic import write_bytes, write_text
+        from tactile_bayes.files.atomic import write_all
 
-        paths = dict[Path, bytes]()
+        paths, folder = dict[Path, bytes](), None
         if exported is not None and self.path is not None:
             if "" not in exported.files:
-                _prepare_folder(self.path, set(exported.files), force=self.force)
+                folder = _prepared_folder(self.path, set(exported.files), force=self.force)
             paths = {self.path / name if name else self.path: data for name, data in exported.files.items()}
-        for path, data in paths.items():
-            write_bytes(path, data, force=self.force)
-        if self.dictionary is None:
-            return tuple(paths)
-        write_text(self.dictionary, dictionary_csv(), force=self.force)
-        return (*paths, self.dictionary)
+        if self.dictionary is not None:
+            paths[self.dictionary] = dictionary_csv().encode()
+        try:
+            write_all(paths, force=self.force)
+        except UsageError:
+            if folder is not None:
+                folder.rmdir()
+            raise
+        return tuple(paths)
 
 
 def _real(path: Path | None) -> str:
     return "" if path is None else os.path.realpath(path)
 
 
-def _prepare_folder(folder: Path, names: set[str], *, force: bool) -> None:
-    """Make the folder, and refuse one in which the files would stand beside those of another export."""
+def _prepared_folder(folder: Path, names: set[str], *, force: bool) -> Path | None:
+    """Refuse a folder in which the files would stand beside those of another export; make it, and return a new one."""
     from tactile_bayes.files.atomic import refuse_existing, unwritable
 
+    new = not folder.exists()
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         others = sorted({path.name for path in folder.glob("*.dcm")} - names)
@@ -100,3 +104,4 @@ def _prepare_folder(folder: Path, names: set[str], *, force: bool) -> None:
         raise UsageError(f"{folder} holds {others[0]} of another export; give another folder")
     for name in sorted(names):
         refuse_existing(folder / name, force=force)
+    return folder if new else None

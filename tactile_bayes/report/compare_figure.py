@@ -163,8 +163,8 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[int, _Laid]], *, l
     _name_axes(panels[-1], first.origin_mm, in_patient=in_patient)
     bars = [bar, figure.colorbar(image, ax=panels[-1], shrink=0.8, pad=0.01)]
     bars[1].set_label(f"difference of {label}", fontsize=8)
-    for one in bars:
-        one.ax.tick_params(labelsize=7)
+    for each in bars:
+        each.ax.tick_params(labelsize=7)
 
 
 def _draw_cells(axes: Axes, values: FloatArray, origin_mm: FloatArray, **how: Any) -> Any:

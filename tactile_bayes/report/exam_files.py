@@ -48,19 +48,19 @@ class PageFiles:
             find_printer()
 
     def write(self, exam: Exam) -> None:
-        """Write the page; it is printed first, so that a failure leaves neither file.
+        """Write the page and its print: both of them, or none.
 
         Raises
         ------
         UsageError
             As of `check`, and when the page could not be printed.
         """
-        from tactile_bayes.files.atomic import write_bytes, write_text
+        from tactile_bayes.files.atomic import write_all
         from tactile_bayes.report.exam_page import exam_page
         from tactile_bayes.report.printed import find_printer
 
         page = exam_page(exam)
-        printed = None if self.pdf is None else find_printer()(page)
-        write_text(self.html, page, force=self.force)
-        if self.pdf is not None and printed is not None:
-            write_bytes(self.pdf, printed, force=self.force)
+        files = {self.html: page.encode()}
+        if self.pdf is not None:
+            files[self.pdf] = find_printer()(page)
+        write_all(files, force=self.force)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -125,3 +127,21 @@ def test_a_dictionary_that_does_not_fit_is_refused_before_anything_is_written(
     with pytest.raises(UsageError, match=told):
         tb.export(**given)
     assert files(folder) == before
+
+
+def test_a_folder_of_files_is_written_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("highdicom")
+    write = Path.write_bytes
+
+    def refusing(path: Path, data: bytes) -> int:
+        if "report" in path.name:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, data)
+
+    before = files(folder)
+    monkeypatch.setattr(Path, "write_bytes", refusing)
+    with pytest.raises(UsageError, match=r"No space left on device.*make room"):
+        tb.export(["map.nc", "map.json"], "exam", to="dicom", **DATED)
+    assert files(folder) == before
+    monkeypatch.setattr(Path, "write_bytes", write)
+    assert len(tb.export(["map.nc", "map.json"], "exam", to="dicom", **DATED).paths) == 3

@@ -16,6 +16,7 @@ from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.report import map_figure as maps
 from tactile_bayes.report import size_figure as sizes
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
+from tactile_bayes.report.posterior_figures import corner_figure
 from tactile_bayes.report.size_figure import SizeInterval, size_figure
 
 INTERVALS = {
@@ -356,3 +357,9 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
     # tradeoff
     assert len(found) == 14
     assert all(isinstance(one, FigurePath) for one in found)
+
+
+def test_the_regions_of_pairs_say_how_many_draws_they_hold() -> None:
+    rng = np.random.default_rng(3)
+    figure = corner_figure({"max_size_mm": rng.normal(15, 1, (1, 400)), "amplitude": rng.normal(0, 1, (1, 400))}, None)
+    assert figure.get_suptitle() == "Corner: dark 50 %, light 90 % of the draws"
