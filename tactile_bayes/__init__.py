@@ -8,6 +8,7 @@
 - `compare`: from the maps of two visits to the change of a mass's size
 - `calibrate_size`, `validate`: from tables to a size calibration, or to a trial's report
 - `calibrate_repeatability`: from a campaign's folder to the spread between exams of one mass at its site
+- `exam_report`: from maps and estimates to the page of an exam, HTML or PDF
 - `export`: from maps and estimates to DICOM, FHIR, NRRD and CSV
 - `record`: from devices to a scan
 - `Map`, `SizeEstimate`, `PooledSize`, `Comparison`, `TrialResult`, `ExportedFiles`, `Draws`: what they return;
@@ -36,6 +37,7 @@ __all__ = [
     "demo_scan",
     "errors",
     "estimate",
+    "exam_report",
     "export",
     "pool",
     "read_map",
@@ -60,6 +62,7 @@ _HOME = {
     "demo_map": "api.maps",
     "demo_scan": "api.maps",
     "estimate": "api.estimates",
+    "exam_report": "api.reports",
     "export": "api.exporting",
     "pool": "api.estimates",
     "read_map": "api.maps",

@@ -16,6 +16,7 @@ from tactile_bayes.api.maps import read_map as read_map
 from tactile_bayes.api.maps import read_scan as read_scan
 from tactile_bayes.api.maps import simulate as simulate
 from tactile_bayes.api.recording import record as record
+from tactile_bayes.api.reports import exam_report as exam_report
 from tactile_bayes.api.trials import TrialResult as TrialResult
 from tactile_bayes.api.trials import calibrate_repeatability as calibrate_repeatability
 from tactile_bayes.api.trials import calibrate_size as calibrate_size

@@ -5,6 +5,7 @@ A live device, a log and a simulation all yield these types. Arrays are kept as 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -148,6 +149,13 @@ class PressureFrames:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the readings alone, which a recording keeps whatever session or calibration it is written with."""
+        digest = hashlib.sha256(np.array(self.counts.shape, dtype="<i8").tobytes())
+        digest.update(np.ascontiguousarray(self.counts, dtype="<u2").data)
+        return digest.hexdigest()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,8 @@ from tactile_bayes.api.maps import Map
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.compared import ComparedOutcome, compare_answers, drawn_maps
-from tactile_bayes.pipeline.comparing import GROWN_BY, Comparing
+from tactile_bayes.pipeline.comparing import GROWN_BY, Comparing, times_of
+from tactile_bayes.pipeline.settings import refuse_checkpoint
 from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -99,6 +100,13 @@ class Comparison:
 
         return compare_summary(self.document)
 
+    @property
+    def full_text(self) -> str:
+        """What ``compare -v`` prints."""
+        from tactile_bayes.report.compare_text import compare_text
+
+        return compare_text(self.document)
+
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the visits' maps, their difference and the change; with a path also write it."""
         from tactile_bayes.report.compare_figure import draw_comparison
@@ -120,6 +128,7 @@ def compare(
     second: Any,
     *more: Any,
     days: Sequence[float] | None = None,
+    dates: Sequence[str] | None = None,
     grown_by: Sequence[float] = GROWN_BY,
     same_mass: bool = False,
     registration_mm: float = REGISTRATION_MM,
@@ -133,6 +142,8 @@ def compare(
         A visit each, in order of time: a map, a path or an estimate, or a list of them.
     days
         Days from the first visit to each later one; with them growth rates are told.
+    dates
+        The visits' dates in place of days, such as ``["2026-01-15", "2026-04-20"]``.
     grown_by
         Shares of the diameter (0.2 for 20 %) that the probability of a larger growth is told for.
     same_mass
@@ -150,8 +161,9 @@ def compare(
         As of `estimate`, and when the maps were normalised in several ways.
     """
     used = settings_of(settings)
-    times = None if days is None else (0.0, *map(float, days))
-    comparing = Comparing(times, tuple(grown_by), same_mass, registration_mm)
+    refuse_checkpoint(used)
+    comparing = Comparing(times_of(days, dates), tuple(grown_by), same_mass, registration_mm)
+    comparing.check_visits(2 + len(more))
     visits = tuple(_visit(one, settings) for one in (first, second, *more))
     prints = [one.outcome.tactile_map.fingerprint for visit in visits for one in visit]
     if len(set(prints)) < len(prints):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,7 @@ from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.api.sized import MassEstimate, Sized
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -175,17 +175,20 @@ class SizeEstimate(Sized):
 
         return named_exam(self.name, self.outcome.provenance.scans)
 
-    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
-        """Write one page of the exam as HTML, as ``tactile-bayes report`` does.
+    def report(
+        self,
+        path: PathLike,
+        *,
+        pdf: PathLike | None = None,
+        title: str = "",
+        name: str = "",
+        day: str = "",
+        force: bool = False,
+    ) -> None:
+        """Write one page of the exam as HTML, and with `pdf` also print it; see `exam_report`."""
+        from tactile_bayes.api.reports import exam_report
 
-        Parameters
-        ----------
-        path
-            Usually ``*.html``.
-        title, name, day
-            To print on the page; nothing is where they are not given.
-        """
-        _write_report((self,), path_of(path), self.outcome.settings, (title, name, day), force=force)
+        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
 
     def save(self, path: PathLike, *, force: bool = False) -> None:
         """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
@@ -234,9 +237,20 @@ class PooledSize(Sized):
         """What ``estimate --pool --json`` prints."""
         return self.outcome.document
 
-    def report(self, path: PathLike, *, title: str = "", name: str = "", day: str = "", force: bool = False) -> None:
-        """Write one page of the exam as HTML, with the repeat maps; see `SizeEstimate.report`."""
-        _write_report(self.maps, path_of(path), self.settings, (title, name, day), force=force)
+    def report(
+        self,
+        path: PathLike,
+        *,
+        pdf: PathLike | None = None,
+        title: str = "",
+        name: str = "",
+        day: str = "",
+        force: bool = False,
+    ) -> None:
+        """Write one page of the exam with its repeat maps as HTML, and with `pdf` also print it; see `exam_report`."""
+        from tactile_bayes.api.reports import exam_report
+
+        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
 
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the posterior of the size; with a path also write it.
@@ -253,17 +267,6 @@ class PooledSize(Sized):
             raise UsageError(f"there is no size to draw: {self.why}")
         name = self.name or f"{len(self.maps)} maps pooled"
         return draw_size(size, path_of(path), name=name, probability=self.probability, force=force)
-
-
-def _write_report(
-    maps: Sequence[SizeEstimate], path: Path, settings: Settings, words: tuple[str, str, str], *, force: bool
-) -> None:
-    from tactile_bayes.files.atomic import write_text
-    from tactile_bayes.pipeline.exam_report import EstimatedMap, Given, make_exam
-    from tactile_bayes.report.exam_page import exam_page
-
-    found = [EstimatedMap(one.outcome.tactile_map, one.answer, one.outcome.provenance.scans) for one in maps]
-    write_text(path, exam_page(make_exam(found, settings, Given(*words))), force=force)
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -364,6 +367,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     from tactile_bayes.pipeline.pooled import pool_answers
 
     used = settings_of(settings)
+    refuse_checkpoint(used)
     found = tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in _several(maps))
     if not found:
         raise UsageError("there is no map to pool; give at least one")

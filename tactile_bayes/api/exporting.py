@@ -16,8 +16,8 @@ from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, read_
 from tactile_bayes.exports.run import FORMATS, TAKES, Format, refuse_untaken
 from tactile_bayes.exports.run import export as exported_files
 from tactile_bayes.exports.worklist import identity_of
-from tactile_bayes.exports.writing import write_exported
-from tactile_bayes.files.atomic import refuse_existing, sha256
+from tactile_bayes.exports.writing import Outputs
+from tactile_bayes.files.atomic import sha256
 
 _IN_PYTHON = Path("what was given in Python")
 """What messages call a map or an estimate that is in no file."""
@@ -40,12 +40,13 @@ class ExportedFiles:
 
 
 def export(
-    files: Any,
-    path: PathLike,
+    files: Any = (),
+    path: PathLike | None = None,
     *,
     to: Format,
     worklist: PathLike | None = None,
     patient_id_from_scan: bool = False,
+    dictionary: PathLike | None = None,
     force: bool = False,
     **identity: str,
 ) -> ExportedFiles:
@@ -55,7 +56,7 @@ def export(
     ----------
     files
         Maps, estimates and pooled sizes, or the paths of their files; one, or a list. An estimate brings its map where
-        `to` is ``"dicom"``.
+        `to` is ``"dicom"``. None at all where only a dictionary is wanted.
     path
         File to write; for ``"dicom"`` the folder of the files.
     to
@@ -64,6 +65,8 @@ def export(
         File of a modality worklist item, or of plain keys in JSON, that says who was examined.
     patient_id_from_scan
         Use the scan's subject code as the patient ID.
+    dictionary
+        With ``"csv"``: also write the data dictionary of the REDCap form there.
     **identity
         patient_id, patient_name, birth_date, sex, issuer, accession, referring_physician, study_id, study_description,
         study_uid, study_date and content_date, each a text; a format refuses what it does not hold.
@@ -85,19 +88,18 @@ def export(
     check_choice("to", to, FORMATS)
     _refuse_unknown(identity)
     refuse_untaken(to, identity)
-    output = path_of(path)
-    if to != "dicom":
-        refuse_existing(output, force=force)
     several = [files] if isinstance(files, str | Path | Map | SizeEstimate | PooledSize) else list(files)
-    if not several:
-        raise UsageError("nothing was given to export; give a map, an estimate or both")
-    exported = exported_files(
-        _read_all(several, to),
-        to=to,
-        identity=identity_of(path_of(worklist), identity),
-        id_from_scan=patient_id_from_scan,
-    )
-    return ExportedFiles(write_exported(exported, output, force=force), exported.notes)
+    outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
+    outputs.check(files=bool(several))
+    exported = None
+    if several:
+        exported = exported_files(
+            _read_all(several, to),
+            to=to,
+            identity=identity_of(path_of(worklist), identity),
+            id_from_scan=patient_id_from_scan,
+        )
+    return ExportedFiles(outputs.write(exported), () if exported is None else exported.notes)
 
 
 def _refuse_unknown(identity: dict[str, str]) -> None:

@@ -40,7 +40,7 @@ class Map:
     notes
         What the scans lost, or what else speaks against them.
     scans
-        The scan files that it was made from, as `Provenance.scans` has them.
+        The scans that it was made from, as `Provenance.scans` has them.
     """
 
     tactile_map: TactileMap
@@ -151,6 +151,7 @@ def build_map(scans: Any, **options: Any) -> Map:
     BadDataError
         When a file is no scan, or no frame is left.
     """
+    from tactile_bayes.files.provenance import scan_facts
     from tactile_bayes.mapping import build_map as build
     from tactile_bayes.pipeline.scans import exam_facts, load_scans
 
@@ -165,7 +166,9 @@ def build_map(scans: Any, **options: Any) -> Map:
             notes += lost
             facts += exam_facts([path_of(one)], read)
         else:
-            loaded.append(_scan_of(one))
+            scan = _scan_of(one)
+            loaded.append(scan)
+            facts.append(scan_facts(scan.session, frames=scan.frames.sha256))
     return Map(build(loaded, **options), notes=tuple(notes), scans=tuple(facts))
 
 

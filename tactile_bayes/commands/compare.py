@@ -12,8 +12,8 @@ from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.commands.visits_command import VisitsCommand, groups_of
 from tactile_bayes.errors import UsageError
-from tactile_bayes.pipeline.comparing import GROWN_BY, Comparing, days_of_dates
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.pipeline.comparing import GROWN_BY, Comparing, times_of
+from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 from tactile_bayes.presets import METHODS, REGISTRATION_MM
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def command(
     from tactile_bayes.report.compare_text import compare_summary, compare_text
 
     comparing = Comparing(
-        days=_days(days, dates),
+        days=times_of(days or None, None if dates is None else dates.split(",")),
         grown_by=tuple(percent / 100 for percent in grown_by),
         same_mass=same_mass,
         registration_mm=registration_mm,
@@ -157,22 +157,13 @@ def command(
     ctx.exit(outcome.exit_code)
 
 
-def _days(days: tuple[float, ...], dates: str | None) -> tuple[float, ...] | None:
-    if days and dates is not None:
-        raise UsageError("--days and --dates both say when the visits were; give one of them")
-    if dates is not None:
-        return days_of_dates(dates.split(","))
-    return (0.0, *days) if days else None
-
-
 def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
     """Refuse a map that is given twice, and a checkpoint."""
     every = [path for maps in visits for path in maps]
     twice = [path for i, path in enumerate(every) if path in every[:i]]
     if twice:
         raise UsageError(f"{twice[0]} is given twice; give each map once, at its own visit")
-    if settings.checkpoint is not None:
-        raise UsageError("a checkpoint is of one map; leave checkpoint out of the settings")
+    refuse_checkpoint(settings)
 
 
 def _compare(

@@ -17,7 +17,7 @@ from tactile_bayes.commands.options import FORCE, FiniteRange, scheduler_option,
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.pipeline.one_map import Answer, answer_file, answer_of, estimate_file
-from tactile_bayes.pipeline.settings import FROM_FILE, Settings
+from tactile_bayes.pipeline.settings import FROM_FILE, Settings, refuse_checkpoint
 from tactile_bayes.presets import METHODS, SCENES
 
 if TYPE_CHECKING:
@@ -171,8 +171,8 @@ def command(
         scene=scene,
         repeatability=repeatability_in(repeatability),
     )
-    if settings.checkpoint is not None and len(maps) > 1:
-        raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")
+    if len(maps) > 1:
+        refuse_checkpoint(settings)
     if figure is not None and size_calibration == "none":
         raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
     outputs = {"output": output, "figure": figure, "map figure": map_figure, "fit figure": fit_figure}

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
 
 from tactile_bayes.commands.options import FORCE
 from tactile_bayes.commands.paths import FilePath
-from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import RESEARCH_USE
-
-if TYPE_CHECKING:
-    from tactile_bayes.exports.run import Exported
 
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 # Name of the part of an identity, metavar, help.
@@ -81,40 +77,19 @@ def command(
     from tactile_bayes.exports.exam import read_exam
     from tactile_bayes.exports.run import export, refuse_untaken
     from tactile_bayes.exports.worklist import identity_of
-    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.exports.writing import Outputs
 
-    if not files and dictionary is None:
-        raise UsageError("no file was given to export; give a map, an estimate or both")
-    if files and output is None:
-        raise UsageError("there is nowhere to write to; give -o OUT")
-    if dictionary is not None and to != "csv":
-        raise UsageError("--dictionary is REDCap's; give it with --to csv")
     given = {name: value for name, value in identity.items() if value is not None}
     refuse_untaken(to, given)
-    for path in (dictionary, None if to == "dicom" else output):
-        if path is not None:
-            refuse_existing(path, force=force)
-    if files and output is not None:
+    outputs = Outputs(output, dictionary, to=to, force=force)
+    outputs.check(files=bool(files))
+    exported = None
+    if files:
         who = identity_of(worklist, given)
         exported = export(map(read_exam, files), to=to, identity=who, id_from_scan=patient_id_from_scan)
-        _write(exported, output, force=force)
-    if dictionary is not None:
-        _write_dictionary(dictionary, force=force)
-    click.echo(RESEARCH_USE)
-
-
-def _write(exported: Exported, output: Path, *, force: bool) -> None:
-    from tactile_bayes.exports.writing import write_exported
-
-    for path in write_exported(exported, output, force=force):
-        click.echo(f"{path}: {path.stat().st_size} bytes")
-    for note in exported.notes:
+    for path in outputs.write(exported):
+        is_dictionary = path == dictionary
+        click.echo(f"{path}: {'data dictionary for REDCap' if is_dictionary else f'{path.stat().st_size} bytes'}")
+    for note in () if exported is None else exported.notes:
         click.echo(f"note: {note}", err=True)
-
-
-def _write_dictionary(path: Path, *, force: bool) -> None:
-    from tactile_bayes.exports.redcap import dictionary_csv
-    from tactile_bayes.files.atomic import write_text
-
-    write_text(path, dictionary_csv(), force=force)
-    click.echo(f"{path}: data dictionary for REDCap")
+    click.echo(RESEARCH_USE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,18 +14,17 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
+from tactile_bayes.files.estimate_json import SCHEMAS, check_estimate
 from tactile_bayes.files.kinds import HDF5_MAGIC
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import open_input
-from tactile_bayes.files.schema import check_document
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
 
 _WAY_OUT: Final = "give a map (.nc), a posterior (.nc), or the JSON of `estimate --json`"
-_SCHEMAS: Final = {"tactile-bayes/estimate/1": "estimate.schema.json", "tactile-bayes/pooled/1": "pooled.schema.json"}
 _MOST_TEXT: Final = 2000
 _SIZES: Final = ("max_size_mm", "min_size_mm")
 Facts = Mapping[str, str]
@@ -159,7 +159,7 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
             group = file.group("posterior")
             attributes = None if group is None else group.attributes()
         return _read_map(path) if attributes is None else [_read_posterior(path, attributes)]
-    if not head.lstrip().startswith((b"{", b"[")):
+    if not head.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"[")):
         from tactile_bayes.files.kinds import kind_of
 
         kind = kind_of(path) or ("none of these" if head else "empty")
@@ -200,11 +200,11 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
         When it is no estimate.
     """
     schema = document.get("schema") if isinstance(document, dict) else None
-    if not isinstance(document, dict) or not isinstance(schema, str) or schema not in _SCHEMAS:
+    if not isinstance(document, dict) or not isinstance(schema, str) or schema not in SCHEMAS:
         from tactile_bayes.files.kinds import schema_kind
 
         raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
-    check_document(document, _SCHEMAS[schema], path=path)
+    check_estimate(document, SCHEMAS[schema], path=path)
     kind = schema.split("/")[1]
     text = json.dumps(document, sort_keys=True)
     return EstimateFile(
@@ -264,6 +264,8 @@ def size_words(size: Mapping[str, Any]) -> str:
 def _cautions(document: Mapping[str, Any]) -> Iterable[str]:
     """The report's cautions, which go wherever the size goes."""
     diagnostics = document.get("diagnostics", {})
+    if told := document.get("side_caution"):
+        yield plain_line(told)
     for text in (*_texts(document.get("outside_calibration")), *_texts(diagnostics.get("outside_calibration"))):
         yield f"outside the calibration's range: {text}"
     yield from _texts(diagnostics.get("broken_assumptions"))

@@ -159,8 +159,9 @@ def _record_id(estimate: EstimateFile, finding: Finding, identity: Identity, *, 
     parts = [patient, *(facts[name] for name in ("side", "visit", "mass") if name in facts), *several]
     name = "-".join(parts)
     if not _RECORD.fullmatch(name):
+        shown = name if len(name) <= 60 else f"{name[:57]}..."
         raise UsageError(
-            f"the record ID {name!r} is none that REDCap takes; use letters, digits, points and dashes, at most 100"
+            f"the record ID {shown!r} is none that REDCap takes; use letters, digits, points and dashes, at most 100"
         )
     return name
 

@@ -9,7 +9,7 @@ import os
 import re
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from tactile_bayes.errors import UsageError
@@ -149,6 +149,19 @@ def write_bytes(path: Path, data: bytes, *, force: bool = False) -> None:
     """Write `data` atomically; see `atomic_path` for the errors."""
     with atomic_path(path, force=force) as partial:
         partial.write_bytes(data)
+
+
+def write_all(files: Mapping[Path, bytes], *, force: bool = False) -> None:
+    """Write several files atomically: none is there before the system has taken the bytes of all.
+
+    Raises
+    ------
+    UsageError
+        As `atomic_path`.
+    """
+    with contextlib.ExitStack() as stack:
+        for path, data in files.items():
+            stack.enter_context(atomic_path(path, force=force)).write_bytes(data)
 
 
 def unwritable(path: Path, error: OSError) -> UsageError:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -48,9 +50,18 @@ def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again
         Of the part of a file that the text is, for the error; empty for a whole file.
     """
     with decoding(f"{name} is not JSON".lstrip(), way_out=way_out):
-        document: object = json.loads(text)
+        document: object = json.loads(text, object_pairs_hook=partial(_object, way_out=way_out))
     check_plain(document, way_out=way_out, name=name)
     return document
+
+
+def _object(pairs: list[tuple[str, Any]], *, way_out: str) -> dict[str, Any]:
+    """A JSON object, in which no key may stand twice: programs differ in which of the values they take."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        (twice, _), *_ = Counter(name for name, _ in pairs).most_common(1)
+        raise BadDataError(f"holds the key {twice[:40]!a} twice in one object", way_out=way_out)
+    return found
 
 
 def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:

@@ -13,9 +13,9 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
+from tactile_bayes.files.estimate_json import check_estimate
 from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
-from tactile_bayes.files.schema import check_document
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.inference_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
@@ -179,7 +179,7 @@ def read_estimate(path: Path) -> dict[str, Any]:
         what = "holds draws without their estimate, as earlier versions wrote it"
         raise BadDataError(what, way_out="give its map, or write it again with `estimate -o`", path=str(path))
     document: Any = parse_json(attributes["estimate"])
-    check_document(document, "estimate.schema.json", path=path)
+    check_estimate(document, "estimate.schema.json", path=path)
     found: dict[str, Any] = document
     return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +13,8 @@ from tactile_bayes.records import dataclass
 
 EXAM_FACTS: Final = ("subject", "side", "posture", "examiner", "visit", "mass", "array_calibration_days")
 """What a scan's session says of its exam and array calibration; codes only, see ``scan_session.schema.json``."""
+_DIGESTS: Final = ("sha256", "frames_sha256")
+"""Of a scan's file, and of its frames alone, which stays when the scan is written again with another session."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +22,7 @@ class Provenance:
     """The origin of one output; equal inputs and settings give equal bytes.
 
     Inputs are named by their role, not by their file name: file names may hold patients' names. `scans` are the scans
-    at the beginning, through whatever files they came: the digest of each and the `EXAM_FACTS` that it carries.
+    at the beginning, through whatever files they came: the digests of each and the `EXAM_FACTS` that it carries.
     """
 
     command: str
@@ -48,9 +50,18 @@ def hash_inputs(**paths: Path) -> dict[str, str]:
     return {role: sha256(path) for role, path in paths.items()}
 
 
-def scan_facts(digest: str, session: Mapping[str, str]) -> dict[str, str]:
-    """Digest of a scan file and what its session says of the exam, for `Provenance.scans`."""
-    return {"sha256": digest, **{name: session[name] for name in EXAM_FACTS if session.get(name)}}
+def scan_facts(session: Mapping[str, str], *, frames: str, file: str = "") -> dict[str, str]:
+    """Digests of a scan and what its session says of the exam, for `Provenance.scans`.
+
+    Parameters
+    ----------
+    frames
+        As `PressureFrames.sha256` gives it.
+    file
+        SHA-256 of the scan's file; empty for a scan that is in none.
+    """
+    facts = {name: session[name] for name in EXAM_FACTS if session.get(name)}
+    return {**({"sha256": file} if file else {}), **facts, "frames_sha256": frames}
 
 
 def scans_of(document: object) -> tuple[dict[str, str], ...]:
@@ -58,18 +69,27 @@ def scans_of(document: object) -> tuple[dict[str, str], ...]:
     scans = document.get("scans") if isinstance(document, dict) else None
     if not isinstance(scans, list):
         return ()
-    known = ("sha256", *EXAM_FACTS)
+    known = (*_DIGESTS, *EXAM_FACTS)
     return tuple(
         {name: one[name] for name in known if isinstance(one.get(name), str)} for one in scans if isinstance(one, dict)
     )
 
 
+def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:
+    """What tells the recordings of some scans from others: digests of their frames and of their files.
+
+    Two exams are of one recording where they share any of them. Files of earlier versions have the file's alone.
+    """
+    for scan in scans:
+        yield from (f"{name} {scan[name]}" for name in _DIGESTS if scan.get(name))
+
+
 def repeated_scans(exams: Sequence[Sequence[Mapping[str, str]]]) -> dict[int, int]:
-    """Which exams are of a scan that an earlier one is of, by its digest: index of the exam, and of the earlier one."""
+    """Which exams share a recording with an earlier one: index of the exam, and of the earlier one."""
     seen: dict[str, int] = {}
     found: dict[int, int] = {}
     for index, scans in enumerate(exams):
-        for digest in (scan["sha256"] for scan in scans if scan.get("sha256")):
-            if seen.setdefault(digest, index) != index:
-                found.setdefault(index, seen[digest])
+        for recording in recordings(scans):
+            if seen.setdefault(recording, index) != index:
+                found.setdefault(index, seen[recording])
     return found

@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, MAP, MASSES, REPEATABILITY, SHAPE
 from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.pipeline.campaign_copies import copy_tasks
-from tactile_bayes.pipeline.campaign_inputs import READ, read_sources, same_bytes
+from tactile_bayes.pipeline.campaign_inputs import READ, Alike, read_sources
 from tactile_bayes.pipeline.campaign_keys import digest_of
 from tactile_bayes.pipeline.campaign_match import Breasts, NamedPlace
 from tactile_bayes.pipeline.campaign_repeatability import (
@@ -110,6 +111,8 @@ class Campaign:
         self._bar: Bar = _no_bar if bar is None else bar
         self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
         self._breasts = Breasts(exams)
+        self._recordings = Alike(self._breasts, "recording")
+        self._repeated: set[str] = set()
         self._digests: dict[Path, str] = {}
         self._calibrations: dict[str, str] = {}
 
@@ -134,8 +137,11 @@ class Campaign:
         with self._bar("steps") as self._stages.tell:
             for block in _blocks_of_patients(sound, self._block):
                 self._size(block)
+            sound = [exam for exam in sound if exam.name not in self._repeated]
             self._learn_repeatability(sound)
             if masses:
+                left = len({exam.of_mass for exam in sound})
+                self._stages.total -= (masses - left) * (2 if self.settings.copy_to else 1)
                 self._pool(sound)
         return self.found
 
@@ -150,13 +156,15 @@ class Campaign:
             if exam.path in sources.faults:
                 self.found.faults[exam.name] = Fault(READ, sources.faults[exam.path])
                 self.unread.add(exam.name)
-        for name, reason in same_bytes(self.exams, self._digests, self._breasts).items():
+        bytes_of = {exam: [self._digests[exam.path]] for exam in self.exams if exam.path in self._digests}
+        for name, reason in Alike(self._breasts, "bytes").faults(bytes_of).items():
             self.found.faults[name] = Fault(READ, reason)
 
     def _size(self, exams: Sequence[Exam]) -> None:
         """Maps, estimates and figures of some exams."""
         known = [exam for exam in exams if exam.path in self._digests]  # a plan fetches nothing from a store
         self._stages.run("map", [self._map_task(exam) for exam in known], without=len(exams) - len(known))
+        exams = self._recorded_once(exams)
         mapped = [exam for exam in exams if exam.name in self.found.results["map"]]
         mapped = mapped if self._dry else self._placed(mapped)
         unmapped = len(exams) - len(mapped)
@@ -166,6 +174,19 @@ class Campaign:
             tasks = [self._estimate_task(exam, "figures") for exam in estimated]
             self._stages.run("figures", tasks, without=len(exams) - len(estimated))
         self._copy(EXAMS, [exam.name for exam in exams], steps=("map", "estimate", "figures"))
+
+    def _recorded_once(self, exams: Sequence[Exam]) -> list[Exam]:
+        """The exams without those of a recording that another exam has, in whatever file: they are no repeats."""
+        made = self.found.results["map"]
+        marks = {exam: recordings(made[exam.name].get("scans", ())) for exam in exams if exam.name in made}
+        faults = self._recordings.faults({exam: list(found) for exam, found in marks.items()})
+        for name, reason in faults.items():
+            self.found.faults[name] = Fault("map", reason)
+        self._repeated |= faults.keys()
+        left = [exam for exam in exams if exam.name not in faults]
+        later_steps = 1 + self.settings.figures + bool(self.settings.copy_to)
+        self._stages.total -= (len(exams) - len(left)) * later_steps
+        return left
 
     def _copy(self, kind: str, names: Sequence[str], *, steps: Sequence[str]) -> None:
         """Copy what steps made of exams or masses into the object store."""

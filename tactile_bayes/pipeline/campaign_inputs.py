@@ -1,4 +1,4 @@
-"""The files of a campaign's exams: their digests, and which of them are the same bytes.
+"""The files of a campaign's exams: their digests, and which of them are the same bytes or the same recording.
 
 A digest is read once: the journal keeps it under the file's name, size, times and inode. The time of the last change of
 the inode cannot be set by a program, so a file that was written to or replaced is read again. Files changed within the
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -125,23 +125,39 @@ def _read(source: _Source) -> dict[str, Any]:
     return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
 
 
-def same_bytes(exams: Iterable[Exam], digests: Mapping[Path, str], breasts: Breasts) -> dict[str, str]:
-    """Reasons against exams of one file, by the exam's name; masses of one scan, each with its place, are sound."""
-    same: dict[str, list[Exam]] = defaultdict(list)
-    for exam in exams:
-        if exam.path in digests:
-            same[digests[exam.path]].append(exam)
-    faults = {}
-    for alike in same.values():
-        if len(alike) == 1:
-            continue
+class Alike:
+    """Exams that share what only masses of one scan may share, told as they come.
+
+    Parameters
+    ----------
+    breasts
+        Of all exams.
+    what
+        What is shared, for people: ``"bytes"`` or ``"recording"``.
+    """
+
+    def __init__(self, breasts: Breasts, what: str) -> None:
+        self._breasts, self._what = breasts, what
+        self._sharing: dict[str, list[Exam]] = defaultdict(list)
+
+    def faults(self, marks: Mapping[Exam, Iterable[str]]) -> dict[str, str]:
+        """Reasons against exams, these and earlier ones, by the exam's name; `marks` says what each of these holds.
+
+        Masses of one scan, each with its place, are sound.
+        """
+        new = {mark: None for of_exam in marks.values() for mark in of_exam}
+        for exam, of_exam in marks.items():
+            for mark in dict.fromkeys(of_exam):
+                self._sharing[mark].append(exam)
+        return {name: reason for mark in new for name, reason in self._reasons(self._sharing[mark])}
+
+    def _reasons(self, alike: Sequence[Exam]) -> Iterator[tuple[str, str]]:
         one_visit = len({(exam.patient, exam.visit, exam.side) for exam in alike}) == 1
-        placed = {one.mass for one in alike if one.centre_mm is not None or breasts.named(one)}
-        if one_visit and len(placed) == len(alike):
-            continue
+        placed = {one.mass for one in alike if one.centre_mm is not None or self._breasts.named(one)}
+        if len(alike) == 1 or (one_visit and len(placed) == len(alike)):
+            return
         for exam in alike:
             others = [other for other in alike if other is not exam]
             named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
             way_out = "give each exam its own file, or each mass of a breast its centre_x_mm and centre_y_mm"
-            faults[exam.name] = f"holds the same bytes as {named}; {way_out}"
-    return faults
+            yield exam.name, f"holds the same {self._what} as {named}; {way_out}"

@@ -192,18 +192,19 @@ def _scanned_map(task: Task) -> tuple[Result, Writes]:
     check_facts(task.expected, scan.session)
     settings = map_settings(task.normalise)
     provenance: Provenance = map_provenance([task.source], [scan], settings)
-    return _built(task, scan, provenance, notes, scan_facts(task.source_sha256, scan.session))
+    facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
+    return _built(task, scan, provenance, notes, facts)
 
 
 def _imported_map(task: Task) -> tuple[Result, Writes]:
     """Bring in arrays as `import` does, and map the scan that they are."""
     from tactile_bayes.files.arrays_npz import read_arrays
-    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.provenance import Provenance, scan_facts
     from tactile_bayes.files.scan_mcap import write_scan
 
     scan = read_arrays(task.source)
     made = Provenance("import", {"as": "scan", "lost": []}, inputs={"source": task.source_sha256})
-    facts = {"sha256": task.source_sha256}
+    facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
     inputs = {"scan_1": task.source_sha256}
     provenance = Provenance("map", map_settings(task.normalise), inputs, scans=[facts])
     found, writes = _built(task, scan, provenance, [], facts)

@@ -27,7 +27,7 @@ _DONE_COLUMNS: Final = (
 )  # fmt: skip
 _FAILURE_COLUMNS: Final = ("patient", "visit", "mass", "replicate", "file", "step", "reason")
 _OF_ESTIMATE: Final = (
-    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability",
+    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "side_caution",
 )  # fmt: skip
 _OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
 _OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
@@ -84,9 +84,12 @@ class Row:
     @property
     def cautions(self) -> list[str]:
         """What may put the size outside its interval, or the exam in doubt."""
-        found = {} if self.document is None else self.document["diagnostics"]
+        if self.document is None:
+            return list(self.notes)
+        found = self.document["diagnostics"]
         apart = ["lies apart from the other exams of its mass"] if self.outlying else []
-        return [*found.get("broken_assumptions", []), *found.get("outside_calibration", []), *apart, *self.notes]
+        side = [told] if (told := self.document.get("side_caution")) else []
+        return [*side, *found.get("broken_assumptions", []), *found.get("outside_calibration", []), *apart, *self.notes]
 
     @property
     def checks(self) -> list[str]:
@@ -134,7 +137,7 @@ def estimate_facts(document: Any) -> dict[str, Any]:
     """What tables and pages need of an estimate's JSON object."""
     diagnostics = {name: document["diagnostics"].get(name, []) for name in _OF_DIAGNOSTICS}
     masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document.get("masses", [])]
-    return {name: document[name] for name in _OF_ESTIMATE} | {"diagnostics": diagnostics, "masses": masses}
+    return {name: document.get(name) for name in _OF_ESTIMATE} | {"diagnostics": diagnostics, "masses": masses}
 
 
 def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:

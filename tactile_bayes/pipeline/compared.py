@@ -233,12 +233,13 @@ def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibrat
 
 
 def _broken(visits: Sequence[Sequence[Answer]]) -> list[str]:
-    """Broken assumptions of the maps' scans."""
+    """What is wrong with the maps' scans: side or landmarks, and broken assumptions."""
+    documents = [(number, one.document or {}) for number, maps in enumerate(visits, start=1) for one in maps]
     return [
         f"CAUTION: visit {number}: {text}"
-        for number, maps in enumerate(visits, start=1)
-        for answer in maps
-        for text in (answer.document or {}).get("diagnostics", {}).get("broken_assumptions", [])
+        for number, document in documents
+        for text in (document.get("side_caution"), *document.get("diagnostics", {}).get("broken_assumptions", []))
+        if text
     ]
 
 

@@ -63,6 +63,21 @@ class Comparing:
             raise UsageError(f"the visits' days are {listed}; give them in order, each later than the one before")
 
 
+def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple[float, ...] | None:
+    """Time of each visit in days, the first at 0, from the days of the later ones or from all dates; None for neither.
+
+    Raises
+    ------
+    UsageError
+        When both are given, or something is no date.
+    """
+    if days is not None and dates is not None:
+        raise UsageError("days and dates both say when the visits were; give one of them")
+    if dates is not None:
+        return days_of_dates(dates)
+    return None if days is None else (0.0, *map(float, days))
+
+
 def days_of_dates(dates: Sequence[str]) -> tuple[float, ...]:
     """Days from the first of some dates, such as 2026-03-01.
 

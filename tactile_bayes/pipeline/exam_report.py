@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +12,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.one_map import Answer, answer_of, estimate_one
 from tactile_bayes.pipeline.pooled import pool_answers
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.exam import Exam, exam_map
 from tactile_bayes.report.lump_place import side_of
@@ -21,13 +23,39 @@ SHARED: Final = ("subject", "side", "mass")
 """Facts in which the maps of one page must not differ."""
 
 
+_LONGEST: Final = {"title": 60, "name": 50}
+_DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
+
+
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What was given for the page besides maps: title, name and date, empty where they were not."""
+    """What was given for the page besides maps: title, name and date, empty where they were not.
+
+    Raises
+    ------
+    UsageError
+        When a text is too long for the page or not printable, or the day is no date.
+    """
 
     title: str = ""
     name: str = ""
     day: str = ""
+
+    def __post_init__(self) -> None:
+        for option, longest in _LONGEST.items():
+            value = getattr(self, option)
+            if not value.isprintable() or len(value) > longest:
+                what = f"{option} is of {len(value)} letters or not printable"
+                raise UsageError(f"{what}; give up to {longest} letters")
+        if self.day and not _is_date(self.day):
+            raise UsageError(f"date {self.day[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
+
+
+def _is_date(text: str) -> bool:
+    try:
+        return bool(_DATE.fullmatch(text)) and bool(date.fromisoformat(text))
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +128,8 @@ def read_exam(files: ExamFiles, settings: Settings, given: Given, *, notice: Not
     maps = files.maps
     if files.estimates:
         return _from_estimate(files.estimates[0], maps[0] if maps else None, given)
+    if len(maps) > 1:
+        refuse_checkpoint(settings)
     found = [_estimated(path, settings, notice) for path in maps]
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
     return make_exam(found, settings, given, inputs=inputs)
@@ -165,13 +195,13 @@ def _from_estimate(source: Path, path: Path | None, given: Given) -> Exam:
 def _read_estimate(source: Path) -> dict[str, Any]:
     """An estimate's JSON object, from its JSON or its posterior's file."""
     from tactile_bayes.files.documents import load_json
+    from tactile_bayes.files.estimate_json import check_estimate
     from tactile_bayes.files.posterior_nc import read_estimate
-    from tactile_bayes.files.schema import check_document
 
     if not _is_json(source):
         return read_estimate(source)
     document: Any = load_json(source, way_out="give what `estimate --json` printed for one map")
-    check_document(document, "estimate.schema.json", path=source)
+    check_estimate(document, "estimate.schema.json", path=source)
     found: dict[str, Any] = document
     return found
 

@@ -364,7 +364,7 @@ def answer_of(outcome: Outcome) -> Answer:
     from tactile_bayes.report.estimate_document import estimate_document
     from tactile_bayes.report.estimate_summary import estimate_summary
     from tactile_bayes.report.estimate_text import estimate_text
-    from tactile_bayes.report.lump_place import lump_place, side_doubt, side_of
+    from tactile_bayes.report.lump_place import lump_place
     from tactile_bayes.report.quantities import estimate_quantities
 
     tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
@@ -380,14 +380,8 @@ def answer_of(outcome: Outcome) -> Answer:
         quantities=quantities,
         place=place,
     )
-    right = quantities.get("centre_patient_mm.x")
-    doubt = side_doubt(side_of(outcome.provenance.scans), None if right is None else right.median)
-    told: dict[str, Any] = {
-        "probability": settings.interval,
-        "masses": document["masses"],
-        "place": place,
-        "side_doubt": doubt,
-    }
+    told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
+    told["side_caution"] = document["side_caution"]
     text = estimate_summary(estimate, quantities, **told)
     full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE

@@ -67,7 +67,7 @@ class _Repeat:
     calibration, calibration_sha256
         That sized it, as its estimate names it.
     scans
-        Digests of the scans that it came from; empty where its estimate does not say.
+        Recordings that it came from, as `recordings` names them; empty where its estimate does not say.
     digest
         Of the draws that pooling keeps.
     size
@@ -206,7 +206,7 @@ def _read(exam: ExamFolder) -> _Repeat | None:
     """What an exam's estimate says of it; None where it has no size."""
     from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.documents import load_json
-    from tactile_bayes.files.provenance import scans_of
+    from tactile_bayes.files.provenance import recordings, scans_of
     from tactile_bayes.files.schema import check_document
 
     path = exam.folder / ESTIMATE
@@ -224,7 +224,7 @@ def _read(exam: ExamFolder) -> _Repeat | None:
         exam,
         calibration,
         digests.get("size_calibration", ""),
-        tuple(sorted(scan["sha256"] for scan in scans_of(provenance) if "sha256" in scan)),
+        tuple(recordings(scans_of(provenance))),
         sha256(exam.folder / SHAPE),
         document["max_size_mm"],
         document["diagnostics"].get("between_map_sd") or 0.0,

@@ -45,8 +45,11 @@ def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mappi
 
 
 def exam_facts(paths: Sequence[Path], scans: Sequence[Scan]) -> list[dict[str, str]]:
-    """Digest of each scan file and what it says of its exam, for `Provenance.scans`."""
+    """Digests of each scan and what it says of its exam, for `Provenance.scans`."""
     from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.provenance import scan_facts
 
-    return [scan_facts(sha256(path), scan.session) for path, scan in zip(paths, scans, strict=True)]
+    return [
+        scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path))
+        for path, scan in zip(paths, scans, strict=True)
+    ]

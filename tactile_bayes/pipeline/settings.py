@@ -114,3 +114,14 @@ class Settings:
     def calibration_name(self) -> str | None:
         """The calibration's name or path; None where none was named."""
         return self.calibration if self.calibration is None or isinstance(self.calibration, str) else GIVEN
+
+
+def refuse_checkpoint(settings: Settings) -> None:
+    """Refuse a checkpoint where several maps are estimated: they would all go on from one.
+
+    Raises
+    ------
+    UsageError
+    """
+    if settings.checkpoint is not None:
+        raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")

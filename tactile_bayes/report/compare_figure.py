@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.orientation import PATIENT_WORDS, PLANE_WORDS, Orientation
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare_text import compare_summary
 from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.report.figure_title import named_exam
+from tactile_bayes.report.map_figure import draw_edges
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,6 +87,7 @@ def draw_comparison(
     laid = [_averaged(maps, in_patient=in_patient) for maps in visits]
     shown = [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
     with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), force=force) as figure:
+        figure.suptitle(_title(document), x=0.01, ha="left", fontsize=11)
         grid = figure.add_gridspec(2, len(shown) + 1, height_ratios=(1.35, 1.0))
         panels = [figure.add_subplot(grid[0, i]) for i in range(len(shown) + 1)]
         words = visits[0][0].tactile_map.recipe.value_words
@@ -92,6 +96,12 @@ def draw_comparison(
         _write_words(figure.add_subplot(grid[1, 1:]), document)
         figure.text(0.01, 0.01, _caption(in_patient=in_patient), fontsize=7.5, color="0.3")
     return figure
+
+
+def _title(document: Mapping[str, Any]) -> str:
+    """Title with the subject's code and the scans' digests."""
+    exam = named_exam("", document.get("provenance", {}).get("scans", ()))
+    return f"Comparison: {exam}" if exam else "Comparison"
 
 
 def _averaged(maps: Sequence[DrawnMap], *, in_patient: bool) -> _Laid:
@@ -142,7 +152,7 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[int, _Laid]], *, l
     for axes, (number, one) in zip(panels, visits, strict=False):
         image = _draw_cells(axes, one.values, first.origin_mm, cmap="viridis", vmin=low, vmax=high)
         axes.set_title(f"Visit {number}", loc="left", fontsize=11)
-        _name_axes(axes, in_patient=in_patient)
+        _name_axes(axes, first.origin_mm, in_patient=in_patient)
     figure = panels[0].figure
     bar = figure.colorbar(image, ax=list(panels[:-1]), shrink=0.8, pad=0.01)
     bar.set_label(label, fontsize=8)
@@ -150,8 +160,11 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[int, _Laid]], *, l
     most = max(0.1 * level, float(np.nanmax(np.abs(difference), initial=0.0)))
     image = _draw_cells(panels[-1], difference, first.origin_mm, cmap="RdBu_r", vmin=-most, vmax=most)
     panels[-1].set_title(f"Visit {later} minus visit {earlier}", loc="left", fontsize=11)
-    _name_axes(panels[-1], in_patient=in_patient)
-    figure.colorbar(image, ax=panels[-1], shrink=0.8, pad=0.01)
+    _name_axes(panels[-1], first.origin_mm, in_patient=in_patient)
+    bars = [bar, figure.colorbar(image, ax=panels[-1], shrink=0.8, pad=0.01)]
+    bars[1].set_label(f"difference of {label}", fontsize=8)
+    for each in bars:
+        each.ax.tick_params(labelsize=7)
 
 
 def _draw_cells(axes: Axes, values: FloatArray, origin_mm: FloatArray, **how: Any) -> Any:
@@ -163,13 +176,21 @@ def _draw_cells(axes: Axes, values: FloatArray, origin_mm: FloatArray, **how: An
     return axes.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **how)
 
 
-def _name_axes(axes: Axes, *, in_patient: bool) -> None:
+def _name_axes(axes: Axes, origin_mm: FloatArray, *, in_patient: bool) -> None:
+    """Name the axes and the edges; of a mass right of the xiphoid the mm are told to the patient's right."""
     words = ("-x (mm)", "y (mm)")
     if in_patient:
-        words = ("to the patient's left of the xiphoid (mm)", "above the xiphoid (mm)")
+        side = "left"
+        if origin_mm[0] < 0:
+            side = "right"
+            axes.xaxis.set_major_formatter(lambda value, _: f"{0.0 - value:g}")
+        words = (f"to the patient's {side} of the xiphoid (mm)", "above the xiphoid (mm)")
     axes.set_xlabel(words[0], fontsize=8)
     axes.set_ylabel(words[1], fontsize=8)
     axes.tick_params(labelsize=7)
+    draw_edges(
+        axes, Orientation("-x", "+y", PATIENT_WORDS, (0.0, 1.0)) if in_patient else Orientation("-x", "+y", PLANE_WORDS)
+    )
 
 
 def _draw_change(axes: Axes, compared: Compared) -> None:

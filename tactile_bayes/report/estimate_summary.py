@@ -22,6 +22,7 @@ from tactile_bayes.report.estimate_text import (
 from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.masses_document import MassDocument, mass_lines, numbered
 from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
+from tactile_bayes.report.quantities import xiphoid_mm
 from tactile_bayes.report.scene_text import scene_line
 from tactile_bayes.report.supposed_text import supposed_document, supposed_line
 from tactile_bayes.size.posterior import EXTREMES
@@ -39,7 +40,7 @@ def estimate_summary(
     probability: float,
     masses: Sequence[MassDocument] = (),
     place: ClockPosition | None = None,
-    side_doubt: str = "",
+    side_caution: str = "",
 ) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
@@ -53,14 +54,14 @@ def estimate_summary(
         As `masses_document` gives them.
     place
         Of the lump about the nipple, where it is known.
-    side_doubt
-        As `lump_place.side_doubt` gives it.
+    side_caution
+        As `lump_place.side_caution` gives it.
     """
     if estimate.status == "no_estimate":
         body = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
         body += _masses(masses, room=MOST_MASSES)
     else:
-        body = _something(estimate, quantities, probability, masses, place, doubt=side_doubt)
+        body = _something(estimate, quantities, probability, masses, place, side_caution)
     return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
 
 
@@ -70,11 +71,10 @@ def _something(
     probability: float,
     masses: Sequence[MassDocument],
     place: ClockPosition | None,
-    *,
-    doubt: str,
+    side_caution: str,
 ) -> list[str]:
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
-    lines = [*_cautions(estimate), *([f"CAUTION: {doubt}."] if doubt else [])]
+    lines = _cautions(estimate, side_caution)
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
     table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
     lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
@@ -99,13 +99,12 @@ def _supposed(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
     return supposed_line(supposed, largest.median, places=size_decimals([largest]))
 
 
-def _cautions(estimate: Estimate) -> list[str]:
-    """One line on broken assumptions and on a map outside the calibration's range; none without either."""
-    found = estimate.diagnostics
-    if found is None:
-        return []
-    outside = joined(found.outside_calibration, most=MOST_CAUTIONS, lead="outside the calibration's range: ")
-    texts = [*found.broken_assumptions, *(line.rstrip(".") for line in outside)]
+def _cautions(estimate: Estimate, side_caution: str) -> list[str]:
+    """One line on a doubtful side, broken assumptions and a map outside the calibration's range; none without."""
+    found, texts = estimate.diagnostics, [side_caution] if side_caution else []
+    if found is not None:
+        outside = joined(found.outside_calibration, most=MOST_CAUTIONS, lead="outside the calibration's range: ")
+        texts += [*found.broken_assumptions, *(line.rstrip(".") for line in outside)]
     return joined(texts, most=MOST_CAUTIONS, lead="CAUTION: ")
 
 
@@ -118,8 +117,8 @@ def _lump(
         parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
     if place is not None:
         parts.append(place.text())
-    elif "centre_patient_mm.x" in quantities:
-        parts.append(from_xiphoid(*(quantities[f"centre_patient_mm.{axis}"].median for axis in "xy")))
+    elif (centre := xiphoid_mm(quantities)) is not None:
+        parts.append(from_xiphoid(*centre))
     if "centre_mm.x" in quantities:
         parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*(quantities[f"centre_mm.{a}"].median for a in "xy")))
     text = ", ".join(parts)

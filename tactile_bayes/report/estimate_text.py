@@ -69,12 +69,12 @@ def estimate_text(
     quantities: Mapping[str, Quantity] | None = None,
     masses: Sequence[MassDocument] | None = None,
     place: ClockPosition | None = None,
-    side_doubt: str = "",
+    side_caution: str = "",
 ) -> str:
     """Full report of one map: findings with intervals, sources of uncertainty, omissions.
 
-    `quantities`, `masses` (see `masses_document`), the lump's `place` about the nipple and `side_doubt` (see
-    `lump_place.side_doubt`) where they are at hand.
+    `quantities`, `masses` (see `masses_document`), the lump's `place` about the nipple and `side_caution` (see
+    `lump_place.side_caution`) where they are at hand.
     """
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
@@ -86,7 +86,8 @@ def estimate_text(
         first = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
         return "\n".join([*first, *mass_lines(masses), *passed_over(estimate), RESEARCH_USE]) + "\n"
     table = size_table(quantities, probability, exam_spread=exam_spread(estimate))
-    lines = [*_cautions(estimate), *([f"CAUTION: {side_doubt}."] if side_doubt else []), *table, ""]
+    lines = [f"CAUTION: {side_caution}."] if side_caution else []
+    lines += [*_cautions(estimate), *table, ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
     lines += [] if place is None else [place_line(place, probability)]

@@ -131,7 +131,10 @@ def _picture(exam: Exam) -> Iterator[str]:
     frame = Frame.within(tactile_map, width_mm=_PICTURE_MM[0], height_mm=height_mm)
     yield f'<div class="picture">{exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}")}</div>'
     yield colour_bar(exam.main)
-    lines = ["Full line: the estimated size; dashed: the ends of its interval."] if largest(exam) is not None else []
+    lines = [f"Map {exam.main_number} of {len(exam.maps)}."] if len(exam.maps) > 1 else []
+    if largest(exam) is not None:
+        of_all = " of all maps" if len(exam.maps) > 1 else ""
+        lines.append(f"Full line: the estimated size{of_all}; dashed: the ends of its interval.")
     if not exam.main.masses:
         lines.append("Crosses: the highest rises, none of which was taken for a lump.")
     view = orientation_of(tactile_map)
@@ -172,7 +175,8 @@ def _place(exam: Exam) -> Iterator[str]:
     yield f'<h2>Place{_of_mass(exam)}</h2><div class="place">{breast_dial(exam.main.masses)}<div>'
     yield from _paragraphs([place_sentence(mass, INTERVAL if size is None else size["probability"])])
     if mass.probability is not None:
-        yield from _paragraphs([f"Probability that it is a lump, by this map: {_chance(mass.probability)}."])
+        which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
+        yield from _paragraphs([f"Probability that it is a lump, by {which}: {_chance(mass.probability)}."])
     yield from (f'<p class="small">{html.escape(text)}</p>' for text in [why_no_clock(exam)] if text)
     yield "</div></div>"
 

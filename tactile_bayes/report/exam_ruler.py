@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -42,7 +43,8 @@ def _bar(row: int, words: str, q: Quantity, scale: float) -> Iterator[str]:
 
 
 def _scale(end_mm: float, y: float) -> Iterator[str]:
-    step = next((one for one in _STEPS_MM if end_mm / one <= _MOST_TICKS), _STEPS_MM[-1])
+    longest = int(10 ** math.ceil(math.log10(end_mm / _MOST_TICKS))) if end_mm > _MOST_TICKS else 1
+    step = next((one for one in _STEPS_MM if end_mm / one <= _MOST_TICKS), longest)
     yield f'<path d="M0 {y:g}H{_LENGTH_MM:g}" stroke="#111" stroke-width="0.25"/>'
     for tick in range(0, int(end_mm) + 1, step):
         x = _LENGTH_MM * tick / end_mm

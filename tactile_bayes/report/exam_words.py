@@ -13,7 +13,7 @@ from tactile_bayes.mapping.clock_face import clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
-from tactile_bayes.report.lump_place import from_xiphoid, side_doubt, side_of
+from tactile_bayes.report.lump_place import from_xiphoid, side_caution, side_of
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
 
@@ -113,7 +113,7 @@ def detail_sentence(exam: Exam) -> str:
     """Why there is no size, as the program's other reports give it; empty where there is one."""
     document = exam.main.document if exam.pooled is None else exam.pooled
     reason = document["reason"] if largest(exam) is None else ""
-    return f"In detail: {reason}." if reason else ""
+    return f"In detail: {reason.replace('cm2', 'cm²')}." if reason else ""
 
 
 def place_sentence(mass: ExamMass, probability: float) -> str:
@@ -181,11 +181,10 @@ def caution_sentences(exam: Exam) -> list[str]:
     return [*told[:MOST_CAUTIONS], f"And {more} more: see `estimate -v`."] if more > 0 else told
 
 
-def _side_in_doubt(exam: Exam) -> Iterator[str]:
-    """Caution where the landmarks put the lump on the other side of the body than the scans say."""
-    lump = exam.main.masses[0].patient_mm if exam.main.masses else None
-    if doubt := side_doubt(side_of(exam.scans), None if lump is None else lump[0]):
-        yield f"Caution: {doubt}."
+def _side_in_doubt(exam: Exam) -> list[str]:
+    """Caution where side and landmarks disagree."""
+    told = side_caution(side_of(exam.scans), exam.main.masses[0].patient_mm if exam.main.masses else None)
+    return [f"Caution: {told}."] if told else []
 
 
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
@@ -247,9 +246,9 @@ def reach_text(tactile_map: TactileMap) -> str:
         return ""
     points = np.stack([tactile_map.x_mm[columns], tactile_map.y_mm[rows], np.zeros(len(rows))], axis=1)
     x, y, _ = apply(tactile_map.patient_from_plane, points).T
-    across = _between(float(x.min()), float(x.max()), ("left", "right"))
+    across = _between(float(x.min()), float(x.max()), ("to the patient's left", "to the patient's right"))
     up = _between(float(y.min()), float(y.max()), ("below", "above"))
-    return f"{across} of and {up} the xiphoid"
+    return f"{across} of the xiphoid, {up} it"
 
 
 def _between(low: float, high: float, words: tuple[str, str]) -> str:

@@ -38,25 +38,6 @@ def lump_place(
     )
 
 
-def side_doubt(side: str, right_mm: float | None) -> str:
-    """Sentence where the landmarks put a lump on the other side of the body than the scan says; empty where not.
-
-    Parameters
-    ----------
-    side
-        As `side_of` gives it.
-    right_mm
-        The lump's distance from the xiphoid to the patient's right; None without landmarks.
-    """
-    if side not in SIDES or right_mm is None or abs(right_mm) < MIDDLE_MM:
-        return ""
-    other = "right" if right_mm > 0 else "left"
-    if other == side:
-        return ""
-    place = f"the landmarks put the lump {abs(right_mm):.0f} mm to the patient's {other} of the xiphoid"
-    return f"the scan says {side} breast, and {place}: side or landmarks are wrong"
-
-
 def place_line(place: ClockPosition, probability: float) -> str:
     """The place with its intervals, as a line of a full report."""
     hours, (near, far) = place.hours_between(probability), place.distance_between(probability)
@@ -68,3 +49,22 @@ def from_xiphoid(x_mm: float, y_mm: float) -> str:
     """A place in the patient's axes, in words."""
     across = f"{abs(x_mm):.0f} mm to the patient's {'right' if x_mm >= 0 else 'left'}"
     return f"{across} of the xiphoid and {abs(y_mm):.0f} mm {'above' if y_mm >= 0 else 'below'} it"
+
+
+def side_caution(side: str, patient_mm: tuple[float, float] | None) -> str:
+    """Caution where the landmarks put a lump on the other side of the body than the scans say; empty where they do not.
+
+    Parameters
+    ----------
+    side
+        As `side_of` gives it.
+    patient_mm
+        From the xiphoid to the patient's right and up; None without landmarks or a lump.
+    """
+    if side not in SIDES or patient_mm is None or abs(patient_mm[0]) < MIDDLE_MM:
+        return ""
+    other = "right" if patient_mm[0] > 0 else "left"
+    if other == side:
+        return ""
+    place = f"the landmarks put the lump {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
+    return f"the scan says {side} breast, and {place}: side or landmarks are wrong"

@@ -137,7 +137,7 @@ def map_figure(
         if len(masses) > 1:
             _draw_masses(left, masses, fit, view)
         _draw_scale_bar(left)
-        _draw_edges(left, view)
+        draw_edges(left, view)
         _draw_notch(left, view)
         _draw_places(left, looked_at, view)
         _explain(right, tactile_map, looked_at)
@@ -173,7 +173,7 @@ def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, 
     image = _draw_cells(axes, np.ma.masked_invalid(values), tactile_map, view, **how)
     _colour_bar(axes, image, label)
     _orient(axes, view, tactile_map)
-    _draw_edges(axes, view)
+    draw_edges(axes, view)
     axes.set_title(title, loc="left", fontsize=11)
 
 
@@ -290,8 +290,8 @@ def _outlined(width: float) -> list[Any]:
     return [patheffects.withStroke(linewidth=width, foreground="black")]
 
 
-def _draw_edges(axes: Axes, view: Orientation) -> None:
-    """Label the edges."""
+def draw_edges(axes: Axes, view: Orientation) -> None:
+    """Label the edges: the patient's R, L, H (head) and F (feet), or else axes."""
     places = {"left": (0.015, 0.5), "right": (0.985, 0.5), "top": (0.5, 0.975), "bottom": (0.5, 0.025)}
     aligned = {"left": ("left", "center"), "right": ("right", "center"), "top": ("center", "top")}
     for side, name in view.edges.items():

@@ -107,7 +107,10 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
         "detected_probability": document["detected_probability"],
         "log_size": nine_digits(pooled.centres[index]) if index in pooled.centres else None,
         "outlying": index in pooled.outlying,
-        "broken_assumptions": list(document["diagnostics"].get("broken_assumptions", [])),
+        "broken_assumptions": [
+            *filter(None, [document.get("side_caution")]),
+            *document["diagnostics"].get("broken_assumptions", []),
+        ],
     }
 
 

@@ -111,7 +111,8 @@ def corner_figure(
     labels, columns = list(shown), [values[finite] for values in shown.values()]
     ends = [tuple(np.quantile(values, _SHOWN)) for values in columns]
     number, side = len(labels), 1.35
-    with _page(path, (side * number + 1.0, side * number + 1.0), title or "Corner", force=force) as figure:
+    named = f"{title or 'Corner'}: dark 50 %, light 90 % of the draws"
+    with _page(path, (side * number + 1.0, side * number + 1.0), named, force=force) as figure:
         grid: Any = figure.subplots(number, number, squeeze=False)
         for i, j in np.ndindex(number, number):
             axes = grid[i, j]

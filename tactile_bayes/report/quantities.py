@@ -45,6 +45,13 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
     return found
 
 
+def xiphoid_mm(quantities: Mapping[str, Quantity]) -> tuple[float, float] | None:
+    """Place of the lump, mm from the xiphoid to the patient's right and up; None without landmarks or a lump."""
+    if "centre_patient_mm.x" not in quantities:
+        return None
+    return quantities["centre_patient_mm.x"].median, quantities["centre_patient_mm.y"].median
+
+
 def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity]) -> dict[str, Any] | None:
     """The spread between exams of a mass as a share of its size, and both sizes with it; None where it is not told."""
     if size is None or size.another_exam is None:

@@ -22,6 +22,7 @@ _MAX_COLOUR, _MIN_COLOUR = "#1f3b73", "#c8641e"  # tell apart in greyscale too
 _ANOTHER_COLOUR = "0.4"
 # The axis ends at these quantiles of the draws, or at an interval's end where that lies farther out.
 _SHOWN: Final = (0.005, 0.985)
+_SIZES: Final = {"max": "largest", "min": "smallest"}
 _KINDS: Final = {"eti": "equal-tailed", "hdi": "highest-density"}
 
 
@@ -70,9 +71,9 @@ def size_figure(
         for row, (name, draws, colour, dash) in enumerate(rows):
             _draw_density(axes, name, draws, colour=colour, dash=dash)
             if name in intervals:
-                _draw_interval(axes, intervals[name], row=row, colour=colour)
+                _draw_interval(axes, intervals[name], size=_SIZES[name], row=row, colour=colour)
         if "another" in intervals:
-            _draw_interval(axes, intervals["another"], row=len(rows), colour=_ANOTHER_COLOUR)
+            _draw_interval(axes, intervals["another"], size=_SIZES["max"], row=len(rows), colour=_ANOTHER_COLOUR)
             figure.get_layout_engine().set(rect=(0.0, 0.1, 1.0, 0.9))  # type: ignore[union-attr,call-arg]
         axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
@@ -121,14 +122,14 @@ def _smoothed(at_mm: FloatArray, middle_mm: FloatArray, weights: FloatArray, wid
 def _draw_density(axes: Axes, name: str, draws_mm: FloatArray, *, colour: str, dash: str) -> None:
     sizes, density = _density(draws_mm)
     median = float(np.median(draws_mm[np.isfinite(draws_mm)]))
-    label = f"{'largest' if name == 'max' else 'smallest'} size, median {median:.1f} mm"
+    label = f"{_SIZES[name]} size, median {median:.1f} mm"
     axes.plot(sizes, density, color=colour, linestyle=dash, linewidth=1.8, label=label)
     axes.fill_between(sizes, density, color=colour, alpha=0.15, linewidth=0)
     axes.vlines(median, 0.0, float(np.interp(median, sizes, density)), color=colour, linestyle=dash, linewidth=1.2)
 
 
-def _draw_interval(axes: Axes, interval: SizeInterval, *, row: int, colour: str) -> None:
-    """Draw a bar below the densities, labelled with its ends, probability and kind."""
+def _draw_interval(axes: Axes, interval: SizeInterval, *, size: str, row: int, colour: str) -> None:
+    """Draw a bar below the densities, labelled with the size that it is of, its ends, probability and kind."""
     from matplotlib.transforms import blended_transform_factory
 
     across = blended_transform_factory(axes.transData, axes.transAxes)
@@ -145,7 +146,8 @@ def _draw_interval(axes: Axes, interval: SizeInterval, *, row: int, colour: str)
         clip_on=False,
     )
     kind = _KINDS.get(interval.kind, interval.kind)
-    text = f"{interval.low_mm:.1f} to {interval.high_mm:.1f} mm: {100 * interval.probability:g} % interval ({kind})"
+    ends = f"{interval.low_mm:.1f} to {interval.high_mm:.1f} mm"
+    text = f"{size}, {ends}: {100 * interval.probability:g} % interval ({kind})"
     text = f"{text} {interval.supposes}".rstrip()
     axes.text(
         (interval.low_mm + interval.high_mm) / 2,

@@ -187,7 +187,8 @@ def test_an_estimate_names_the_scan_it_comes_from(undisturbed: Path, study: Path
     document = json.loads((undisturbed / "exams" / "07.v1.m1.r1" / "estimate.json").read_text())
     digest = sha256(study / "scans" / "07-a.mcap")
     facts = {"subject": "07", "side": "left", "posture": "phantom", "examiner": "R1"}
-    assert document["provenance"]["scans"] == [{"sha256": digest, **facts}]
+    frames = thinned(0, 2).frames.sha256
+    assert document["provenance"]["scans"] == [{"sha256": digest, **facts, "frames_sha256": frames}]
 
 
 def test_validate_takes_the_trial_table_as_it_is(finished: Path) -> None:
@@ -253,7 +254,7 @@ def test_masses_that_were_not_excised_are_left_out_of_the_trial_by_name(finished
 
 
 def test_arrays_and_maps_are_exams_too(undisturbed: Path, own: Path) -> None:
-    scan = thinned(0, 3)
+    scan = thinned(1, 4)
     np.savez(
         own / "arrays.npz",
         counts=scan.frames.counts,

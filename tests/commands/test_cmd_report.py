@@ -154,9 +154,9 @@ REFUSED = [
     (("a.nc", "a.json", "--size-calibration", "eq6"), 2, "an estimate has settings of its own; leave out --size"),
     (("a.nc", "post.nc", "--interval", "0.95"), 2, "an estimate has settings of its own; leave out --interval"),
     (("post.nc", "--settings", "a.json"), 2, "an estimate has settings of its own; leave out --settings"),
-    (("a.nc", "--date", "1.3.2026"), 2, "--date '1.3.2026' is no date; give it as YEAR-MONTH-DAY"),
-    (("a.nc", "--title", "x" * 61), 2, "--title is of 61 letters or not printable; give up to 60 letters"),
-    (("a.nc", "--name", "a\nb"), 2, "--name is of 3 letters or not printable"),
+    (("a.nc", "--date", "1.3.2026"), 2, "date '1.3.2026' is no date; give it as YEAR-MONTH-DAY"),
+    (("a.nc", "--title", "x" * 61), 2, "title is of 61 letters or not printable; give up to 60 letters"),
+    (("a.nc", "--name", "a\nb"), 2, "name is of 3 letters or not printable"),
     (("a.nc", "--pdf", "bad.html"), 2, "two outputs of this command"),
 ]
 

@@ -72,15 +72,30 @@ def test_what_does_not_fit_is_told_in_one_line(case: str, folder: Path, tmp_path
 
 @pytest.mark.parametrize("key", ["settings", "inputs", "scans", "version"])
 @pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
-def test_an_odd_provenance_is_no_fault(key: str, value: Any, estimate: Any, tmp_path: Path) -> None:
-    """What is in an estimate's provenance, and in its diagnostics, has no schema: anything may stand there."""
-    odd = estimate | {"provenance": estimate["provenance"] | {key: value}, "diagnostics": {"broken_assumptions": value}}
+def test_an_odd_provenance_is_no_fault_or_one_line(key: str, value: Any, estimate: Any, tmp_path: Path) -> None:
+    """Scans and version have no schema: anything may stand there. Settings are an object, inputs name files."""
+    odd = estimate | {"provenance": estimate["provenance"] | {key: value}}
     (tmp_path / "e.json").write_text(json.dumps(odd))
+    taken = key in ("scans", "version") or (key == "settings" and isinstance(value, dict))
     for to in ("csv", "fhir"):
         if to == "fhir":
             pytest.importorskip("fhir.resources")
-        exported(tmp_path, "e.json", "--to", to, "-o", tmp_path / f"out.{to}")
+        done = run_here("export", "e.json", "--to", to, "-o", tmp_path / f"out.{to}", cwd=tmp_path)
+        if not taken:
+            assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+            assert f"provenance.{key}" in done.stderr
+            continue
+        assert done.returncode == 0, done.stderr
         assert "\u202e" not in (tmp_path / f"out.{to}").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
+def test_cautions_that_are_no_texts_are_refused_and_not_dropped(value: Any, estimate: Any, tmp_path: Path) -> None:
+    odd = estimate | {"diagnostics": estimate["diagnostics"] | {"broken_assumptions": value}}
+    (tmp_path / "e.json").write_text(json.dumps(odd))
+    done = run_here("export", "e.json", "--to", "csv", "-o", "out.csv", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "diagnostics.broken_assumptions" in done.stderr
 
 
 def test_an_estimate_of_no_file_is_refused_beside_a_map(estimate: dict[str, Any], folder: Path, tmp_path: Path) -> None:

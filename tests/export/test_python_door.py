@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -90,6 +92,56 @@ def test_what_cannot_be_exported_is_told(folder: Path) -> None:
         tb.export(folder / "map.json", folder / "x", to="csv", patient_name="Doe")
     with pytest.raises(UsageError, match="int is nothing to export"):
         tb.export([3], folder / "x", to="csv")
-    with pytest.raises(UsageError, match="nothing was given"):
+    with pytest.raises(UsageError, match="no file was given to export"):
         tb.export([], folder / "x", to="csv")
     assert not (folder / "x").exists()
+
+
+def test_the_dictionary_is_the_command_lines_alone_and_with_records(folder: Path) -> None:
+    exported(folder, "--to", "csv", "--dictionary", "dict.csv")
+    wanted = (folder / "dict.csv").read_bytes()
+    done = tb.export(to="csv", dictionary=folder / "alone.csv")
+    assert (done.paths, done.notes) == ((folder / "alone.csv",), ())
+    assert (folder / "alone.csv").read_bytes() == wanted
+    done = tb.export("map.json", "records.csv", to="csv", dictionary="both.csv", patient_id="P1")
+    assert [path.name for path in done.paths] == ["records.csv", "both.csv"]
+    assert (folder / "both.csv").read_bytes() == wanted
+    assert (folder / "records.csv").read_text().splitlines()[1].startswith("P1")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"to": "csv"}, "no file was given to export"),
+        ({"files": "map.json", "to": "csv"}, "nowhere to write to"),
+        ({"files": "map.json", "path": "r.csv", "to": "fhir", "dictionary": "d.csv"}, "--dictionary is REDCap's"),
+        ({"files": "map.json", "path": "r.csv", "to": "csv", "dictionary": "./r.csv"}, "records and dictionary"),
+        ({"path": "r.csv", "to": "csv", "dictionary": "d.csv"}, "no file was given to export to r.csv"),
+        ({"files": "map.json", "path": "r.csv", "to": "csv", "dictionary": "size.json"}, "size.json exists"),
+    ],
+)
+def test_a_dictionary_that_does_not_fit_is_refused_before_anything_is_written(
+    folder: Path, given: dict[str, str], told: str
+) -> None:
+    before = files(folder)
+    with pytest.raises(UsageError, match=told):
+        tb.export(**given)
+    assert files(folder) == before
+
+
+def test_a_folder_of_files_is_written_whole_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("highdicom")
+    write = Path.write_bytes
+
+    def refusing(path: Path, data: bytes) -> int:
+        if "report" in path.name:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, data)
+
+    before = files(folder)
+    monkeypatch.setattr(Path, "write_bytes", refusing)
+    with pytest.raises(UsageError, match=r"No space left on device.*make room"):
+        tb.export(["map.nc", "map.json"], "exam", to="dicom", **DATED)
+    assert files(folder) == before
+    monkeypatch.setattr(Path, "write_bytes", write)
+    assert len(tb.export(["map.nc", "map.json"], "exam", to="dicom", **DATED).paths) == 3

@@ -66,3 +66,40 @@ def test_without_landmarks_the_axes_are_the_planes() -> None:
 def test_a_visit_without_a_lump_is_left_empty() -> None:
     found = images(visit(0.0, height=0.4), replace(visit(0.0, height=0.4), centre_mm=None))
     assert np.ma.getmaskarray(found[1].get_array()).all()
+
+
+def panels(*visits: DrawnMap, **document: object):
+    figure = draw_comparison(Compared("not_one_mass"), {**REFUSED, **document}, [[one] for one in visits], None)
+    figure.canvas.draw()
+    return figure, [axes for axes in figure.axes if axes.images and axes.get_title(loc="left")]
+
+
+def test_every_panel_names_the_patients_sides_and_counts_mm_from_the_xiphoid() -> None:
+    """The mass lies 60 mm to the patient's right; moved across the xiphoid it lies as far to the left."""
+    _, found = panels(visit(0.0, height=0.4), visit(0.5, height=0.6))
+    assert len(found) == 3
+    for axes in found:
+        assert [text.get_text() for text in axes.texts] == ["R", "L", "H", "F"]
+        assert axes.get_xlabel() == "to the patient's right of the xiphoid (mm)"
+        ticks = {
+            round(place): label.get_text()
+            for place, label in zip(axes.get_xticks(), axes.get_xticklabels(), strict=True)
+        }
+        assert ticks[-60] == "60"
+    left = visit(0.0, height=0.4)
+    moved = left.tactile_map.patient_from_plane.copy()
+    moved[0, 3] = -60.0
+    other = replace(left, tactile_map=replace(left.tactile_map, patient_from_plane=moved))
+    _, (axes, *_) = panels(other, other)
+    assert axes.get_xlabel() == "to the patient's left of the xiphoid (mm)"
+    _, (plane, *_) = panels(visit(0.0, height=0.4, landmarks=False), visit(0.0, height=0.4))
+    assert [text.get_text() for text in plane.texts] == ["+x", "-x", "+y", "-y"]
+
+
+def test_the_figure_is_titled_by_its_scans_and_both_colour_bars_say_what_they_are_of() -> None:
+    scans = [{"sha256": "ab" * 32, "subject": "P07"}, {"sha256": "cd" * 32, "subject": "P07"}]
+    figure, _ = panels(visit(0.0, height=0.4), visit(0.5, height=0.6), provenance={"scans": scans})
+    assert figure.get_suptitle() == "Comparison: P07, scans abababab, cdcdcdcd"
+    bars = [axes.get_ylabel() for axes in figure.axes if axes.get_label() == "<colorbar>"]
+    words = visit(0.0, height=0.4).tactile_map.recipe.value_words
+    assert bars == [words, f"difference of {words}"]

@@ -23,7 +23,7 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.exam import Exam, exam_map
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.exam_words import headline
+from tactile_bayes.report.exam_words import headline, reach_text
 from tactile_bayes.report.printed import BROWSERS, find_printer
 from tactile_bayes.scan import Landmarks
 
@@ -301,7 +301,28 @@ def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     page = Page(exam_page(both))
     assert "How good the exam was (map 2)" in page.words
     assert "1: no size" in page.words
+    assert "Map 2 of 2. Full line: the estimated size of all maps; dashed: the ends of its interval." in page.words
+    assert "Probability that it is a lump, by map 2: above 0.999." in page.words
     assert len(page.named("path", **{"class": "size-high"})) == 1
+    alone = Page(exam_page(Exam((with_lump,), None, SCANS))).words
+    assert "Map 1 of" not in alone
+    assert "Full line: the estimated size; dashed" in alone
+    assert "by this map: above 0.999." in alone
+
+
+def test_what_was_reached_is_told_by_the_patients_left_and_right() -> None:
+    """The demo's map about the xiphoid, moved so that it lies on one side, on the other, and across the middle."""
+    tactile_map, _ = demo()
+    assert tactile_map.patient_from_plane is not None
+    told = {}
+    for shift in (0.0, -60.0, -120.0):
+        moved = tactile_map.patient_from_plane.copy()
+        moved[0, 3] += shift
+        told[shift] = reach_text(replace(tactile_map, patient_from_plane=moved))
+    assert re.fullmatch(r"\d+ to \d+ mm to the patient's right of the xiphoid, \d+ to \d+ mm above it", told[0.0])
+    across = r"\d+ mm to the patient's left to \d+ mm to the patient's right of the xiphoid, .*"
+    assert re.fullmatch(across, told[-60.0])
+    assert re.fullmatch(r"\d+ to \d+ mm to the patient's left of the xiphoid, .*", told[-120.0])
 
 
 def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() -> None:

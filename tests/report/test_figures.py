@@ -16,6 +16,7 @@ from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.report import map_figure as maps
 from tactile_bayes.report import size_figure as sizes
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
+from tactile_bayes.report.posterior_figures import corner_figure
 from tactile_bayes.report.size_figure import SizeInterval, size_figure
 
 INTERVALS = {
@@ -271,8 +272,8 @@ def test_a_size_is_drawn_with_its_intervals_named(tmp_path, axes):
         size_figure(draws(0, 15), draws(1, 12), tmp_path / name, intervals=INTERVALS)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert [text.get_text() for text in axes[0].texts] == [
-        "12.0 to 18.0 mm: 95 % interval (equal-tailed)",
-        "9.0 to 15.0 mm: 95 % interval (equal-tailed)",
+        "largest, 12.0 to 18.0 mm: 95 % interval (equal-tailed)",
+        "smallest, 9.0 to 15.0 mm: 95 % interval (equal-tailed)",
     ]
 
 
@@ -356,3 +357,9 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
     # tradeoff
     assert len(found) == 14
     assert all(isinstance(one, FigurePath) for one in found)
+
+
+def test_the_regions_of_pairs_say_how_many_draws_they_hold() -> None:
+    rng = np.random.default_rng(3)
+    figure = corner_figure({"max_size_mm": rng.normal(15, 1, (1, 400)), "amplitude": rng.normal(0, 1, (1, 400))}, None)
+    assert figure.get_suptitle() == "Corner: dark 50 %, light 90 % of the draws"
