@@ -13,9 +13,9 @@ repeats
     begins where all exams are estimated; half of the kills come while the spread is learned, the others while sizes and
     pooled sizes are made by it.
 client, worker, scheduler
-    The same 18 exams from the beginning on a dask scheduler with two workers (``--port``). The kill comes at a random
-    step. A worker's nanny starts another and the client goes on; with the scheduler the client must end with one line
-    and code 1, and scheduler and workers are started again.
+    8 exams of 4 patients on a dask scheduler with two workers (``--port``). The kill comes at a random step. A
+    worker's nanny starts another and the client goes on; with the scheduler the client must end with one line and code
+    1, and scheduler and workers are started again.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from tactile_bayes.files.campaign_names import JOURNAL
 WHAT: Final = ("local", "repeats", "client", "worker", "scheduler")
 MASSES, REPEATS = 6, 3
 MOST_CPU_S, GRACE_S, SETTLED_S = 9.0, 10.0, 10.0
-MOST_KILLS_OF_WORKERS = 2
-"""Per run: dask gives a task up after its worker ended four times."""
-LEARNING_CPU_S = 0.3
+MOST_KILLS_IN_A_FOLDER = 3
+"""So that many folders come to their end, and no more, for dask gives a task up after its worker ended four times."""
+LEARNING_CPU_S = 0.2
 """Before the learned spread is in the journal: the exams' draws are read and its posterior computed."""
 
 
@@ -152,10 +152,10 @@ class Study:
         """
         while self._more():
             self._begin(begun)
-            ended = False
+            ended, most = False, self.tally.kills + self._rng.randint(1, MOST_KILLS_IN_A_FOLDER)
             while not ended:
                 workers = self._rng.choice("12")
-                after = moment(self._rng, workers) if self._more() else float("inf")
+                after = moment(self._rng, workers) if self._more(most) else float("inf")
                 process = start(self._folder, "out", "--workers", workers)
                 was_killed, survivors = Family(process).killed(after_cpu_s=after)
                 self.tally.survivors += survivors
@@ -172,20 +172,17 @@ class Study:
         cluster.start()
         while self._more():
             self._begin(None)
-            ended = False
+            ended, most = False, self.tally.kills + self._rng.randint(1, MOST_KILLS_IN_A_FOLDER)
             while not ended:
                 cluster.wait()
                 process = start(self._folder, "out", "--scheduler", cluster.address)
-                ended = self._until_it_ends(process, cluster, victim)
+                ended = self._until_it_ends(process, cluster, victim, most=most)
             self._check()
         return self.tally
 
-    def _until_it_ends(self, process: subprocess.Popen[bytes], cluster: Cluster, victim: str) -> bool:
+    def _until_it_ends(self, process: subprocess.Popen[bytes], cluster: Cluster, victim: str, *, most: int) -> bool:
         """Run the client once, with kills; whether it came to its end by itself."""
-        most = MOST_KILLS_OF_WORKERS if victim == "worker" else 1
-        for _ in range(most):
-            if not self._more() or not self._wait_for_a_moment(process):
-                break
+        while self._more(most) and self._wait_for_a_moment(process):
             if victim == "client":
                 process.kill()
                 process.wait()
@@ -220,8 +217,8 @@ class Study:
             print(f"  the client ended with {code}: {last}", flush=True)
         self.tally.untold += not told and code != 0
 
-    def _more(self) -> bool:
-        return self.tally.kills < self._kills
+    def _more(self, most: int | None = None) -> bool:
+        return self.tally.kills < (self._kills if most is None else min(self._kills, most))
 
     def _begin(self, begun: Path | None) -> None:
         shutil.rmtree(self._out, ignore_errors=True)
@@ -270,19 +267,21 @@ def _steps_in(out: Path) -> list[str]:
     return [key for key in entries_or_none(out / JOURNAL) if not key.startswith("read ")]
 
 
-def prepare(folder: Path, *, repeats: bool) -> None:
+def prepare(folder: Path, what: str) -> None:
     """Scans, table of exams and the undisturbed run."""
-    if repeats:
+    if what == "local":
+        make(folder, patients=6, exams=2, bodies=3, faults=Faults(cut=11, damaged=0), empty_every=3)
+    elif what == "repeats":
         make(folder, patients=MASSES, exams=REPEATS, bodies=MASSES, faults=Faults(0, 0), empty_every=0)
     else:
-        make(folder, patients=6, exams=2, bodies=3, faults=Faults(cut=11, damaged=0), empty_every=3)
+        make(folder, patients=4, exams=2, bodies=2, faults=Faults(0, 0), empty_every=0)
     time.sleep(SETTLED_S)  # digests of files changed a moment ago are not kept
     words = ["campaign", "init", "scans", "-o", "exams.csv", "--force"]
     subprocess.run([sys.executable, "-m", "tactile_bayes", *words], cwd=folder, check=True)
     shutil.rmtree(folder / "undisturbed", ignore_errors=True)
     if start(folder, "undisturbed").wait() != 0:
         raise SystemExit(f"the undisturbed run failed; see {folder / 'client.log'}")
-    if repeats and not (folder / "undisturbed" / "repeatability.json").exists():
+    if what == "repeats" and not (folder / "undisturbed" / "repeatability.json").exists():
         raise SystemExit(f"the undisturbed run did not learn the spread; see {folder / 'client.log'}")
 
 
@@ -338,7 +337,7 @@ def cluster_in(folder: Path, port: int) -> Iterator[Cluster]:
 
 def main(folder: Path, *, what: str, kills: int, seed: int, port: int) -> Tally:
     """Prepare and disturb."""
-    prepare(folder, repeats=what != "local")
+    prepare(folder, what)
     study = Study(folder, kills=kills, seed=seed)
     if what == "local":
         return study.disturb(lambda rng, _: rng.uniform(0.05, MOST_CPU_S))
