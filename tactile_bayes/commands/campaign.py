@@ -158,7 +158,7 @@ def run(
         [output / name for name in WRITTEN],
         [path for path in (exams, excision, protocol, settings_file, given) if path],
     )
-    check_inputs(excision, protocol)
+    check_inputs(table, excision, protocol)
     with (
         open_campaign(output, dry=dry_run) as store,
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
