@@ -102,7 +102,10 @@ FAULTS = {
     "a path that leaves inside": ("scans/../../x.mcap,1,1,1,1", "leaves the table's folder"),
     "an absolute path": ("/etc/passwd,1,1,1,1", "'/etc/passwd' leaves the table's folder"),
     "a link that leaves": ("link.mcap,1,1,1,1", "'link.mcap' leaves the table's folder"),
-    "backslashes": ("scans\\x.mcap,1,1,1,1", "'scans\\x.mcap' has backslashes, and no file is called so; write the path"),
+    "backslashes": (
+        "scans\\x.mcap,1,1,1,1",
+        "'scans\\x.mcap' has backslashes, and no file is called so; write the path",
+    ),
     "a drive": ("C:\\data\\x.mcap,1,1,1,1", "write the path from the table's folder with / between folders"),
     "a patient in capitals": ("a.mcap,p1,1,1,1\nb.mcap,P1,1,1,1", "'P1' differs from 'p1' on line 2 by capitals alone"),
     "a mass in capitals": ("a.mcap,1,1,a,1\nb.mcap,1,1,A,2", "column mass: 'A' differs from 'a' on line 2"),
