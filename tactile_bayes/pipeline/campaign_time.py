@@ -108,7 +108,7 @@ class Pace:
 
 def _as_long_as(earlier: Mapping[str, float]) -> dict[str, float]:
     """Earlier times in the unit of the usual ones, so that both can stand side by side."""
-    both = [step for step in earlier if step in USUAL_S]
+    both = [step for step, seconds in earlier.items() if step in USUAL_S and seconds > 0.0]
     if not both:
         return {}
     unit = sum(USUAL_S[step] for step in both) / sum(earlier[step] for step in both)

@@ -15,7 +15,7 @@ from tactile_bayes.pipeline import campaign_stages
 from tactile_bayes.pipeline.campaign_folder import StepResults
 from tactile_bayes.pipeline.campaign_stages import CampaignState, Stages
 from tactile_bayes.pipeline.campaign_steps import FILES, Task
-from tactile_bayes.pipeline.campaign_time import USUAL_S, mean_seconds
+from tactile_bayes.pipeline.campaign_time import USUAL_S, Pace, mean_seconds
 
 EXAMS, MASSES = 20, 10
 TAKES = {"map": 0.08, "estimate": 0.5, "size": 0.06, "repeatability": 0.3, "pool": 0.15}
@@ -116,6 +116,14 @@ def test_a_plan_says_what_it_knows(seconds: dict[str, float], workers: int, on_c
     found = CampaignState({step: StepResults({}) for step in FILES}, seconds=seconds)
     found.todo.update({"map": 10, "estimate": 10, "pool": 0})
     assert _time_words(found, workers, on_cluster=on_cluster) == words
+
+
+def test_steps_that_took_no_time_earlier_tell_nothing() -> None:
+    clock = iter((0.0, 1.0))
+    pace = Pace({"map": 0.0, "read": 0.1}, lambda: next(clock))
+    pace.note("map", 1)
+    pace.note("map", 2)
+    assert pace.left({"map": 3}) == pytest.approx(3.0)
 
 
 def test_every_step_has_a_usual_time() -> None:
