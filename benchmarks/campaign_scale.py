@@ -19,8 +19,6 @@ import contextlib
 import csv
 import hashlib
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -31,17 +29,18 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from benchmarks.campaign_cluster import Cluster
 from tactile_bayes.files.campaign_names import JOURNAL
 
-PORT, SAMPLE_S, WORKERS = 18786, 5.0, 2
+PORT, SAMPLE_S = 18786, 5.0
 
 
 class Watch:
     """The processes of the run, sampled, with a log of events."""
 
-    def __init__(self, folder: Path, journal: Path) -> None:
+    def __init__(self, folder: Path, journal: Path, processes: dict[str, psutil.Process]) -> None:
         self.began = time.monotonic()
-        self.processes: dict[str, psutil.Process] = {}
+        self.processes = processes
         self._journal, self._read, self.steps = journal, 0, Counter[str]()
         self._memory = (folder / "memory.csv").open("a", buffering=1)
         self._events = (folder / "events.txt").open("a", buffering=1)
@@ -75,68 +74,16 @@ class Watch:
         self.steps.update(line[9:].split(b" ")[0].decode() for line in new.splitlines() if line.startswith(b'{"key"'))
 
 
-def start(log: Path, *words: str) -> subprocess.Popen[bytes]:
-    """A process of its own with its output in a file."""
-    with log.open("ab") as file:
-        return subprocess.Popen([sys.executable, *words], stdout=file, stderr=file, start_new_session=True)
-
-
-class Cluster:
-    """A scheduler and workers, whose processes the watch knows."""
-
-    def __init__(self, folder: Path, watch: Watch) -> None:
-        self._folder, self._watch = folder, watch
-        self.scheduler: subprocess.Popen[bytes] | None = None
-        self.nannies: dict[str, subprocess.Popen[bytes]] = {}
-
-    def start(self) -> None:
-        """Start all of it."""
-        words = ("--host", "127.0.0.1", "--port", str(PORT), "--no-dashboard")
-        self.scheduler = start(self._folder / "scheduler.log", "-m", "distributed.cli.dask_scheduler", *words)
-        self._watch.processes["scheduler"] = psutil.Process(self.scheduler.pid)
-        for number in range(WORKERS):
-            self.start_worker(f"worker {number + 1}")
-
-    def start_worker(self, name: str) -> None:
-        """Start a worker with its nanny."""
-        words = (f"tcp://127.0.0.1:{PORT}", "--nthreads", "1", "--no-dashboard", "--host", "127.0.0.1")
-        log = self._folder / f"{name.replace(' ', '')}.log"
-        local = ("--local-directory", str(self._folder), "--memory-limit", "2GB")
-        self.nannies[name] = start(log, "-m", "distributed.cli.dask_worker", *words, *local)
-        self._watch.processes[f"nanny of {name}"] = psutil.Process(self.nannies[name].pid)
-
-    def find_workers(self) -> None:
-        """Look up the workers' processes, which their nannies start."""
-        for name, nanny in self.nannies.items():
-            with contextlib.suppress(psutil.Error):
-                children = [one for one in psutil.Process(nanny.pid).children() if one.memory_info().rss > 6e7]
-                if children:
-                    self._watch.processes[name] = children[0]
-
-    def kill(self, name: str) -> None:
-        """SIGKILL a process of the watch."""
-        with contextlib.suppress(psutil.Error):
-            self._watch.processes[name].kill()
-
-    def stop(self) -> None:
-        """Kill what is left."""
-        for process in (self.scheduler, *self.nannies.values()):
-            if process is not None:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-
-
 def run(folder: Path, out: str, *, scheduler_dies_at: float | None) -> None:
     """Run the campaign, with the accidents on the way to this share of the exams; None for none."""
     notes = folder / f"{out}.notes"
     notes.mkdir(exist_ok=True)
-    watch = Watch(notes, folder / out / JOURNAL)
+    cluster = Cluster(notes, port=PORT)
+    watch = Watch(notes, folder / out / JOURNAL, cluster.processes)
     if not (folder / "exams.csv").exists():
         client(folder, notes, "init", "scans", "-o", "exams.csv").wait()
         watch.tell("table of exams written")
     exams = len((folder / "exams.csv").read_text().splitlines()) - 1
-    cluster = Cluster(notes, watch)
     cluster.start()
     try:
         for accident in (None,) if scheduler_dies_at is None else (scheduler_dies_at, None):
@@ -151,7 +98,7 @@ def _until_the_end(
     """Run the client once; where the scheduler dies on the way, start the cluster again after it."""
     time.sleep(10)
     words = ("run", "exams.csv", "--excision", "excision.csv", "-o", out, "--method", "laplace")
-    process = client(folder, folder / f"{out}.notes", *words, "--scheduler", f"tcp://127.0.0.1:{PORT}")
+    process = client(folder, folder / f"{out}.notes", *words, "--scheduler", cluster.address)
     watch.processes["client"] = psutil.Process(process.pid)
     watch.tell("client started")
     accidents = [] if scheduler_dies_at is None else _accidents(watch, cluster, scheduler_dies_at)

@@ -110,8 +110,10 @@ class ClusterWorkers(Executor):
         """Number of items to submit ahead: no worker waits, and the scheduler holds few at any time."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """The future of ``fn(*args, **kwargs)`` on one of the workers."""
-        return self._cluster.submit(fn, *args, **kwargs)
+        """The future of ``fn(*args, **kwargs)`` on one of the workers, whose profiler does not look at it."""
+        from tactile_bayes.worker_profile import unprofiled
+
+        return self._cluster.submit(unprofiled, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let the items end, or cancel them."""
@@ -176,9 +178,6 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
                 "give the address it prints"
             ) from None
         _check_workers(client, address)
-        from tactile_bayes.worker_profile import without_profile
-
-        stack.enter_context(without_profile(client))
         workers = stack.enter_context(client.get_executor(pure=False))
         yield ClusterWorkers(workers, sum(client.nthreads().values()))
 

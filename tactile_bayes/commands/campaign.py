@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_report import Written
     from tactile_bayes.pipeline.campaign_settings import CampaignSettings
+    from tactile_bayes.pipeline.campaign_stages import CampaignState
 
 _FILE = FilePath()
 _MOST_NAMED = 5
@@ -158,7 +159,7 @@ def run(
         [output / name for name in WRITTEN],
         [path for path in (exams, excision, protocol, settings_file, given) if path],
     )
-    check_inputs(excision, protocol)
+    check_inputs(table, excision, protocol)
     with (
         open_campaign(output, dry=dry_run) as store,
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
@@ -172,7 +173,7 @@ def run(
             if of_all.copy_to:
                 copy_outputs(place, of_all.copy_to)
     if dry_run:
-        _say_plan(campaign, workers)
+        _say_plan(campaign, workers, on_cluster=scheduler is not None)
     else:
         _say_done(campaign, written, output, left)
     if dry_run or not written.report:  # which ends with it
@@ -196,23 +197,29 @@ def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings
         also_read(size_calibration_path(str(name)))
 
 
-def _say_plan(campaign: Campaign, workers: int) -> None:
+def _say_plan(campaign: Campaign, workers: int, *, on_cluster: bool) -> None:
     found = campaign.found
-    seconds, unknown = 0.0, []
     for step, todo in found.todo.items():
         click.echo(f"{step}: {todo} to do, {found.kept[step]} done")
-        if todo and step not in found.seconds:
-            unknown.append(step)
-        seconds += todo * found.seconds.get(step, 0.0)
     for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"{name}: {fault.step} failed: {fault.reason}")
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"{len(found.faults) - _MOST_NAMED} more failed")
-    if unknown:
-        click.echo(f"How long is not known: no {', '.join(unknown)} was run here yet.")
-    else:
-        click.echo(f"About {_duration(seconds / max(workers, 1))} by the times measured here.")
+    click.echo(_time_words(found, workers, on_cluster=on_cluster))
     click.echo("Nothing was run.")
+
+
+def _time_words(found: CampaignState, workers: int, *, on_cluster: bool) -> str:
+    """How long the planned steps take, as far as any of their kind was run in the folder."""
+    todo = {step: count for step, count in found.todo.items() if count}
+    unknown = ", ".join(step for step in todo if step not in found.seconds)
+    if unknown and not todo.keys() & found.seconds.keys():
+        return f"How long is not known: no {unknown} was run here yet."
+    seconds = sum(count * found.seconds.get(step, 0.0) for step, count in todo.items())
+    about = f"About {_duration(seconds / (1 if on_cluster else max(workers, 1)))}"
+    about += " of one worker" if on_cluster else ""
+    more = f", and more for {unknown}, which was not run here yet" if unknown else ""
+    return f"{about} by the times measured here{more}."
 
 
 def _duration(seconds: float) -> str:

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TextIO
+from typing import Protocol, TextIO
 
 from tactile_bayes.printing import raw_stream
 
@@ -16,7 +16,12 @@ QUIET_S = 2.0
 REDRAW_S = 0.1
 _WIDTH = 30
 
-Progress = Callable[[int, int], None]
+
+class Progress(Protocol):
+    """Called with what is done and how much there is; `left_s` where the caller knows better than by their ratio."""
+
+    def __call__(self, done: int, total: int, /, *, left_s: float | None = None) -> None:
+        """Draw."""
 
 
 @contextmanager
@@ -36,13 +41,17 @@ def progress_bar(
     """
     out = raw_stream(sys.stderr) if stream is None else stream
     if not out.isatty():
-        yield lambda _done, _total: None
+        yield _undrawn
         return
     bar = _Bar(label, out, clock)
     try:
         yield bar.update
     finally:
         bar.erase()
+
+
+def _undrawn(_done: int, _total: int, *, left_s: float | None = None) -> None:
+    """Progress that nobody watches."""
 
 
 class _Bar:
@@ -57,24 +66,25 @@ class _Bar:
         self._drawn = 0
         self._first: int | None = None  # what a resumed run had before it began
 
-    def update(self, done: int, total: int) -> None:
-        """Redraw the bar at `done` of `total`, at most every so often."""
+    def update(self, done: int, total: int, *, left_s: float | None = None) -> None:
+        """Redraw the bar at `done` of `total`, at most every so often; `left_s` stands in for what it would reckon."""
         now = self._clock()
         self._first = done if self._first is None else self._first
         if now < self._next or total <= 0:
             return
         self._next = now + REDRAW_S
         filled = _WIDTH * done // total
-        line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{self._left(now, done, total)}"
+        left = self._left(now, done, total, left_s)
+        line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{left}"
         self._out.write("\r" + line.ljust(self._drawn))
         self._out.flush()
         self._drawn = len(line)
 
-    def _left(self, now: float, done: int, total: int) -> str:
+    def _left(self, now: float, done: int, total: int, left_s: float | None) -> str:
         new = done - (self._first or 0)
         if new <= 0 or done >= total:
             return ""
-        seconds = round((now - self._begun) * (total - done) / new)
+        seconds = round((now - self._begun) * (total - done) / new if left_s is None else left_s)
         return f" {seconds // 60}:{seconds % 60:02d} left"
 
     def erase(self) -> None:

@@ -93,10 +93,12 @@ def read_manifest(path: Path) -> list[Exam]:
     ------
     BadDataError
         Naming the line, the column, the value and the way out: a cell that is not as ``exams.table.json`` has it, a
-        path that leaves the table's folder, half a place, rows of one mass that contradict each other.
+        path that leaves the table's folder or has backslashes, half a place, codes that differ by capitals alone, rows
+        of one mass that contradict each other.
     """
     table = read_table(path, SCHEMA)
     exams = [_exam(table, row) for row in range(len(table))]
+    _check_spelling(table, exams)
     _check_masses(table, exams)
     return sorted(exams, key=lambda exam: exam.order)
 
@@ -122,7 +124,11 @@ def _exam(table: Table, row: int) -> Exam:
 
 def _path(table: Table, row: int, name: str) -> Path:
     if not is_address(name):
-        return Path(os.path.abspath(_inside(table, row, "file", name)))  # noqa: PTH100 (links stay links)
+        path = Path(os.path.abspath(_inside(table, row, "file", name)))  # noqa: PTH100 (links stay links)
+        if "\\" in name and not os.path.lexists(path):
+            way_out = "write the path from the table's folder with / between folders"
+            raise table.error(row, "file", f"{_shown(name)} has backslashes, and no file is called so", way_out=way_out)
+        return path
     try:
         return Path(check_address(name))
     except UsageError as error:
@@ -134,10 +140,31 @@ def _inside(table: Table, row: int, column: str, name: str) -> Path:
     folder = Path(os.path.realpath(table.path.parent))
     path = table.path.parent / name
     if Path(name).is_absolute() or not Path(os.path.realpath(path)).is_relative_to(folder):
-        shown = name if len(name) <= 80 else f"{name[:77]}..."
         way_out = "give a path inside it, or put the table into a folder above the file"
-        raise table.error(row, column, f"{shown!r} leaves the table's folder", way_out=way_out)
+        raise table.error(row, column, f"{_shown(name)} leaves the table's folder", way_out=way_out)
     return path
+
+
+def _shown(name: str) -> str:
+    """Path for a message: quoted, as it is in the table but for unprintable characters, cut to 80 characters."""
+    short = name if len(name) <= 80 else f"{name[:77]}..."
+    return f"'{short}'" if short.isprintable() and "'" not in short else repr(short)
+
+
+def _check_spelling(table: Table, exams: Sequence[Exam]) -> None:
+    """Refuse codes that differ by capitals alone: one may be mistyped, and on some disks their folders are one."""
+    first: dict[tuple[str, str, str], tuple[str, int]] = {}
+    for row, exam in enumerate(exams):
+        for column, code, patient in (
+            ("patient", exam.patient, ""),
+            ("visit", exam.visit, exam.patient),
+            ("mass", exam.mass, exam.patient),
+        ):
+            spelled, line = first.setdefault((column, patient, code.casefold()), (code, exam.line))
+            if code != spelled:
+                told = f"{code!r} differs from {spelled!r} on line {line} by capitals alone"
+                way_out = f"write it one way, or give the other {column} another code"
+                raise table.error(row, column, told, way_out=way_out)
 
 
 def _check_masses(table: Table, exams: Sequence[Exam]) -> None:

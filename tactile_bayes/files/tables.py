@@ -92,11 +92,12 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
     Notes
     -----
     The file is UTF-8, with or without a byte order mark, with commas between cells and points in numbers. Blank
-    lines are skipped.
+    lines are skipped, and so are rows without a filled cell, which spreadsheets write.
     """
     schema = load_schema(schema_name)
     fields = {field["name"]: field for field in schema["fields"]}
     path, text = (source.name, source.text) if isinstance(source, Sheet) else (source, _decode(source))
+    _check_separator(path, text)
     rows = _split(path, text)
     if not rows:
         raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}", path=str(path))
@@ -183,7 +184,7 @@ def _split(path: Path, text: str) -> list[tuple[int, list[str]]]:
     before = 0
     try:
         for cells in reader:
-            if cells:
+            if any(cells):
                 rows.append((before + 1, cells))
             before = reader.line_num
     except csv.Error as error:
@@ -192,11 +193,16 @@ def _split(path: Path, text: str) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any]) -> None:
+def _check_separator(path: Path, text: str) -> None:
+    """Refuse other separators than commas by the first line, before quotes between them are taken for faults."""
+    first = text.lstrip("\r\n").partition("\n")[0]
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
-        if len(header) == 1 and separator in header[0]:
+        if separator in first and "," not in first:
             way_out = "save it with commas between cells and points in numbers"
             raise BadDataError(f"line 1: the cells are separated by {word}", way_out=way_out, path=str(path))
+
+
+def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any]) -> None:
     for name in header:
         if name not in fields:
             advice = _other_table(header, fields) or _advice_on_column(name, header, fields)

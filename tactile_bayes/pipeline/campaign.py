@@ -33,12 +33,13 @@ from tactile_bayes.pipeline.campaign_repeatability import (
     FEWEST_MASSES,
     NOT_LEARNED,
     exam_folders,
-    repeated_masses,
+    taught_by,
     too_few,
 )
 from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 from tactile_bayes.pipeline.campaign_stages import CampaignState, Fault, Progress, Stages, untold
 from tactile_bayes.pipeline.campaign_steps import Task
+from tactile_bayes.pipeline.campaign_time import steps_needed
 from tactile_bayes.pipeline.settings import Settings
 
 if TYPE_CHECKING:
@@ -132,8 +133,8 @@ class Campaign:
         sound = [exam for exam in self.exams if exam.name not in self.found.faults]
         self.not_pooled = self._why_not_pooled()
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
-        per_exam = 2 + self.settings.figures + bool(self.settings.copy_to)
-        self._stages.total = len(sound) * per_exam + masses * (2 if self.settings.copy_to else 1)
+        learns = taught_by(sound, self.settings) >= FEWEST_MASSES
+        self._stages.needed.update(steps_needed(len(sound), masses, settings=self.settings, learns=learns))
         with self._bar("steps") as self._stages.tell:
             for block in _blocks_of_patients(sound, self._block):
                 self._size(block)
@@ -285,15 +286,12 @@ class Campaign:
 
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
         """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
-        given = self.settings.estimate
-        if not self.settings.own_repeatability or given.repeatability or given.between_map_sd is not None:
-            return
         estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
-        masses = repeated_masses(sound if self._dry else estimated)
+        masses = taught_by(sound if self._dry else estimated, self.settings)
         if masses < FEWEST_MASSES:
             self.not_learned = too_few(masses) if masses else ""
+            self._stages.needed.update({name: -self._stages.needed[name] for name in ("repeatability", "size")})
             return
-        self._stages.total += 1
         complete = not self._dry or len(estimated) == len(sound)
         tasks = [self._repeatability_task(estimated)] if complete else []
         self._stages.run("repeatability", tasks, without=int(not complete))
@@ -308,12 +306,17 @@ class Campaign:
             self.repeatability = read_repeatability(self.folder / REPEATABILITY)
         if self._sizes_unknown:
             self._stages.run("size", [], without=len(sound))
-        elif self.repeatability is not None:
-            self._stages.total += len(estimated) * (2 if self.settings.copy_to else 1)
-            for block in _blocks(estimated, self._block):
-                tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
-                self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
-                self._copy(EXAMS, [exam.name for exam in block], steps=("size",))
+        else:
+            self._size_again(estimated if self.repeatability else [])
+
+    def _size_again(self, estimated: Sequence[Exam]) -> None:
+        """Size exams by the repeatability."""
+        self._stages.needed["size"] = len(estimated)
+        self._stages.needed["copy"] += len(estimated) * bool(self.settings.copy_to)
+        for block in _blocks(estimated, self._block):
+            tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
+            self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
+            self._copy(EXAMS, [exam.name for exam in block], steps=("size",))
 
     def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
         files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]

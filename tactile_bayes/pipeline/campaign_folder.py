@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import statistics
-from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -19,8 +17,6 @@ from tactile_bayes.pipeline.campaign_keys import stamp
 from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
 
 _HEADER: Final = {"campaign": 1}
-_LATEST: Final = 1000
-"""So many results of a step tell how long it takes."""
 _BESIDE: Final = ("repeatability",)
 """Steps whose files lie beside the exams."""
 
@@ -71,16 +67,6 @@ def _same(path: Path, digest: str, stamped: str | None) -> bool:
         return stamp(path) == stamped or sha256(path) == digest
     except (OSError, TactileBayesError):
         return False
-
-
-def median_seconds(values: Mapping[str, Result]) -> dict[str, float]:
-    """Median seconds of each step, by its latest results of any run."""
-    taken: dict[str, list[float]] = defaultdict(list)
-    for key in reversed([*values]):
-        times = taken[key.split(" ")[0]]
-        if len(times) < _LATEST:
-            times.append(values[key]["seconds"])
-    return {step: statistics.median(times) for step, times in taken.items()}
 
 
 class StepResults(Mapping[str, Result]):

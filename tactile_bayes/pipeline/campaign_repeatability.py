@@ -18,6 +18,7 @@ from tactile_bayes.pipeline.campaign_steps import Result, Task, Writes
 from tactile_bayes.pipeline.repeatability import ExamFolder, learn_from_exams, repeatability_setting
 
 if TYPE_CHECKING:
+    from tactile_bayes.pipeline.campaign_settings import CampaignSettings
     from tactile_bayes.pipeline.settings import Settings
     from tactile_bayes.size.posterior import SizePosterior
 
@@ -27,6 +28,14 @@ NOT_LEARNED: Final = "not_learned"
 """Key of the reason in the result of a step that did not learn."""
 _ANOTHER_STREAM: Final = 1
 """Of random numbers: the sizes' points must not be those that drew the map's posterior."""
+
+
+def taught_by(exams: Sequence[Exam], settings: CampaignSettings) -> int:
+    """Count the masses that may teach the spread; 0 where one was given or is not wanted."""
+    given = settings.estimate
+    if not settings.own_repeatability or given.repeatability or given.between_map_sd is not None:
+        return 0
+    return repeated_masses(exams)
 
 
 def repeated_masses(exams: Sequence[Exam]) -> int:

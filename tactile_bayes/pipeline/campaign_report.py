@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -29,6 +29,7 @@ from tactile_bayes.pipeline.campaign_tables import Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
+    from tactile_bayes.files.manifest_csv import Exam
     from tactile_bayes.pipeline.trial import TrialSettings
     from tactile_bayes.report.campaign_html import Card
 
@@ -120,8 +121,10 @@ def copy_outputs(folder: Path, address: str) -> None:
             put(folder / name, f"{address}/{name}")
 
 
-def check_inputs(excision: Path | None, protocol: Path | None) -> None:
+def check_inputs(exams: Iterable[Exam], excision: Path | None, protocol: Path | None) -> None:
     """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
+
+    Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there.
 
     Raises
     ------
@@ -133,9 +136,25 @@ def check_inputs(excision: Path | None, protocol: Path | None) -> None:
     if protocol is not None and excision is None:
         raise UsageError("--protocol is for the trial's report; give --excision too")
     if excision is not None:
-        excised(excision)
+        _check_spelling(excision, exams)
     if protocol is not None:
         _trial_settings(protocol)
+
+
+def _check_spelling(excision: Path, exams: Iterable[Exam]) -> None:
+    """Refuse a row that is of a mass of the exams but for capitals: the mass would be left out of the trial."""
+    from tactile_bayes.files.tables import read_table
+
+    table = read_table(excision, "excision.table.json")
+    known = {(exam.patient.casefold(), exam.mass.casefold()): exam for exam in exams}
+    for row, (patient, mass) in enumerate(zip(table.columns["patient"], table.columns["mass"], strict=True)):
+        exam = known.get((patient.casefold(), mass.casefold()))
+        if exam is None:
+            continue
+        for column, code, spelled in (("patient", patient, exam.patient), ("mass", mass, exam.mass)):
+            if code != spelled:
+                what = f"{code!r} is {spelled!r} in the table of exams (line {exam.line})"
+                raise table.error(row, column, what, way_out="write it one way in both tables")
 
 
 def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import field
+from typing import Protocol
 
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.pipeline.campaign_folder import StepResults, median_seconds, unchanged
+from tactile_bayes.pipeline.campaign_folder import StepResults, unchanged
 from tactile_bayes.pipeline.campaign_steps import FILES, Result, Task, run_step
+from tactile_bayes.pipeline.campaign_time import Pace, mean_seconds
 from tactile_bayes.records import dataclass
 
-Progress = Callable[[int, int], None]
+
+class Progress(Protocol):
+    """Called with what is done, what is needed, and the seconds that are left, where they are known."""
+
+    def __call__(self, done: int, total: int, /, *, left_s: float | None = None) -> None:
+        """Take note."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +46,7 @@ class CampaignState:
     kept, todo
         Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do.
     seconds
-        Median time that one of each step took so far.
+        Mean time that one of each step took so far.
     """
 
     results: dict[str, StepResults]
@@ -63,25 +71,35 @@ class Stages:
         As `run_batch`'s.
     dry
         Plan only.
+    clock
+        Seconds from anywhere, for the time that is left.
 
     Attributes
     ----------
     found
         Filled as steps are run.
-    total
-        Steps that are needed, as far as is known, and not done by earlier runs.
+    needed
+        By step, how many are still to be run or found done, as far as is known.
     tell
-        Called with the steps of this run that are done, and `total`.
+        Called with the steps of this run that are done, those it does altogether, and the seconds left.
     """
 
-    def __init__(self, *, store: BatchStore | None, executor: Executor | None = None, dry: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        store: BatchStore | None,
+        executor: Executor | None = None,
+        dry: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         values = {} if store is None else store.values
         results = {step: StepResults(values) for step in FILES}
-        self.found = CampaignState(results, seconds=median_seconds(values))
-        self.total = 0
+        self.found = CampaignState(results, seconds=mean_seconds(values))
+        self.needed: Counter[str] = Counter()
         self.tell: Progress = untold
         self._store, self._executor, self._dry = store, executor, dry
         self._done = 0
+        self._pace = Pace(self.found.seconds, clock)
 
     def run(self, step: str, tasks: Sequence[Task], *, without: int = 0) -> None:
         """Run one step for those that need it.
@@ -98,10 +116,10 @@ class Stages:
         missing = [task for task in tasks if task.key not in done]
         self.found.kept[step] += len(kept)
         self.found.todo[step] += len(missing) + (without if self._dry else 0)
-        self.total -= len(kept) + without
+        self.needed[step] -= len(kept) + without
         if self._dry:
             return
-        for task, outcome in zip(missing, self._run(missing), strict=True):
+        for task, outcome in zip(missing, self._run(step, missing), strict=True):
             if outcome.value is not None:
                 self.found.results[step].add(task.name, task.key)
             elif outcome.error == CLUSTER_LOST:
@@ -109,18 +127,21 @@ class Stages:
             else:
                 self.found.faults[task.name] = Fault(step, outcome.error)
 
-    def _run(self, tasks: Sequence[Task]) -> list[Outcome[Result]]:
-        before = self._done
+    def _run(self, step: str, tasks: Sequence[Task]) -> list[Outcome[Result]]:
+        before, total = self._done, self._done + self.needed.total()
+        self._pace.begin()
 
         def tell(done: int, _total: int) -> None:
-            self.tell(before + done, self.total)
+            self._pace.note(step, done)
+            self.tell(before + done, total, left_s=self._pace.left(self.needed - Counter({step: done})))
 
         try:
             outcomes = run_batch(run_step, tasks, key=_key, executor=self._executor, store=self._store, progress=tell)
         except BatchInterrupted as stop:
             path = None if self._store is None else self._store.path
-            raise BatchInterrupted(stop.outcomes, total=self.total, store=path, before=before) from None
+            raise BatchInterrupted(stop.outcomes, total=total, store=path, before=before) from None
         self._done += len(tasks)
+        self.needed[step] -= len(tasks)
         return outcomes
 
     def _kept(self, tasks: Sequence[Task]) -> list[Task]:
@@ -135,7 +156,7 @@ class Stages:
         return [task for task in known if task.key in values]
 
 
-def untold(_done: int, _total: int) -> None:
+def untold(_done: int, _total: int, /, *, left_s: float | None = None) -> None:
     """Progress that nobody watches."""
 
 

@@ -256,7 +256,9 @@ def map_settings(normalise: str) -> dict[str, Any]:
 
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
-    """Refuse a file that says it is of another exam than the table does; what either leaves out is not compared.
+    """Refuse a file that says it is of another exam than the table does.
+
+    What either leaves out is not compared, nor are capitals: the table has no two codes that differ by these alone.
 
     Parameters
     ----------
@@ -271,7 +273,7 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
         Naming both.
     """
     both = {ours: facts[theirs] for ours, theirs in _SAME.items() if facts.get(theirs) and expected.get(ours)}
-    differs = [name for name, value in both.items() if value != expected[name]]
+    differs = [name for name, value in both.items() if value.casefold() != expected[name].casefold()]
     if not differs:
         return
     shown = list(dict.fromkeys([*(name for name in ("patient", "side") if name in both), *differs]))

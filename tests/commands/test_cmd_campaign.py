@@ -102,6 +102,14 @@ FAULTS = {
     "a path that leaves inside": ("scans/../../x.mcap,1,1,1,1", "leaves the table's folder"),
     "an absolute path": ("/etc/passwd,1,1,1,1", "'/etc/passwd' leaves the table's folder"),
     "a link that leaves": ("link.mcap,1,1,1,1", "'link.mcap' leaves the table's folder"),
+    "backslashes": (
+        "scans\\x.mcap,1,1,1,1",
+        "'scans\\x.mcap' has backslashes, and no file is called so; write the path",
+    ),
+    "a drive": ("C:\\data\\x.mcap,1,1,1,1", "write the path from the table's folder with / between folders"),
+    "a patient in capitals": ("a.mcap,p1,1,1,1\nb.mcap,P1,1,1,1", "'P1' differs from 'p1' on line 2 by capitals alone"),
+    "a mass in capitals": ("a.mcap,1,1,a,1\nb.mcap,1,1,A,2", "column mass: 'A' differs from 'a' on line 2"),
+    "semicolons and quotes": ('"a.mcap";1;1;1;1', "the cells are separated by semicolons"),
     "a formula": ("=cmd.mcap,1,1,1,1", "does not match"),
     "a path for a patient": ("a.mcap,../p,1,1,1", "does not match"),
     "no replicate": ("a.mcap,1,1,1,0", "'0' is not at least 1"),
@@ -122,12 +130,42 @@ def test_a_fault_of_the_table_is_one_line_and_no_work(case: str, tmp_path: Path)
     body, fault = FAULTS[case]
     (tmp_path / "link.mcap").symlink_to(tmp_path.parent / "elsewhere.mcap")
     sides = body.count(",") > 4 * (body.count("\n") + 1)
-    (tmp_path / "exams.csv").write_text(f"file,patient,visit,mass,replicate{',side' if sides else ''}\n{body}\n")
+    head = f"file,patient,visit,mass,replicate{',side' if sides else ''}"
+    (tmp_path / "exams.csv").write_text(f"{head.replace(',', ';') if ';' in body else head}\n{body}\n")
     done = run_here("campaign", "run", "exams.csv", "-o", "out", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
     assert fault in done.stderr
     assert len(done.stderr) < 1000
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_whose_name_has_a_backslash_is_an_exam(own: Path) -> None:
+    (own / "scans" / "07-a.mcap").rename(own / "scans" / "07\\a.mcap")
+    write_table(own / "exams.csv", [("scans/07\\a.mcap", "07", 1, "left")])
+    assert "1 exams: 1 sized" in campaign(own).stdout
+
+
+def test_capitals_do_not_make_a_scan_another_patients(own: Path) -> None:
+    write(own / "scans" / "07-a.mcap", thinned(0, 2, subject="p07", side="left"))
+    write_table(own / "exams.csv", [("scans/07-a.mcap", "P07", 1, "left")])
+    assert "1 exams: 1 sized" in campaign(own).stdout
+
+
+def test_an_excision_table_that_writes_a_code_another_way_is_refused_before_any_work(own: Path) -> None:
+    write_table(own / "exams.csv", [("scans/09-a.mcap", "P09", 1, "right")])
+    (own / "excision.csv").write_text("patient,mass,ex_vivo_mm\nP10,1,12\np09,1,14\n")
+    done = campaign(own, "--excision", "excision.csv")
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "line 3, column patient: 'p09' is 'P09' in the table of exams (line 2); write it one way" in done.stderr
+    assert not (own / "out").exists()
+
+
+def test_a_table_from_windows_is_read(finished: Path) -> None:
+    before = contents(finished / "out")
+    table = finished / "exams.csv"
+    table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes().replace(b"\n", b"\r\n") + b",,,,,\r\n\r\n")
+    assert "2 steps run, 11 kept" in campaign(finished).stdout
+    assert contents(finished / "out") == before
 
 
 def test_half_a_place_is_refused(tmp_path: Path) -> None:

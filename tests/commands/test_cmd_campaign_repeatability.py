@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from campaign_files import contents, rows_of, steps, thinned, write, write_table
+from campaign_files import JOURNAL, contents, rows_of, steps, thinned, write, write_table
 from in_process import run_here
+
+from tactile_bayes.commands import progress
 
 MASSES, EXAMS = ("01", "02", "03", "04", "05"), (1, 2)
 ROWS = [(f"scans/{mass}-{exam}.mcap", mass, exam, "left") for mass in MASSES for exam in EXAMS]
@@ -93,7 +96,26 @@ def test_a_second_run_does_nothing_again(own: Path) -> None:
     assert contents(own / "out") == before
 
 
-def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path) -> None:
+@pytest.mark.parametrize("done", [20, 26])
+def test_what_a_kill_leaves_while_it_learns_or_sizes_goes_on_to_the_same_bytes(done: int, own: Path) -> None:
+    """Killed before the spread was in the journal, and between the sizes; files may be there before their lines."""
+    before, order = contents(own / "out"), steps(own / "out")
+    journal = own / "out" / JOURNAL
+    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[: 1 + done]) + '{"key": "cut')
+    for path in [*(own / "out").glob("masses/*/*"), *(own / "out").glob("exams/0[3-5]*/sized.json")]:
+        path.unlink()
+    campaign(own)
+    assert contents(own / "out") == before
+    assert steps(own / "out") == order
+
+
+def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[int, int, float | None]] = []
+
+    def tell(done: int, total: int, /, *, left_s: float | None = None) -> None:
+        told.append((done, total, left_s))
+
+    monkeypatch.setattr(progress, "progress_bar", lambda _label: nullcontext(tell))
     count = len(steps(own / "out"))
     write(own / "scans" / "03-2.mcap", thinned(2, 6, subject="03", side="left"))
     campaign(own)
@@ -105,6 +127,8 @@ def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path) -> None:
         *sizes,
         *(f"pool {mass}.v1.m1" for mass in MASSES),
     ]
+    assert told[-1] == (18, 18, 0.0)
+    assert (2, 18) in [one[:2] for one in told]  # sizes are counted before the spread is learned
     campaign(own, out="fresh")
     assert contents(own / "out") == contents(own / "fresh")
 

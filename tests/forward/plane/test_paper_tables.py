@@ -65,6 +65,7 @@ FAULTS = {
     "utf-16": ((HEADER + ROW).encode("utf-16"), ["UTF-16", "CSV UTF-8"]),
     "latin-1": ((HEADER + "P\xe9,1,tactile,1,1,detected\n").encode("latin-1"), ["line 2", "0xe9", "CSV UTF-8"]),
     "semicolons": ((HEADER + ROW).replace(",", ";"), ["line 1", "semicolons", "commas"]),
+    "semicolons and quotes": ('"patient";"mass"\n"P1";1\n', ["line 1", "semicolons", "commas"]),
     "tabs": ((HEADER + ROW).replace(",", "\t"), ["line 1", "tabs"]),
     "open quote": (HEADER + 'P1,1,"tactile,1,12.5,detected\n', ["line 2", "not CSV", "quotes"]),
     "ragged short": (HEADER + "P1,1,tactile,1,12.5\n", ["line 2", "5 cells under 6 columns"]),
