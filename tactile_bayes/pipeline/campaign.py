@@ -141,8 +141,8 @@ class Campaign:
             sound = [exam for exam in sound if exam.name not in self._repeated]
             self._learn_repeatability(sound)
             if masses:
-                left = len({exam.of_mass for exam in sound})
-                self._stages.total -= (masses - left) * (2 if self.settings.copy_to else 1)
+                spared = masses - len({exam.of_mass for exam in sound})
+                self._stages.needed.subtract(steps_needed(0, spared, settings=self.settings, learns=False))
                 self._pool(sound)
         return self.found
 
@@ -185,8 +185,8 @@ class Campaign:
             self.found.faults[name] = Fault("map", reason)
         self._repeated |= faults.keys()
         left = [exam for exam in exams if exam.name not in faults]
-        later_steps = 1 + self.settings.figures + bool(self.settings.copy_to)
-        self._stages.total -= (len(exams) - len(left)) * later_steps
+        spared = steps_needed(len(exams) - len(left), 0, settings=self.settings, learns=False)
+        self._stages.needed.subtract({step: count for step, count in spared.items() if step != "map"})
         return left
 
     def _copy(self, kind: str, names: Sequence[str], *, steps: Sequence[str]) -> None:
