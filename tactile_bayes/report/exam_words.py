@@ -84,7 +84,7 @@ def _supposed(exam: Exam) -> str:
     told = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"
     if at_site:
         return f"{told}, by these maps and this site's other exams"
-    stated = document["provenance"]["settings"].get("between_map_sd")
+    stated = document["provenance"].get("settings", {}).get("between_map_sd")
     if stated is not None:
         return f"{told}, as was stated"
     if exam.pooled is not None:
@@ -192,7 +192,7 @@ def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
     if exam.main.tactile_map is not None:
         yield from _scan_rows(exam.main.tactile_map)
     yield "array calibration", _age(exam)
-    calibration = exam.main.document["provenance"]["settings"].get("size_calibration")
+    calibration = exam.main.document["provenance"].get("settings", {}).get("size_calibration")
     if calibration:
         yield "size calibration", str(calibration)[:60]
 

@@ -65,12 +65,21 @@ def test_a_strange_provenance_is_shown_as_it_is(written: Path, tmp_path: Path) -
     assert describe(path)["provenance"] == {"inputs": ["x", {"no": 1}]}
 
 
-@pytest.mark.parametrize("fault", ["settings", "inputs"])
-def test_an_estimate_that_does_not_say_its_calibration_is_refused(fault: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("fault", "value", "words"),
+    [
+        ("settings", {}, "does not say by which calibration; run the campaign again"),
+        ("settings", [1], "provenance.settings must be object"),
+        ("inputs", [1], "provenance.inputs.0 must be object"),
+    ],
+)
+def test_an_estimate_that_does_not_say_its_calibration_is_refused(
+    fault: str, value: object, words: str, tmp_path: Path
+) -> None:
     out = write_repeats(tmp_path / "out", 3, maps=2)
     path = out / "exams" / "02.v1.m1.r1" / "estimate.json"
     document = json.loads(path.read_text())
-    document["provenance"][fault] = [1]
+    document["provenance"][fault] = value
     path.write_text(json.dumps(document))
-    with pytest.raises(BadDataError, match="does not say by which calibration; run the campaign again"):
+    with pytest.raises(BadDataError, match=words):
         learn_from_exams(exams_in(out))
