@@ -6,7 +6,7 @@ With :math:`u = \ln a - \alpha_0` and :math:`v = p - p_0`, where p is the log of
 
 g is the form: a polynomial (`log_quadratic`), Eq 6 (`population_eq6`) or a Gaussian process (`fat_process`). B differs
 from body to body by what a map does not show (seat, stiffness, moduli): :math:`N(0, s^2)`, with ln s a polynomial in u
-and v. E differs from exam to exam of one body.
+and v, or with that spread and the skewness of `hidden.HiddenTerms`. E differs from exam to exam of one body.
 
 A ball under the oblong head gives an oval map; its half log axis ratio :math:`q_0` is a quadratic in u and v, and only
 what exceeds it says that a lump is not round.
