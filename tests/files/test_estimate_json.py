@@ -69,7 +69,7 @@ EDITS: dict[str, tuple[Edit, str]] = {
         lambda one: one["masses"].append({**copy.deepcopy(one["masses"][0]), "number": 2}),
         "2 masses are the reported one",
     ),
-    "no settings": (lambda one: one["provenance"].pop("settings"), r"provenance must contain \['settings'\]"),
+    "settings of nothing": (lambda one: one["provenance"].update(settings=None), "provenance.settings must be object"),
     "inputs of nothing": (lambda one: one["provenance"].update(inputs=[None]), "provenance.inputs.0 must be object"),
     "cautions of letters": (
         lambda one: one["diagnostics"].update(broken_assumptions="abc"),
@@ -101,7 +101,7 @@ def test_an_edit_is_named_in_one_line(name: str) -> None:
     assert str(caught.value).startswith("exam.json: ")
 
 
-@pytest.mark.parametrize("name", ["ends exchanged", "no lump's", "no place", "no settings"])
+@pytest.mark.parametrize("name", ["ends exchanged", "no lump's", "no place", "settings of nothing"])
 def test_exports_and_the_page_refuse_it_and_write_nothing(tmp_path: Path, name: str) -> None:
     (tmp_path / "exam.json").write_text(json.dumps(edited(EDITS[name][0])))
     for words in (
