@@ -136,7 +136,7 @@ def size_error(
     body, _, error = at.body_and_error(at.terms(a, p).mean(axis=0, keepdims=True), *middle, np.zeros(1))
     told = {name: float(exams.unknowns[name][0]) for name in known}
     told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
-    own_sd = np.sqrt(np.maximum(body**2 - at.other_sd**2, 0.0))
+    own_sd = at.own_sd(body)
     left = known_body(at, told, *middle, own_sd)
     variance = left.variance[0] + at.other_sd**2 + error[0] + exam / len(exams)
     skewness = left.skewness[0] * (left.variance[0] / variance) ** 1.5

@@ -157,8 +157,8 @@ def simulate(folder: Path, bodies: int) -> None:
             continue
         try:
             scene, scan = scan_of(name, body)
-            kept: dict[str, Any] = {"name": name, "body": body, "d_mm": scene.solid_lumps[0].d_mm, "scene": scene}
-            kept["scan"] = scan
+            lump = scene.solid_lumps[0]
+            kept: dict[str, Any] = {"name": name, "body": body, "d_mm": lump.d_mm, "scene": scene, "scan": scan}
         except TactileBayesError as error:
             kept = {"name": name, "body": body, "error": str(error)}
         partial = path.with_suffix(".part")

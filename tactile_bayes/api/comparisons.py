@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.draws import Draws
-from tactile_bayes.api.estimates import SizeEstimate, estimate, settings_of
+from tactile_bayes.api.estimates import SizeEstimate, estimated, settings_of
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError
@@ -179,4 +179,4 @@ def _visit(given: Any, settings: dict[str, Any]) -> tuple[SizeEstimate, ...]:
     several = (
         [given] if isinstance(given, str | Path | Map | SizeEstimate) or not isinstance(given, Sequence) else given
     )
-    return tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in several)
+    return estimated(several, settings)

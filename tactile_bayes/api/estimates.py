@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.paths import PathLike, path_of
-from tactile_bayes.api.sized import MassEstimate, Sized
+from tactile_bayes.api.sized import MassEstimate, SizedExam
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
@@ -27,7 +27,7 @@ _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad",
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SizeEstimate(Sized):
+class SizeEstimate(SizedExam):
     """The estimate of one map.
 
     Parameters
@@ -175,21 +175,6 @@ class SizeEstimate(Sized):
 
         return named_exam(self.name, self.outcome.provenance.scans)
 
-    def report(
-        self,
-        path: PathLike,
-        *,
-        pdf: PathLike | None = None,
-        title: str = "",
-        name: str = "",
-        day: str = "",
-        force: bool = False,
-    ) -> None:
-        """Write one page of the exam as HTML, and with `pdf` also print it; see `exam_report`."""
-        from tactile_bayes.api.reports import exam_report
-
-        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
-
     def save(self, path: PathLike, *, force: bool = False) -> None:
         """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
 
@@ -204,7 +189,7 @@ class SizeEstimate(Sized):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PooledSize(Sized):
+class PooledSize(SizedExam):
     """One size from several maps of one mass.
 
     Parameters
@@ -236,21 +221,6 @@ class PooledSize(Sized):
     def document(self) -> dict[str, Any]:
         """What ``estimate --pool --json`` prints."""
         return self.outcome.document
-
-    def report(
-        self,
-        path: PathLike,
-        *,
-        pdf: PathLike | None = None,
-        title: str = "",
-        name: str = "",
-        day: str = "",
-        force: bool = False,
-    ) -> None:
-        """Write one page of the exam with its repeat maps as HTML, and with `pdf` also print it; see `exam_report`."""
-        from tactile_bayes.api.reports import exam_report
-
-        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
 
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the posterior of the size; with a path also write it.
@@ -368,7 +338,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
 
     used = settings_of(settings)
     refuse_checkpoint(used)
-    found = tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in _several(maps))
+    found = estimated(_several(maps), settings)
     if not found:
         raise UsageError("there is no map to pool; give at least one")
     prints = [one.outcome.tactile_map.fingerprint for one in found]
@@ -377,6 +347,16 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
     outcome = pool_answers([one.answer for one in found], used, names=names, inputs={})
     return PooledSize(outcome, found, used.interval, settings=used)
+
+
+def estimated(given: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:
+    """Estimates of maps, or of their paths; those that are estimates already keep their own settings."""
+    return tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in given)
+
+
+def listed(given: Any) -> list[Any]:
+    """One map, estimate, pooled size or path as a list of it; a list of them as it is."""
+    return [given] if isinstance(given, str | Path | Map | SizeEstimate | PooledSize) else list(given)
 
 
 def _several(maps: Iterable[Any]) -> list[Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tactile_bayes.api.estimates import PooledSize, SizeEstimate
+from tactile_bayes.api.estimates import PooledSize, SizeEstimate, listed
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError, check_choice
@@ -88,7 +88,7 @@ def export(
     check_choice("to", to, FORMATS)
     _refuse_unknown(identity)
     refuse_untaken(to, identity)
-    several = [files] if isinstance(files, str | Path | Map | SizeEstimate | PooledSize) else list(files)
+    several = listed(files)
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
     outputs.check(files=bool(several))
     exported = None

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.api.estimates import PooledSize, SizeEstimate, estimate, settings_of
-from tactile_bayes.api.maps import Map
+from tactile_bayes.api.estimates import PooledSize, SizeEstimate, estimated, listed, settings_of
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.exam_report import EstimatedMap, ExamFiles, Given, make_exam, read_exam
@@ -59,17 +58,12 @@ def exam_report(
     """
     page = PageFiles(path_of(path), path_of(pdf), force)
     page.check()
-    exam = _exam(_several(files), Given(title, name, day), settings)
+    given = listed(files)
+    if not given:
+        raise UsageError("nothing was given to report; give maps, or an estimate")
+    exam = _exam(given, Given(title, name, day), settings)
     page.write(exam)
     return headline(exam)
-
-
-def _several(files: Any) -> list[Any]:
-    alone = isinstance(files, str | Path | Map | SizeEstimate | PooledSize)
-    found = [files] if alone else list(files)
-    if not found:
-        raise UsageError("nothing was given to report; give maps, or an estimate")
-    return found
 
 
 def _exam(given: Sequence[Any], words: Given, settings: dict[str, Any]) -> Exam:
@@ -84,12 +78,12 @@ def _exam(given: Sequence[Any], words: Given, settings: dict[str, Any]) -> Exam:
     return make_exam(maps, used, words)
 
 
-def _estimates(given: Sequence[Any], settings: dict[str, Any]) -> tuple[list[SizeEstimate], Settings]:
+def _estimates(given: Sequence[Any], settings: dict[str, Any]) -> tuple[tuple[SizeEstimate, ...], Settings]:
     """Estimates of all maps, and the settings that pool them."""
     if len(given) == 1 and isinstance(given[0], PooledSize):
-        return list(given[0].maps), given[0].settings
+        return given[0].maps, given[0].settings
     used = settings_of(settings)
     if len(given) > 1:
         refuse_checkpoint(used)
-    found = [one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in given]
+    found = estimated(given, settings)
     return found, found[0].outcome.settings if len(found) == 1 else used

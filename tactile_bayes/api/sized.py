@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.draws import Draws
+from tactile_bayes.api.paths import PathLike
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.posterior import SIZES
@@ -107,6 +108,25 @@ class Sized:
         cells = [f"<tr><th>{name}</th><td>{escape(repr(draws))}</td></tr>" for name, draws in rows if draws is not None]
         table = f"<table>{''.join(cells)}</table>" if cells else f"<p>No size: {escape(self.why)}</p>"
         return f"{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
+
+
+class SizedExam(Sized):
+    """Base of the estimates of a whole exam, from one map or from several."""
+
+    def report(
+        self,
+        path: PathLike,
+        *,
+        pdf: PathLike | None = None,
+        title: str = "",
+        name: str = "",
+        day: str = "",
+        force: bool = False,
+    ) -> None:
+        """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
+        from tactile_bayes.api.reports import exam_report
+
+        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

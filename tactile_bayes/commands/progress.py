@@ -6,22 +6,16 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, TextIO
+from typing import TextIO
 
 from tactile_bayes.printing import raw_stream
+from tactile_bayes.progress import Progress, untold
 
 # Work that ends sooner draws nothing.
 QUIET_S = 2.0
 # Seconds between two drawings.
 REDRAW_S = 0.1
 _WIDTH = 30
-
-
-class Progress(Protocol):
-    """Called with what is done and how much there is; `left_s` where the caller knows better than by their ratio."""
-
-    def __call__(self, done: int, total: int, /, *, left_s: float | None = None) -> None:
-        """Draw."""
 
 
 @contextmanager
@@ -41,17 +35,13 @@ def progress_bar(
     """
     out = raw_stream(sys.stderr) if stream is None else stream
     if not out.isatty():
-        yield _undrawn
+        yield untold
         return
     bar = _Bar(label, out, clock)
     try:
         yield bar.update
     finally:
         bar.erase()
-
-
-def _undrawn(_done: int, _total: int, *, left_s: float | None = None) -> None:
-    """Progress that nobody watches."""
 
 
 class _Bar:

@@ -37,10 +37,11 @@ from tactile_bayes.pipeline.campaign_repeatability import (
     too_few,
 )
 from tactile_bayes.pipeline.campaign_settings import CampaignSettings
-from tactile_bayes.pipeline.campaign_stages import CampaignState, Fault, Progress, Stages, untold
+from tactile_bayes.pipeline.campaign_stages import CampaignState, Fault, Stages
 from tactile_bayes.pipeline.campaign_steps import Task
 from tactile_bayes.pipeline.campaign_time import steps_needed
 from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.progress import Progress, untold
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

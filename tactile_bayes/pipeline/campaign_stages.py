@@ -7,7 +7,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import field
-from typing import Protocol
 
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
@@ -15,14 +14,8 @@ from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.pipeline.campaign_folder import StepResults, unchanged
 from tactile_bayes.pipeline.campaign_steps import FILES, Result, Task, run_step
 from tactile_bayes.pipeline.campaign_time import Pace, mean_seconds
+from tactile_bayes.progress import Progress, untold
 from tactile_bayes.records import dataclass
-
-
-class Progress(Protocol):
-    """Called with what is done, what is needed, and the seconds that are left, where they are known."""
-
-    def __call__(self, done: int, total: int, /, *, left_s: float | None = None) -> None:
-        """Take note."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,10 +147,6 @@ class Stages:
             if not unchanged(task.folder, values[task.key]):
                 values.forget(task.key)
         return [task for task in known if task.key in values]
-
-
-def untold(_done: int, _total: int, /, *, left_s: float | None = None) -> None:
-    """Progress that nobody watches."""
 
 
 def _key(task: Task) -> str:

@@ -234,6 +234,10 @@ class BodyCalibration:
         whole = np.sum(terms @ spread[:k, :k] * terms, axis=-1)
         return np.hypot(body_sd, self.other_sd), slope * score, np.maximum(whole - slope**2, 0.0)
 
+    def own_sd(self, body_sd: FloatArray) -> FloatArray:
+        """(n,) SD(B) without `other_sd`, of which nothing that is known of a body tells anything."""
+        return np.asarray(np.sqrt(np.maximum(body_sd**2 - self.other_sd**2, 0.0)))
+
     def leverage(self, amplitude: float, sigma_mm: float) -> float:
         """Leverage of a map over the largest in the table; infinite without a rise."""
         if not (amplitude > 0 and sigma_mm > 0):

@@ -285,7 +285,7 @@ class _Pool:
         body_sd, shift, error = self.calibration.body_and_error(terms, middle_a, middle_width, score)
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
         other_sd = self.calibration.other_sd
-        own_sd = np.sqrt(np.maximum(body_sd**2 - other_sd**2, 0.0))
+        own_sd = self.calibration.own_sd(body_sd)
         left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
         return (
             left.expected + shift,

@@ -88,7 +88,7 @@ def suppositions(
     """
     at = np.array([middle[0]]), np.array([middle[1]])
     body_sd = calibration.body_and_error(calibration.terms(*at), *at, np.zeros(1))[0]
-    own_sd = np.sqrt(np.maximum(body_sd**2 - calibration.other_sd**2, 0.0))
+    own_sd = calibration.own_sd(body_sd)
     names, found = () if calibration.hidden is None else calibration.hidden.names, {}
     before = known_body(calibration, known, *at, own_sd)
     features = calibration.features(*at)[0]

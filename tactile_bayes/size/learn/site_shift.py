@@ -248,8 +248,8 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     )
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
     terms = used.terms(log_a, log_width)
-    body_sd = float(used.body_and_error(terms, log_a, log_width, np.zeros(len(maps)))[0].mean())
-    own_sd = float(np.sqrt(max(body_sd**2 - used.other_sd**2, 0.0)))
+    body_sd = used.body_and_error(terms, log_a, log_width, np.zeros(len(maps)))[0].mean()
+    own_sd = float(used.own_sd(body_sd))
     expected, alone, together = _known(used, maps[0].known, (float(log_a.mean()), float(log_width.mean())), own_sd)
     n = len(maps)
     exam = used.between_exams.sd**2 / n
