@@ -19,14 +19,17 @@ from tactile_bayes.presets import RESEARCH_USE
 def command(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance.
 
-    Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms.
+    Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms. The calibrations
+    that come with the program are known by their names where no file is called so: solid, solid-mean, eq6, plane-strain.
 
     Example: tactile-bayes show map.nc
     """
     from tactile_bayes.files.identify import describe
     from tactile_bayes.files.schema import dump_json
+    from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
 
-    found = describe(file)
+    shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
+    found = describe(shipped or file)
     if as_json:
         click.echo(dump_json(found), nl=False)
         return

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.size.calibration import Calibration
+    from tactile_bayes.size.fat_depth import FatTerms
 
 _TABLES = (
     "trial.table.json",
@@ -195,7 +196,7 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
             "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
             **{name: document[name] for name in kept},
             "variance_taken_away_by_knowing": calibration.unknowns,
-            **({} if calibration.with_fat is None else {"with_depth_of_fat": dict(calibration.with_fat.fit)}),
+            **_with_fat(calibration.with_fat),
         }
     return {
         "schema": document["schema"],
@@ -212,6 +213,26 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
         },
         "provenance": document["provenance"],
     }
+
+
+def _with_fat(part: FatTerms | None) -> dict[str, Any]:
+    """Fits of the parts for maps that tell the depth of the fat, and the figures by place too."""
+    from tactile_bayes.size.fat_process import FatProcess
+
+    if part is None:
+        return {}
+    parts = {"with_depth_of_fat": part}
+    if isinstance(part, FatProcess) and part.with_places is not None:
+        parts["with_figures_by_place"] = part.with_places
+    return {name: {**one.fit, **_spread(one)} for name, one in parts.items()}
+
+
+def _spread(part: FatTerms) -> dict[str, float]:
+    """What a part knows of the spread between bodies besides its fit."""
+    from tactile_bayes.size.fat_process import FatProcess
+
+    found = {} if part.hidden is None else {"body_skewness": part.hidden.skewness}
+    return {**found, "other_sd": part.other_sd} if isinstance(part, FatProcess) else found
 
 
 def _table(path: Path, head: bytes) -> dict[str, Any]:

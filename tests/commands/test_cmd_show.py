@@ -79,6 +79,20 @@ def test_a_posterior_tells_its_method_draws_and_origin(folder: Path) -> None:
     assert found["provenance"]["command"] == "estimate"
 
 
+def test_a_calibration_of_the_program_is_known_by_its_name_and_tells_all_its_parts(tmp_path: Path) -> None:
+    found = json.loads(run_here("show", "solid", "--json", cwd=tmp_path).stdout)
+    stored = json.loads((Path(tactile_bayes.__file__).parent / "calibrations" / "solid.json").read_text())
+    assert found["with_depth_of_fat"]["body_skewness"] == stored["fat_process"]["hidden"]["skewness"]
+    by_place, place = found["with_figures_by_place"], stored["fat_process"]["with_places"]
+    assert by_place["body_skewness"] == place["hidden"]["skewness"] > 0
+    assert by_place["other_sd"] == place["other_sd"] > 0
+
+
+def test_a_file_goes_before_a_calibration_of_its_name(tmp_path: Path) -> None:
+    (tmp_path / "solid").write_bytes((DEMO / "trial.csv").read_bytes())
+    assert json.loads(run_here("show", "solid", "--json", cwd=tmp_path).stdout)["kind"] == "table: trial"
+
+
 @pytest.mark.parametrize(
     ("name", "data"),
     [
