@@ -19,8 +19,8 @@ from tactile_bayes.presets import RESEARCH_USE
 def command(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance.
 
-    Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms. The calibrations
-    that come with the program are known by their names where no file is called so: solid, solid-mean, eq6, plane-strain.
+    Knows scans, maps, posteriors, size calibrations, reports and the tables of trials and phantoms. Calibrations that
+    come with the program are known by their names where no file is called so: solid, solid-mean, eq6, plane-strain.
 
     Example: tactile-bayes show map.nc
     """
