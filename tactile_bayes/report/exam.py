@@ -114,10 +114,14 @@ class Exam:
         return replace(self.main, masses=(replace(first, axes_mm=(along, across), largest=size), *others))
 
     @property
+    def document(self) -> Mapping[str, Any]:
+        """The JSON object of the size that the page reports: the pooled one of several maps."""
+        return self.main.document if self.pooled is None else self.pooled
+
+    @property
     def figures(self) -> Mapping[str, Any]:
         """Figures of the size: spread between exams, whether the lump is oval."""
-        document = self.main.document if self.pooled is None else self.pooled
-        found: Mapping[str, Any] = document["diagnostics" if self.pooled is None else "figures"]
+        found: Mapping[str, Any] = self.document["diagnostics" if self.pooled is None else "figures"]
         return found
 
 

@@ -187,7 +187,7 @@ def _chance(probability: float) -> str:
 
 def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
     """Both intervals of the largest size, with what they suppose."""
-    another = (exam.main.document if exam.pooled is None else exam.pooled).get("another_exam")
+    another = exam.document.get("another_exam")
     found = [("this exam" if exam.pooled is None else "these exams", size)]
     if another is not None:
         found.append((f"exams differ by {100 * another['between_map_sd']:.0f} %", another["max_size_mm"]))

@@ -42,14 +42,13 @@ def headline(exam: Exam) -> str:
 
 def largest(exam: Exam) -> Quantity | None:
     """The largest size that the page reports: the pooled one of several maps."""
-    document = exam.main.document if exam.pooled is None else exam.pooled
-    size: Quantity | None = document["max_size_mm"]
+    size: Quantity | None = exam.document["max_size_mm"]
     return size
 
 
 def size_sentences(exam: Exam) -> Iterator[str]:
     """The largest size with both intervals and the smallest size."""
-    document, size = exam.main.document if exam.pooled is None else exam.pooled, largest(exam)
+    document, size = exam.document, largest(exam)
     if size is None:
         return
     share = _percent(size)
@@ -77,7 +76,7 @@ def _supposed(exam: Exam) -> str:
     spread = exam.figures.get("between_map_sd")
     if spread is None:
         return ""
-    document = exam.main.document if exam.pooled is None else exam.pooled
+    document = exam.document
     at_site = document.get("repeatability") or exam.figures.get("repeatability")
     if at_site and exam.pooled is None:
         return f"; {at_site}"
@@ -94,7 +93,7 @@ def _supposed(exam: Exam) -> str:
 
 def nothing_sentences(exam: Exam) -> Iterator[str]:
     """Why there is no size, what would help, and what was covered."""
-    document = exam.main.document if exam.pooled is None else exam.pooled
+    document = exam.document
     if exam.main.document["reason_code"] in UNDETECTED:
         tactile_map = exam.main.tactile_map
         area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
@@ -111,7 +110,7 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
 
 def detail_sentence(exam: Exam) -> str:
     """Why there is no size, as the program's other reports give it; empty where there is one."""
-    document = exam.main.document if exam.pooled is None else exam.pooled
+    document = exam.document
     reason = document["reason"] if largest(exam) is None else ""
     return f"In detail: {reason.replace('cm2', 'cm²')}." if reason else ""
 
@@ -150,7 +149,7 @@ def why_no_clock(exam: Exam) -> str:
 
 def narrowing_sentences(exam: Exam) -> list[str]:
     """What makes the interval wide and what would narrow it, without the program's options."""
-    document = exam.main.document if exam.pooled is None else exam.pooled
+    document = exam.document
     share = document["variance_share"]
     return [] if share is None else [_OPTIONS.sub("", line) for line in width_lines(share)]
 
