@@ -48,10 +48,19 @@ def supposed_lines(supposed: Mapping[str, Any] | None, median_mm: float, *, plac
 
 
 def supposed_line(supposed: Mapping[str, Any] | None, median_mm: float, *, places: int) -> list[str]:
-    """A soft lump's size and a hard one's in a few words, for a short report; empty where they hardly differ."""
-    pair = [one["max_size_mm"]["median"] for one in _pair(supposed, median_mm, ("soft", "hard"))]
-    words = [f"{name}, {size:.{places}f} mm" for name, size in zip(("soft", "hard"), pair, strict=False)]
-    return [f"No map shows stiffness: were the lump {'; '.join(words)}."] if pair else []
+    """A soft lump's size and a hard one's in a few words, for a short report; empty where they hardly differ.
+
+    A lump softer than the calibration's may lie above the interval, and nothing on its map says so: the line does.
+    """
+    pair = _pair(supposed, median_mm, ("soft", "hard"))
+    if not pair:
+        return []
+    (soft, soft_ratio), (hard, hard_ratio) = ((one["max_size_mm"]["median"], one["value"]) for one in pair)
+    words = (
+        f"No map shows stiffness: were the lump soft ({soft_ratio:g} times fat), {soft:.{places}f} mm; "
+        f"hard ({hard_ratio:g} times), {hard:.{places}f} mm"
+    )
+    return [f"{words}; softer still, larger." if soft > hard else f"{words}."]
 
 
 def _pair(supposed: Mapping[str, Any] | None, median_mm: float, names: tuple[str, str]) -> list[Mapping[str, Any]]:

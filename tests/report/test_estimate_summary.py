@@ -31,6 +31,7 @@ from tactile_bayes.report.narrowing import joined, width_lines
 from tactile_bayes.report.quantities import estimate_quantities
 from tactile_bayes.report.scene_text import _change, sensitivity_line
 from tactile_bayes.report.size_text import decimals
+from tactile_bayes.report.supposed_text import supposed_line
 
 
 def mass(seed: int, *, amplitude: float = 0.4, second: float = 0.0, **made) -> TactileMap:
@@ -121,6 +122,16 @@ def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder
     whole = run_here("estimate", "clear.nc", "--method", "laplace", "-v", cwd=folder).stdout
     assert "Were the lump soft (11 times as stiff as fat): " in whole
     assert "bodies unlike the calibration's (lumps 6 to 100 times as stiff as fat" in whole
+    words = "No map shows stiffness: were the lump soft (11 times fat), {:.1f} mm; hard (70 times), {:.1f} mm"
+    sizes = [supposed[name]["max_size_mm"]["median"] for name in ("soft", "hard")]
+    assert supposed_line(supposed, supposed_median := sum(sizes) / 2, places=1) == [
+        f"{words.format(*sizes)}; softer still, larger."
+    ]
+    exchanged = {
+        "soft": {**supposed["soft"], "max_size_mm": supposed["hard"]["max_size_mm"]},
+        "hard": {**supposed["hard"], "max_size_mm": supposed["soft"]["max_size_mm"]},
+    }
+    assert supposed_line(exchanged, supposed_median, places=1) == [f"{words.format(*sizes[::-1])}."]
 
 
 def crowded() -> tuple[Estimate, dict]:
