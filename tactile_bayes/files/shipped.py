@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+from tactile_bayes.errors import UsageError
+
 SHIPPED: Final = {
     "solid": "solid.json",
     "eq6": "eq6.json",
@@ -30,7 +32,17 @@ def size_calibration_path(name: str) -> Path | None:
     """Path of a calibration given by name or path; None for ``none``.
 
     A file of the same name in the working directory needs a ``./`` before it.
+
+    Raises
+    ------
+    UsageError
+        When it is no name of a calibration and no file either: most likely a name that was typed wrong.
     """
     if name == NONE:
         return None
-    return _FOLDER / SHIPPED[name] if name in SHIPPED else Path(name)
+    if name in SHIPPED:
+        return _FOLDER / SHIPPED[name]
+    path = Path(name)
+    if path.name == name and not path.suffix and not path.exists():
+        raise UsageError(f"no calibration or file is called {name!r}; give {', '.join(SHIPPED)} or a file")
+    return path
