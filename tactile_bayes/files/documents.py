@@ -115,6 +115,8 @@ def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, obj
             yield "", key
             yield (f"{where}.{key}" if where else str(key)), value
     elif isinstance(item, list):
+        if all(type(value) is float and -_LARGEST <= value <= _LARGEST for value in item):
+            return  # a calibration has tens of thousands of them: no place is spelled that no error names
         yield from ((f"{where}[{i}]", value) for i, value in enumerate(item))
     elif isinstance(item, int | float) and not -_LARGEST <= item <= _LARGEST:
         value = str(item) if isinstance(item, float) else f"a whole number of {len(str(abs(item)))} digits"
