@@ -20,7 +20,7 @@ from tactile_bayes.size.fat_process import FatProcess, Kernel, ProcessAtProfile,
 from tactile_bayes.size.learn.fat_depth import FatTable, learn_fat_cubic
 from tactile_bayes.size.learn.fat_process import learn_fat_process, place_table
 from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
-from tactile_bayes.size.learn.process_fit import ProcessRows, given, spread_points
+from tactile_bayes.size.learn.process_fit import ProcessRows, drawn_points, given
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.log_quadratic import LogQuadratic
 
@@ -81,11 +81,13 @@ def test_with_a_point_for_each_body_it_is_exact_regression() -> None:
     kernel = 0.3**2 * squared_exponential(points, points, np.exp(theta[:5])) + 100.0 * linear @ linear.T
     weights = np.linalg.solve(kernel + np.diag(noise), rows.data.mean_log_d)
     np.testing.assert_allclose(fitted.terms @ fitted.mean, kernel @ weights, atol=2e-5)
-    sign, log_det = np.linalg.slogdet(kernel + np.diag(noise))
-    exact = -0.5 * rows.data.mean_log_d @ weights - 0.5 * log_det
-    # the evidence is kept without the determinant of the prior on the four linear terms
-    assert sign == 1
-    assert fitted.log_evidence == pytest.approx(exact + 0.5 * 4 * np.log(100.0), abs=0.05)
+    # bodies left out, by the textbook formula too (Rasmussen & Williams 2006, eq. 5.12)
+    inverse = np.linalg.inv(kernel + np.diag(noise))
+    error, variance = fitted.left_out(rows.data.mean_log_d)
+    np.testing.assert_allclose(error, -weights / np.diag(inverse), atol=2e-4)
+    np.testing.assert_allclose(variance, 1.0 / np.diag(inverse), rtol=1e-2)
+    density = -0.5 * np.sum(np.log(variance) + error**2 / variance)
+    assert fitted.left_out_density(rows.data.mean_log_d) == pytest.approx(density)
     # the control: with other lengths it is another regression
     other = given(one_each, points, theta + np.r_[1.0, np.zeros(len(theta) - 1)], exam_sd=EXAM_SD)
     assert np.abs(other.terms @ other.mean - kernel @ weights).max() > 1e-3
@@ -108,13 +110,15 @@ def test_bodies_left_out_are_predicted_as_if_the_fit_had_not_seen_them() -> None
         assert variance[body] == pytest.approx(left, rel=1e-6)
 
 
-def test_points_are_spread_over_the_bodies() -> None:
-    x = np.random.default_rng(3).normal(size=(200, 5))
-    points = spread_points(x, np.ones(5), 40)
-    assert len(np.unique(points, axis=0)) == 40
-    left = 1.0 - squared_exponential(x, points, np.ones(5)).max(axis=1)
-    by_chance = 1.0 - squared_exponential(x, x[:40], np.ones(5)).max(axis=1)
-    assert left.max() < by_chance.max()
+def test_points_are_bodies_and_lie_as_they_do() -> None:
+    x = np.random.default_rng(3).normal(size=(2000, 5))
+    points = drawn_points(x, 400)
+    assert len(np.unique(points, axis=0)) == 400
+    assert {tuple(one) for one in points} <= {tuple(one) for one in x}
+    np.testing.assert_allclose(points.std(axis=0), x.std(axis=0), rtol=0.12)
+    # the control: a kernel's pivots lie at the ends first
+    ends = x[np.argsort(np.abs(x).sum(axis=1))[-400:]]
+    assert (ends.std(axis=0) > 1.3 * x.std(axis=0)).all()
 
 
 def test_it_follows_a_law_that_no_cubic_does(learned) -> None:
