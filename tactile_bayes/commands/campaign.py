@@ -71,6 +71,9 @@ def init(folder: Path | str, output: Path, force: bool) -> None:
     "--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision: adds the trial's report."
 )
 @click.option(
+    "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide EX.csv: which column holds what, in which unit."
+)
+@click.option(
     "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis of the trial, as for `validate`."
 )
 @click.option("--method", type=click.Choice(METHODS), default="importance", show_default=True, help="As `estimate`.")
@@ -105,6 +108,7 @@ def run(
     exams: Path,
     output: Path,
     excision: Path | None,
+    columns: Path | None,
     protocol: Path | None,
     method: str,
     size_calibration: str | None,
@@ -137,7 +141,7 @@ def run(
     from tactile_bayes.files.shipped import NONE
     from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
-    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, copy_outputs, write_outputs
+    from tactile_bayes.pipeline.campaign_report import WRITTEN, Excision, check_inputs, copy_outputs, write_outputs
     from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
@@ -157,9 +161,12 @@ def run(
     _check_paths(table, output, of_all)
     refuse_same(
         [output / name for name in WRITTEN],
-        [path for path in (exams, excision, protocol, settings_file, given) if path],
+        [path for path in (exams, excision, columns, protocol, settings_file, given) if path],
     )
-    check_inputs(table, excision, protocol)
+    if columns is not None and excision is None:
+        raise UsageError("--columns is the layout of the excision table; give --excision too")
+    measured = None if excision is None else Excision(excision, columns)
+    check_inputs(table, measured, protocol)
     with (
         open_campaign(output, dry=dry_run) as store,
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
@@ -169,7 +176,7 @@ def run(
         campaign.run()
         if not dry_run:
             left = tidy(place, table, campaign.found.results, unread=campaign.unread)
-            written = write_outputs(campaign, excision, protocol)
+            written = write_outputs(campaign, measured, protocol)
             if of_all.copy_to:
                 copy_outputs(place, of_all.copy_to)
     if dry_run:

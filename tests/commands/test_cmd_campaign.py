@@ -109,7 +109,7 @@ FAULTS = {
     "a drive": ("C:\\data\\x.mcap,1,1,1,1", "write the path from the table's folder with / between folders"),
     "a patient in capitals": ("a.mcap,p1,1,1,1\nb.mcap,P1,1,1,1", "'P1' differs from 'p1' on line 2 by capitals alone"),
     "a mass in capitals": ("a.mcap,1,1,a,1\nb.mcap,1,1,A,2", "column mass: 'A' differs from 'a' on line 2"),
-    "semicolons and quotes": ('"a.mcap";1;1;1;1', "the cells are separated by semicolons"),
+    "semicolons and quotes": ('"a.mcap";1;1;1;0', "'0' is not at least 1"),
     "a formula": ("=cmd.mcap,1,1,1,1", "does not match"),
     "a path for a patient": ("a.mcap,../p,1,1,1", "does not match"),
     "no replicate": ("a.mcap,1,1,1,0", "'0' is not at least 1"),
@@ -166,6 +166,36 @@ def test_a_table_from_windows_is_read(finished: Path) -> None:
     table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes().replace(b"\n", b"\r\n") + b",,,,,\r\n\r\n")
     assert "2 steps run, 11 kept" in campaign(finished).stdout
     assert contents(finished / "out") == before
+
+
+def test_an_excision_sheet_of_a_german_spreadsheet_is_read_by_its_mapping(finished: Path) -> None:
+    """Semicolons, decimal commas, cm, other names and columns: the report is that of the tidy table in mm."""
+    tidy = campaign(finished, "--excision", "excision.csv").stdout
+    sheet = "Pat.-Nr.;Alter;größter Durchmesser (cm, Patho);;\r\n07;54;1,5;;\r\n09;61;1,4;;\r\n11;70;0,9;;\r\n12;48;1;;\r\n"
+    (finished / "patho.csv").write_bytes(b"\xef\xbb\xbf" + sheet.encode())
+    mapping = 'patient = "Pat.-Nr."\n[excision]\nsize = "größter Durchmesser (cm, Patho)"\nunit = "cm"\n'
+    (finished / "patho.toml").write_text(mapping, encoding="utf-8")
+    done = campaign(finished, "--excision", "patho.csv", "--columns", "patho.toml")
+    assert done.returncode == 0, done.stderr
+    assert "Sizes against excision: 4 masses of 4 patients" in done.stdout
+    assert done.stdout == tidy
+
+
+def test_an_excision_sheet_with_two_rows_of_one_mass_is_refused(finished: Path) -> None:
+    (finished / "patho.csv").write_text("id;cm\n07;1,5\n09;1,4\n07;2,4\n")
+    (finished / "patho.toml").write_text('patient = "id"\n[excision]\nsize = "cm"\nunit = "cm"\n')
+    done = campaign(finished, "--excision", "patho.csv", "--columns", "patho.toml")
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "line 4, column patient: 07 + 1 stands on line 2 already; remove one, or name the column" in done.stderr
+
+
+def test_a_mapping_needs_its_excision_table(finished: Path) -> None:
+    (finished / "patho.toml").write_text('patient = "id"\n[excision]\nsize = "cm"\nunit = "cm"\n')
+    alone = campaign(finished, "--columns", "patho.toml")
+    assert (alone.returncode, alone.stderr.count("\n")) == (2, 1)
+    assert "--columns is the layout of the excision table; give --excision too" in alone.stderr
+    missing = campaign(finished, "--excision", "excision.csv", "--columns", "patho.toml")
+    assert "line 1, column id: is missing; correct the mapping; the table has 'patient', 'mass'" in missing.stderr
 
 
 def test_half_a_place_is_refused(tmp_path: Path) -> None:
