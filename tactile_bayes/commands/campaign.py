@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARC
 if TYPE_CHECKING:
     from tactile_bayes.files.manifest_csv import Exam
     from tactile_bayes.pipeline.campaign import Campaign
+    from tactile_bayes.pipeline.campaign_init import Found
     from tactile_bayes.pipeline.campaign_report import Written
     from tactile_bayes.pipeline.campaign_settings import CampaignSettings
     from tactile_bayes.pipeline.campaign_stages import CampaignState
@@ -33,35 +34,76 @@ def command() -> None:
 @command.command("init")
 @click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
 @click.option("-o", "--output", required=True, metavar="EXAMS.csv", type=_FILE, help="Where to write the table.")
+@click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
 @FORCE
-def init(folder: Path | str, output: Path, force: bool) -> None:
+def init(folder: Path | str, output: Path, add: bool, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry.
 
-    FOLDER may be one in an object store, as s3://bucket/scans.
+    FOLDER may be one in an object store, as s3://bucket/scans; the maps in it are passed over.
 
     Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
     are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
-    fills stay blank.
+    fills stay blank. Copies, and maps of scans that are listed, are left out and named.
 
     Example: tactile-bayes campaign init scans -o exams.csv
     """
     from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.manifest_csv import write_manifest
+    from tactile_bayes.files.manifest_csv import add_rows, read_rows, write_manifest
     from tactile_bayes.pipeline.campaign_init import find_exams
 
-    refuse_existing(output, force=force)
-    found = find_exams(folder, output)
+    if add and force:
+        raise UsageError("--add keeps the rows of a table, --force writes it anew; give one of them")
+    before = read_rows(output) if add and output.exists() else None
+    if output.exists() and not (add or force):
+        raise UsageError(f"{output} exists; --add keeps its rows and adds other files, --force writes it anew")
+    refuse_existing(output, force=force or add)
+    found = find_exams(folder, output, listed=before.rows if before else ())
     for line in found.skipped:
         click.echo(f"left out: {line}", err=True)
-    if not found.rows:
-        raise BadDataError("holds no scan (.mcap, .npz)", way_out="give the folder of the scans", path=str(folder))
-    write_manifest(output, found.rows, force=force)
-    patients = {row["patient"] for row in found.rows} - {""}
-    nameless = sum(not row["patient"] for row in found.rows)
-    click.echo(f"{output}: {len(found.rows)} exams of {len(patients)} patients")
+    if before is None:
+        if not found.rows:
+            raise BadDataError(
+                "holds no scan (.mcap, .npz) and no map (.nc)", way_out="give the folder of the scans", path=str(folder)
+            )
+        write_manifest(output, found.rows, force=force)
+    elif found.rows:
+        add_rows(before, found.rows)
+    _say_found(found, output, before.rows if before else None)
+
+
+def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] | None) -> None:
+    """What the table holds now, what is to be looked at, and the next command."""
+    import shlex
+
+    rows = [*(before or ()), *found.rows]
+    patients = {row["patient"].casefold() for row in rows} - {""}
+    added = "" if before is None else f" ({len(found.rows)} added, {len(before)} kept)"
+    click.echo(f"{output}: {len(rows)} exams of {len(patients)} patients{added}")
+    for line in found.spelled:
+        click.echo(line)
+    _say_names("listed, and not there any more", found.gone)
+    if found.others:
+        kinds = ", ".join(sorted(found.others))
+        click.echo(f"passed over: {sum(found.others.values())} other files ({kinds})")
+    nameless = sum(not row["patient"] for row in rows)
     if nameless:
         click.echo(f"{nameless} of them do not say whose they are: fill in the column patient")
+    elif told := _to_correct(output):
+        click.echo(f"to correct before the run: {told}")
+    folder = shlex.quote(str(output.with_name("out")))
+    click.echo(f"next: tactile-bayes campaign run {shlex.quote(str(output))} -o {folder} --dry-run")
     click.echo(RESEARCH_USE)
+
+
+def _to_correct(output: Path) -> str:
+    """Why `campaign run` would refuse the table; empty where it would take it."""
+    from tactile_bayes.files.manifest_csv import read_manifest
+
+    try:
+        read_manifest(output)
+    except BadDataError as error:
+        return str(error)
+    return ""
 
 
 @command.command("run")

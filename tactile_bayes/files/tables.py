@@ -120,6 +120,8 @@ class RawTable:
         Cells as text, without blanks around them, by their columns.
     decimal_comma
         Whether its numbers are written as 12,5.
+    separator
+        Between its cells.
     """
 
     path: Path
@@ -127,6 +129,7 @@ class RawTable:
     line_numbers: list[int]
     rows: list[dict[str, str]]
     decimal_comma: bool = False
+    separator: str = ","
 
     def number(self, line: int, column: str, text: str) -> float:
         """Parse a finite number; an error names its cell."""
@@ -148,7 +151,7 @@ def read_raw(path: Path) -> RawTable:
     for line, row in body:
         _check_length(path, line, row, header)
     rows = [dict(zip(header, (cell.strip() for cell in row), strict=True)) for _, row in body]
-    return RawTable(path, header, [line for line, _ in body], rows, cells.decimal_comma)
+    return RawTable(path, header, [line for line, _ in body], rows, cells.decimal_comma, cells.separator)
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
