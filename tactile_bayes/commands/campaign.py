@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _FILE = FilePath()
 _MOST_NAMED = 5
+_LOG_EVERY_S = 60.0
+"""Where stderr is no terminal, progress is a line so often."""
 
 
 @click.group("campaign")
@@ -175,6 +177,8 @@ def run(
 
     Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
     """
+    from functools import partial
+
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.settings_file import repeatability_in, settings_of
     from tactile_bayes.executors import open_executor
@@ -214,7 +218,8 @@ def run(
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=progress_bar)
+        bar = partial(progress_bar, log_every_s=_LOG_EVERY_S)
+        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=bar)
         campaign.run()
         if not dry_run:
             left = tidy(place, table, campaign.found.results, unread=campaign.unread)
@@ -249,13 +254,19 @@ def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings
 def _say_plan(campaign: Campaign, workers: int, *, on_cluster: bool) -> None:
     found = campaign.found
     for step, todo in found.todo.items():
-        click.echo(f"{step}: {todo} to do, {found.kept[step]} done")
+        named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
+        click.echo(f"{step}: {todo} to do{named}, {found.kept[step]} done")
     for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"{name}: {fault.step} failed: {fault.reason}")
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"{len(found.faults) - _MOST_NAMED} more failed")
     click.echo(_time_words(found, workers, on_cluster=on_cluster))
     click.echo("Nothing was run.")
+
+
+def _few(found: CampaignState, step: str) -> bool:
+    """Whether all exams or masses that need a step are known by name, and fit a line."""
+    return 0 < found.todo[step] == len(found.names[step])
 
 
 def _time_words(found: CampaignState, workers: int, *, on_cluster: bool) -> str:
@@ -285,12 +296,17 @@ def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence
     counts = counts_words(written.sized, written.unsized, written.failed)
     click.echo(f"{output}: {len(campaign.exams)} exams: {counts}")
     if written.pooled:
-        click.echo(f"{written.pooled} masses pooled")
+        click.echo(f"{written.pooled} masses pooled, each at one visit")
     elif campaign.not_pooled:
         click.echo(f"no mass pooled: {campaign.not_pooled}")
     if line := repeatability_words(campaign):
         click.echo(line)
     click.echo(f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs")
+    if any(found.kept.values()):
+        for step, todo in found.todo.items():
+            more = "" if _few(found, step) else f" and {todo - len(found.names[step])} more"
+            if todo:
+                click.echo(f"{step} run: {', '.join(found.names[step])}{more}")
     for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"failed: {name}: {fault.step}: {fault.reason}", err=True)
     if len(found.faults) > _MOST_NAMED:

@@ -138,7 +138,9 @@ def _reading(
     values = {key: _number(table, line, row, reading, key, factor) for key in ("sd", "low", "high")}
     probability = reading.get("probability") if values["low"] is not None else None
     if status == "detected" and values["low"] is not None and probability is None:
-        raise _fault(table.path, line, reading["low"], "is an interval's end without probability", "add it to the mapping")
+        raise _fault(
+            table.path, line, reading["low"], "is an interval's end without probability", "add it to the mapping"
+        )
     return {
         "modality": reading["modality"],
         "replicate": reading.get("replicate", 1),
@@ -178,7 +180,9 @@ def _check_keys(table: Table, names: Sequence[str]) -> None:
         if key in seen:
             shown = " + ".join(map(str, key))
             way_out = "remove one row" if "modality" in names else "remove one, or name the column of the mass"
-            raise table.error(row, "patient", f"{shown} stands on line {table.line_numbers[seen[key]]} already", way_out=way_out)
+            raise table.error(
+                row, "patient", f"{shown} stands on line {table.line_numbers[seen[key]]} already", way_out=way_out
+            )
         seen[key] = row
 
 

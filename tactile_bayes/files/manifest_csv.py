@@ -186,7 +186,9 @@ def _check_masses(table: Table, exams: Sequence[Exam]) -> None:
 
 def write_manifest(path: Path, rows: Iterable[Mapping[str, object]], *, force: bool = False) -> None:
     """Write a table of exams; keys of the rows are columns, those that no row has are left out."""
-    write_text(path, table_text(list(rows), _columns()), force=force)
+    held = list(rows)
+    filled = [name for name in _columns() if any(row.get(name) is not None for row in held)]
+    write_text(path, table_text(held, filled or _columns()), force=force)
 
 
 def read_rows(path: Path) -> RawTable:
@@ -222,12 +224,11 @@ def _columns() -> list[str]:
 
 
 def table_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
-    """CSV text of rows; columns that no row fills are left out, None is a blank cell, numbers keep every digit."""
-    filled = [name for name in columns if any(row.get(name) is not None for row in rows)] or list(columns)
+    """CSV text of rows; None is a blank cell, numbers keep every digit."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(filled)
-    writer.writerows([_cell(row.get(name)) for name in filled] for row in rows)
+    writer.writerow(columns)
+    writer.writerows([_cell(row.get(name)) for name in columns] for row in rows)
     return out.getvalue()
 
 

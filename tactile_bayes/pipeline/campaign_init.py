@@ -64,10 +64,14 @@ def find_exams(folder: Path | str, table: Path, *, listed: Sequence[Mapping[str,
     known = {_normal(row["file"]): row for row in listed}
     found = _stored(folder, known) if isinstance(folder, str) else _local(folder, table, known)
     found.spelled.extend(_spell_as(listed, found.rows))
-    found.rows.sort(key=lambda row: (natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"]))
+    found.rows.sort(key=_order)
     _number(found.rows, listed)
     found.gone.extend(row["file"] for name, row in known.items() if _is_gone(table.parent, name))
     return found
+
+
+def _order(row: Mapping[str, str]) -> tuple[Any, ...]:
+    return natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"]
 
 
 def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]]) -> Found:

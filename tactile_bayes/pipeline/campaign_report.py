@@ -232,7 +232,8 @@ def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int],
     if len(cards) <= _MOST_INLINE:
         cards = [_self_contained(card, campaign.folder) for card in cards]
     masses = len(campaign.found.results["pool"])
-    lines = [f"{len(rows)} exams: {counts_words(*counts)}."] + ([f"{masses} masses pooled."] if masses else [])
+    lines = [f"{len(rows)} exams: {counts_words(*counts)}."]
+    lines += [f"{masses} masses pooled, each at one visit."] if masses else []
     if len(cards) < len(rows):
         lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
     lines += [repeatability_words(campaign)] if campaign.repeatability else []

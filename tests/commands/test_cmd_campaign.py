@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import random
@@ -18,6 +19,10 @@ import numpy as np
 import pytest
 from campaign_files import JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
 from in_process import run_here
+
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.pipeline.campaign_steps import Task, run_step
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 FAST = ("--method", "laplace")
@@ -171,7 +176,8 @@ def test_a_table_from_windows_is_read(finished: Path) -> None:
 def test_an_excision_sheet_of_a_german_spreadsheet_is_read_by_its_mapping(finished: Path) -> None:
     """Semicolons, decimal commas, cm, other names and columns: the report is that of the tidy table in mm."""
     tidy = campaign(finished, "--excision", "excision.csv").stdout
-    sheet = "Pat.-Nr.;Alter;größter Durchmesser (cm, Patho);;\r\n07;54;1,5;;\r\n09;61;1,4;;\r\n11;70;0,9;;\r\n12;48;1;;\r\n"
+    rows = ("Pat.-Nr.;Alter;größter Durchmesser (cm, Patho)", "07;54;1,5", "09;61;1,4", "11;70;0,9", "12;48;1")
+    sheet = "".join(f"{row};;\r\n" for row in rows)
     (finished / "patho.csv").write_bytes(b"\xef\xbb\xbf" + sheet.encode())
     mapping = 'patient = "Pat.-Nr."\n[excision]\nsize = "größter Durchmesser (cm, Patho)"\nunit = "cm"\n'
     (finished / "patho.toml").write_text(mapping, encoding="utf-8")
@@ -196,6 +202,55 @@ def test_a_mapping_needs_its_excision_table(finished: Path) -> None:
     assert "--columns is the layout of the excision table; give --excision too" in alone.stderr
     missing = campaign(finished, "--excision", "excision.csv", "--columns", "patho.toml")
     assert "line 1, column id: is missing; correct the mapping; the table has 'patient', 'mass'" in missing.stderr
+
+
+def test_a_step_that_ends_after_its_command_was_killed_changes_nothing_that_is_read(finished: Path) -> None:
+    """On a cluster a worker goes on; here its step is run after the folder's last run, with another normalisation."""
+    out, exam = finished / "out", "07.v1.m1.r1"
+    before, done = contents(out), steps(out)
+    source = finished / "scans" / "07-a.mcap"
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    task = Task("map", exam, out / "exams" / exam, "late", source=source, source_sha256=digest, normalise="mean")
+    late = run_step(task)
+    assert set(late["files"]) == {"map.nc"}
+    now = contents(out)
+    assert {name: now[name] for name in before} == before
+    assert campaign(finished).returncode == 0
+    assert contents(out) == before
+    assert steps(out) == done
+
+
+@pytest.mark.parametrize("name", ["exams_done", "failures"])
+def test_tables_have_every_column_of_their_schema_in_its_order(undisturbed: Path, name: str) -> None:
+    """Also those that no exam fills: a script must not break on a trial without cautions."""
+    table = read_table(undisturbed / f"{name}.csv", f"{name}.table.json")
+    assert len(table) == {"exams_done": 4, "failures": 2}[name]
+    header = (undisturbed / f"{name}.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert header == ",".join(one["name"] for one in load_schema(f"{name}.table.json")["fields"])
+
+
+def test_the_trial_table_has_its_columns_where_no_exam_has_a_size(own: Path) -> None:
+    write_table(own / "exams.csv", [("scans/11-a.mcap", "11", 1, "left")])
+    done = campaign(own, "--excision", "excision.csv")
+    assert done.returncode == 0, done.stderr
+    table = read_table(own / "out" / "trial.csv", "trial.table.json")
+    assert (table.columns["size_mm"], table.columns["status"]) == ([None], ["not_detected"])
+    assert "Sizes against excision: 1 mass" in done.stdout
+
+
+def test_a_pooled_size_is_synthetic_also_where_the_last_exam_failed(undisturbed: Path) -> None:
+    rows = [row for row in rows_of(undisturbed / "trial.csv") if row["modality"] == "tactile-pooled"]
+    assert {row["patient"]: row["synthetic"] for row in rows} == {"07": "true", "09": "true", "11": "true", "12": ""}
+
+
+def test_a_plan_and_a_run_name_the_few_exams_they_do_again(finished: Path) -> None:
+    write(finished / "scans" / "09-a.mcap", thinned(1, 5, subject="09", side="right"))
+    planned = campaign(finished, "--dry-run").stdout.splitlines()
+    assert "map: 3 to do (07.v1.m1.r3, 09.v1.m1.r1, 12.v1.m1.r1), 3 done" in planned
+    done = campaign(finished).stdout.splitlines()
+    assert "map run: 07.v1.m1.r3, 09.v1.m1.r1, 12.v1.m1.r1" in done
+    assert "estimate run: 09.v1.m1.r1" in done
+    assert "pool run: 09.v1.m1" in done
 
 
 def test_half_a_place_is_refused(tmp_path: Path) -> None:

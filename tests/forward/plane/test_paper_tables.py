@@ -56,7 +56,8 @@ def test_spreadsheets_write_marks_and_line_ends(tmp_path: Path, prefix: bytes, e
 @pytest.mark.parametrize("separator", [";", "\t"])
 def test_a_spreadsheet_of_another_country_is_read(tmp_path: Path, separator: str) -> None:
     """Semicolons or tabs, decimal commas, a byte order mark, and the blank columns right of a table."""
-    text = (HEADER.strip() + ",,\n" + "P1,1,tactile,1,12!5,detected,,\nP2,1,tactile,1,9,detected,,\n").replace(",", separator)
+    rows = (HEADER.strip(), "P1,1,tactile,1,12!5,detected", "P2,1,tactile,1,9,detected")
+    text = "".join(f"{row},,\n" for row in rows).replace(",", separator)
     table = read_table(write(tmp_path, "\ufeff" + text.replace("!", ",").replace("\n", "\r\n")), TRIAL)
     assert table.columns["size_mm"] == [12.5, 9.0]
     assert table.columns["status"] == ["detected", "detected"]
@@ -94,7 +95,10 @@ FAULTS = {
     "size in cm": (HEADER.replace("size_mm", "size_cm") + ROW, ["size_cm", "size_mm", "multiply by 10"]),
     "size without unit": (HEADER.replace("size_mm", "size") + ROW, ["did you mean size_mm, in millimetres?"]),
     "strange column": (HEADER.strip() + ",zzz\n" + ROW, ["zzz", "remove it"]),
-    "nameless column": (HEADER.strip() + ",\n" + ROW.strip() + ",x\n", ["column ''", "remove it", "--columns MAP.toml"]),
+    "nameless column": (
+        HEADER.strip() + ",\n" + ROW.strip() + ",x\n",
+        ["column ''", "remove it", "--columns MAP.toml"],
+    ),
     "missing column": (HEADER.replace(",status", "") + "P1,1,tactile,1,12.5\n", ["status", "is missing"]),
     "missing size column": (HEADER.replace(",size_mm", "") + "P1,1,cbe,1,not_done\n", ["size_mm", "is missing"]),
     "column twice": (HEADER.strip() + ",mass\n", ["mass", "more than once"]),
