@@ -30,17 +30,18 @@ def load_trial(
     Parameters
     ----------
     columns
-        The mapping file of a wide table; None where both are tidy.
+        The mapping file of a wide table; None where both are tidy. One without ``[[reading]]`` is for the excision
+        sizes alone.
     tidy_trial
-        Whether the mapping is for the excision sizes alone.
+        Whether the trial is tidy whatever the mapping holds.
     """
-    from tactile_bayes.files.column_map import read_wide
+    from tactile_bayes.files.column_map import read_mapping, read_wide
     from tactile_bayes.files.size_posterior import fill_from_posteriors
     from tactile_bayes.files.tables import Sheet, check_references, read_table
     from tactile_bayes.trial.readings import readings_from_columns
 
     sizes = read_excision(excision, columns)
-    if columns is None or tidy_trial or isinstance(trial, Sheet):
+    if columns is None or tidy_trial or isinstance(trial, Sheet) or "reading" not in read_mapping(columns):
         table = read_table(trial, "trial.table.json")
     else:
         table = read_wide(trial, columns)

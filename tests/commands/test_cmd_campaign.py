@@ -185,6 +185,8 @@ def test_an_excision_sheet_of_a_german_spreadsheet_is_read_by_its_mapping(finish
     assert done.returncode == 0, done.stderr
     assert "Sizes against excision: 4 masses of 4 patients" in done.stdout
     assert done.stdout == tidy
+    by_hand = run_here("validate", "out/trial.csv", "--excision", "patho.csv", "--columns", "patho.toml", cwd=finished)
+    assert by_hand.stdout in done.stdout, by_hand.stderr
 
 
 def test_an_excision_sheet_with_two_rows_of_one_mass_is_refused(finished: Path) -> None:
