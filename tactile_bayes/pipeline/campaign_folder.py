@@ -14,7 +14,7 @@ from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.campaign_names import EXAMS, JOURNAL, MASSES
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.campaign_keys import stamp
-from tactile_bayes.pipeline.campaign_staging import clear_staged, put_in_place
+from tactile_bayes.pipeline.campaign_staging import STAGED, clear_staged, put_in_place
 from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
 
 _HEADER: Final = {"campaign": 1}
@@ -56,6 +56,8 @@ def _taken(result: Result) -> Result:
     if fault is None:
         try:
             return put_in_place(result)
+        except FileNotFoundError:
+            fault = f"a worker's files are not in {result[STAGED]['folder']}: do all machines see this folder?"
         except OSError as error:
             fault = str(error)
     raise UsageError(f"{fault}; what is done is kept: run again to go on")
