@@ -1,7 +1,7 @@
 """Cells of a CSV file as text: its encoding, its separator, its quotes, and the decimal commas of spreadsheets.
 
 Spreadsheets set to the language of many countries save semicolons between the cells and commas in the numbers. The
-first line tells the separator; a comma inside a number is a decimal comma only where it separates no cells.
+first lines tell the separator; a comma inside a number is a decimal comma only where it separates no cells.
 """
 
 from __future__ import annotations
@@ -92,9 +92,17 @@ def cells_of(path: Path, text: str) -> Cells:
 
 
 def separator_in(text: str) -> str:
-    """Comma, semicolon or tab: whichever the first line has most of outside quotes; a comma where it has none."""
-    first = _QUOTED.sub("", text.lstrip("\r\n").partition("\n")[0])
-    return max(",;\t", key=first.count)
+    """Comma, semicolon or tab: one of which the first two lines have as many outside quotes, else most in the first.
+
+    So names like ``size (cm, by pathology)`` do not make a table with semicolons one with commas.
+    """
+    first, second, *_ = (_QUOTED.sub("", line) for line in [*text.lstrip("\r\n").split("\n", 2), "", ""])
+
+    def trust(separator: str) -> tuple[bool, int]:
+        count = first.count(separator)
+        return 0 < count == second.count(separator), count
+
+    return max(",;\t", key=trust)
 
 
 def may_be_thousands(number: str) -> bool:

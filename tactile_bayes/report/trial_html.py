@@ -24,7 +24,8 @@ th{font-weight:600}td small{color:#5a5a5a;white-space:nowrap}img{max-width:100%;
 .wide{overflow-x:auto}.note{color:#5a5a5a;font-size:.86rem}pre{font-size:.76rem;overflow-x:auto;background:#f6f6f4;padding:.8rem}
 .mark{background:#fff3d6;padding:.35rem .7rem;border-left:4px solid #c8641e}code{font-size:.8rem;overflow-wrap:anywhere}
 @media print{body{margin:0;max-width:none;padding:0}h2{break-after:avoid}img,tr{break-inside:avoid}
-.wide{overflow:visible}table{font-size:7.5pt}th,td{padding-right:.3rem}td small{white-space:normal}pre{white-space:pre-wrap}}
+.wide{overflow:visible}table{font-size:7.5pt}th,td{padding-right:.3rem}td small{white-space:normal}
+pre{white-space:pre-wrap}}
 """
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
+from tactile_bayes.files.csv_cells import separator_in
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.tables import check_references, read_table
@@ -62,6 +63,25 @@ def test_a_spreadsheet_of_another_country_is_read(tmp_path: Path, separator: str
     assert table.columns["size_mm"] == [12.5, 9.0]
     assert table.columns["status"] == ["detected", "detected"]
     assert describe(table.path)["kind"] == "table: trial"
+
+
+@pytest.mark.parametrize(
+    ("text", "separator"),
+    [
+        ("a,b\n1,2\n", ","),
+        ("a;b\n1,5;2\n", ";"),
+        ("size (cm, largest, pathology);patient\n1,5;P1\n", ";"),
+        ('"size (cm, largest)";patient\n"1,5";P1\n', ";"),
+        ("note; free,patient\nx,P1\n", ","),
+        ("a\tb\n1,5\t2\n", "\t"),
+        ("patient\nP1\n", ","),
+        ("a,b,c\n1,2\n", ","),
+        ("a;b", ";"),
+        ("", ","),
+    ],
+)
+def test_the_separator_is_told_by_two_lines(text: str, separator: str) -> None:
+    assert separator_in(text) == separator
 
 
 def test_size_table_needs_three_columns(tmp_path: Path) -> None:
