@@ -96,7 +96,7 @@ class FolderFiles:
         for names in self._alike(said):
             first, *copies = sorted(names, key=lambda name: (name not in listed, len(name), name))
             found |= {name: f"holds the same bytes as {first}" for name in copies if name not in listed}
-        for made, original in self._made_of(said):
+        for made, original in self._made_of({name: one for name, one in said.items() if name not in found}):
             arrays = original.lower().endswith(".npz")  # which say less of the exam than the scan that they became
             first, second = (made, original) if arrays else (original, made)
             if second in listed and first not in listed:

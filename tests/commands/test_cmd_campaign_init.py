@@ -58,6 +58,13 @@ def test_copies_maps_of_listed_scans_and_files_of_systems_give_no_exam(site: Pat
     assert "passed over: 2 other files (.txt, .xlsx)" in done.stdout
 
 
+def test_a_map_of_a_scan_that_has_a_copy_is_of_the_one_that_is_listed(site: Path) -> None:
+    """Whichever of the two names comes first in the folder."""
+    one = site / "Studie 1" / "Köhler, M."
+    (one / "P01 links – 1 - Kopie.mcap").rename(one / "Z Kopie von P01 links – 1.mcap")
+    assert "P01 links – 1.nc: was made from Studie 1/Köhler, M./P01 links – 1.mcap, which" in init(site).stderr
+
+
 def test_codes_that_differ_by_capitals_become_one_and_the_next_command_is_told(site: Path) -> None:
     done = init(site)
     assert done.stdout.splitlines()[0] == "exams.csv: 3 exams of 2 patients"
