@@ -54,11 +54,13 @@ class FolderFiles:
         By name, of files that may be exams, in a fixed order.
     others
         How many other files there are, by the ends of their names.
+    closed
+        Folders in it that cannot be read, with the reason.
 
     Raises
     ------
     UsageError
-        When the folder is none, or the table would lie outside it and not above it.
+        When the folder is none or cannot be read, or the table would lie outside it and not above it.
     """
 
     def __init__(self, folder: Path, table: Path) -> None:
@@ -70,9 +72,10 @@ class FolderFiles:
             raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; {way_out}")
         self.paths: dict[str, Path] = {}
         self.others: Counter[str] = Counter()
+        self.closed: list[str] = []
         self._digests: dict[str, str] = {}
         own = Path(os.path.realpath(table))
-        for path in _walk(folder):
+        for path in _walk(folder, self.closed):
             if path.name.lower().endswith(_ENDINGS):
                 name = os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)
                 self.paths[name] = path
@@ -136,9 +139,15 @@ class FolderFiles:
         return self._digests[name]
 
 
-def _walk(folder: Path) -> Iterator[Path]:
-    """Files in a fixed order, without those that systems leave beside others."""
-    for place, folders, names in os.walk(folder):
+def _walk(folder: Path, closed: list[str]) -> Iterator[Path]:
+    """Files in a fixed order, without those that systems leave beside others; folders that cannot be read are noted."""
+
+    def skip(error: OSError) -> None:
+        if error.filename == os.fspath(folder):
+            raise UsageError(f"{folder} cannot be read ({error.strerror}); give a folder that can")
+        closed.append(f"{error.filename}: cannot be read ({error.strerror})")
+
+    for place, folders, names in os.walk(folder, onerror=skip):
         if JOURNAL in names:
             folders.clear()
             continue

@@ -59,7 +59,7 @@ def find_exams(folder: Path | str, table: Path, *, listed: Sequence[Mapping[str,
     Raises
     ------
     UsageError
-        When the folder is none, or the table would lie outside it and not above it.
+        When the folder is none or cannot be read, or the table would lie outside it and not above it.
     """
     known = {_normal(row["file"]): row for row in listed}
     found = _stored(folder, known) if isinstance(folder, str) else _local(folder, table, known)
@@ -77,7 +77,7 @@ def _order(row: Mapping[str, str]) -> tuple[Any, ...]:
 def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]]) -> Found:
     files = FolderFiles(folder, table)
     said: dict[str, Said] = {}
-    found = Found(others=files.others)
+    found = Found(skipped=files.closed, others=files.others)
     for name, path in files.paths.items():
         try:
             said[name] = said_by(path, name)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,6 +76,26 @@ def test_codes_that_differ_by_capitals_become_one_and_the_next_command_is_told(s
     assert [row["patient"] for row in rows_of(site / "exams.csv")] == ["p01", "p01", "P02"]
     planned = run_here("campaign", "run", "exams.csv", "-o", "out", "--dry-run", cwd=site)
     assert "map: 3 to do" in planned.stdout, planned.stderr
+
+
+def test_a_folder_that_cannot_be_read_is_named(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The superuser may read any folder, so the system's refusal is played."""
+    scandir = os.scandir
+
+    def closed(path: str) -> Any:
+        if str(path).endswith(shut):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", closed)
+    shut = "B"
+    inner = init(site)
+    assert inner.returncode == 0, inner.stderr
+    assert "left out: Studie 1/B: cannot be read (Permission denied)" in inner.stderr
+    shut = "Studie 1"
+    outer = init(site, "--force")
+    assert (outer.returncode, outer.stderr.count("\n")) == (2, 1)
+    assert "Studie 1 cannot be read (Permission denied); give a folder that can" in outer.stderr
 
 
 def test_what_run_would_refuse_is_told(site: Path) -> None:
