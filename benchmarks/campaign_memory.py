@@ -27,6 +27,7 @@ from tactile_bayes.batch import run_batch
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.executors import LocalWorkers, open_executor
 from tactile_bayes.files.atomic import sha256
+from tactile_bayes.pipeline.campaign_staging import put_in_place
 from tactile_bayes.pipeline.campaign_steps import Task, run_step
 from tactile_bayes.pipeline.settings import Settings
 
@@ -38,9 +39,9 @@ def exam(path: str, *, out: str, steps: tuple[str, ...]) -> list[float]:
     source = Path(path)
     task = Task("map", source.stem, Path(out), "0", source, sha256(source), normalise="gain")
     with contextlib.suppress(TactileBayesError):  # damaged on purpose
-        run_step(task)
+        put_in_place(run_step(task))
         for step in steps:
-            run_step(replace(task, step=step, settings=Settings(method="laplace")))
+            put_in_place(run_step(replace(task, step=step, settings=Settings(method="laplace"))))
     process = psutil.Process()
     return [process.memory_info().rss / 1e6, process.cpu_times().user, float(_profiled())]
 

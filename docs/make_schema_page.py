@@ -11,6 +11,8 @@ SCHEMAS = Path(__file__).resolve().parent.parent / "data_schema"
 SECTIONS = {
     "Trial (CSV)": "trial.table.json",
     "Exams (CSV)": "exams.table.json",
+    "Exams done (CSV)": "exams_done.table.json",
+    "Failures (CSV)": "failures.table.json",
     "Excision (CSV)": "excision.table.json",
     "Size table (CSV)": "size_table.table.json",
     "Phantom maps (CSV)": "phantom_maps.table.json",
@@ -26,7 +28,7 @@ SECTIONS = {
     "Worklist (JSON)": "worklist.schema.json",
     "Mapping of columns (TOML)": "column_map.schema.json",
 }
-"""Heading of each schema of what users write themselves."""
+"""Heading of each schema of what users write themselves, or read in tables."""
 HEAD = """\
 # Columns and keys
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,12 +17,15 @@ from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARC
 if TYPE_CHECKING:
     from tactile_bayes.files.manifest_csv import Exam
     from tactile_bayes.pipeline.campaign import Campaign
+    from tactile_bayes.pipeline.campaign_init import Found
     from tactile_bayes.pipeline.campaign_report import Written
     from tactile_bayes.pipeline.campaign_settings import CampaignSettings
     from tactile_bayes.pipeline.campaign_stages import CampaignState
 
 _FILE = FilePath()
 _MOST_NAMED = 5
+_LOG_EVERY_S = 60.0
+"""Where stderr is no terminal, progress is a line so often."""
 
 
 @click.group("campaign")
@@ -33,35 +36,76 @@ def command() -> None:
 @command.command("init")
 @click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
 @click.option("-o", "--output", required=True, metavar="EXAMS.csv", type=_FILE, help="Where to write the table.")
+@click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
 @FORCE
-def init(folder: Path | str, output: Path, force: bool) -> None:
+def init(folder: Path | str, output: Path, add: bool, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry.
 
-    FOLDER may be one in an object store, as s3://bucket/scans.
+    FOLDER may be one in an object store, as s3://bucket/scans; the maps in it are passed over.
 
     Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
     are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
-    fills stay blank.
+    fills stay blank. Copies, and maps of scans that are listed, are left out and named.
 
     Example: tactile-bayes campaign init scans -o exams.csv
     """
     from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.manifest_csv import write_manifest
+    from tactile_bayes.files.manifest_csv import add_rows, read_rows, write_manifest
     from tactile_bayes.pipeline.campaign_init import find_exams
 
-    refuse_existing(output, force=force)
-    found = find_exams(folder, output)
+    if add and force:
+        raise UsageError("--add keeps the rows of a table, --force writes it anew; give one of them")
+    before = read_rows(output) if add and output.exists() else None
+    if output.exists() and not (add or force):
+        raise UsageError(f"{output} exists; --add keeps its rows and adds other files, --force writes it anew")
+    refuse_existing(output, force=force or add)
+    found = find_exams(folder, output, listed=before.rows if before else ())
     for line in found.skipped:
         click.echo(f"left out: {line}", err=True)
-    if not found.rows:
-        raise BadDataError("holds no scan (.mcap, .npz)", way_out="give the folder of the scans", path=str(folder))
-    write_manifest(output, found.rows, force=force)
-    patients = {row["patient"] for row in found.rows} - {""}
-    nameless = sum(not row["patient"] for row in found.rows)
-    click.echo(f"{output}: {len(found.rows)} exams of {len(patients)} patients")
+    if before is None:
+        if not found.rows:
+            raise BadDataError(
+                "holds no scan (.mcap, .npz) and no map (.nc)", way_out="give the folder of the scans", path=str(folder)
+            )
+        write_manifest(output, found.rows, force=force)
+    elif found.rows:
+        add_rows(before, found.rows)
+    _say_found(found, output, before.rows if before else None)
+
+
+def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] | None) -> None:
+    """What the table holds now, what is to be looked at, and the next command."""
+    import shlex
+
+    rows = [*(before or ()), *found.rows]
+    patients = {row["patient"].casefold() for row in rows} - {""}
+    added = "" if before is None else f" ({len(found.rows)} added, {len(before)} kept)"
+    click.echo(f"{output}: {len(rows)} exams of {len(patients)} patients{added}")
+    for line in found.spelled:
+        click.echo(line)
+    _say_names("listed, and not there any more", found.gone)
+    if found.others:
+        kinds = ", ".join(sorted(found.others))
+        click.echo(f"passed over: {sum(found.others.values())} other files ({kinds})")
+    nameless = sum(not row["patient"] for row in rows)
     if nameless:
         click.echo(f"{nameless} of them do not say whose they are: fill in the column patient")
+    elif told := _to_correct(output):
+        click.echo(f"to correct before the run: {told}")
+    folder = shlex.quote(str(output.with_name("out")))
+    click.echo(f"next: tactile-bayes campaign run {shlex.quote(str(output))} -o {folder} --dry-run")
     click.echo(RESEARCH_USE)
+
+
+def _to_correct(output: Path) -> str:
+    """Why `campaign run` would refuse the table; empty where it would take it."""
+    from tactile_bayes.files.manifest_csv import read_manifest
+
+    try:
+        read_manifest(output)
+    except BadDataError as error:
+        return str(error)
+    return ""
 
 
 @command.command("run")
@@ -69,6 +113,9 @@ def init(folder: Path | str, output: Path, force: bool) -> None:
 @click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
 @click.option(
     "--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision: adds the trial's report."
+)
+@click.option(
+    "--columns", metavar="MAP.toml", type=_FILE, help="Layout of a wide EX.csv: which column holds what, in which unit."
 )
 @click.option(
     "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis of the trial, as for `validate`."
@@ -105,6 +152,7 @@ def run(
     exams: Path,
     output: Path,
     excision: Path | None,
+    columns: Path | None,
     protocol: Path | None,
     method: str,
     size_calibration: str | None,
@@ -129,6 +177,8 @@ def run(
 
     Example: tactile-bayes campaign run exams.csv --excision excision.csv -o out
     """
+    from functools import partial
+
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.settings_file import repeatability_in, settings_of
     from tactile_bayes.executors import open_executor
@@ -137,7 +187,7 @@ def run(
     from tactile_bayes.files.shipped import NONE
     from tactile_bayes.pipeline.campaign import Campaign
     from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
-    from tactile_bayes.pipeline.campaign_report import WRITTEN, check_inputs, copy_outputs, write_outputs
+    from tactile_bayes.pipeline.campaign_report import WRITTEN, Excision, check_inputs, copy_outputs, write_outputs
     from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
@@ -157,19 +207,23 @@ def run(
     _check_paths(table, output, of_all)
     refuse_same(
         [output / name for name in WRITTEN],
-        [path for path in (exams, excision, protocol, settings_file, given) if path],
+        [path for path in (exams, excision, columns, protocol, settings_file, given) if path],
     )
-    check_inputs(table, excision, protocol)
+    if columns is not None and excision is None:
+        raise UsageError("--columns is the layout of the excision table; give --excision too")
+    measured = None if excision is None else Excision(excision, columns)
+    check_inputs(table, measured, protocol)
     with (
         open_campaign(output, dry=dry_run) as store,
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=progress_bar)
+        bar = partial(progress_bar, log_every_s=_LOG_EVERY_S)
+        campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=bar)
         campaign.run()
         if not dry_run:
             left = tidy(place, table, campaign.found.results, unread=campaign.unread)
-            written = write_outputs(campaign, excision, protocol)
+            written = write_outputs(campaign, measured, protocol)
             if of_all.copy_to:
                 copy_outputs(place, of_all.copy_to)
     if dry_run:
@@ -200,13 +254,19 @@ def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings
 def _say_plan(campaign: Campaign, workers: int, *, on_cluster: bool) -> None:
     found = campaign.found
     for step, todo in found.todo.items():
-        click.echo(f"{step}: {todo} to do, {found.kept[step]} done")
+        named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
+        click.echo(f"{step}: {todo} to do{named}, {found.kept[step]} done")
     for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"{name}: {fault.step} failed: {fault.reason}")
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"{len(found.faults) - _MOST_NAMED} more failed")
     click.echo(_time_words(found, workers, on_cluster=on_cluster))
     click.echo("Nothing was run.")
+
+
+def _few(found: CampaignState, step: str) -> bool:
+    """Whether all exams or masses that need a step are known by name, and fit a line."""
+    return 0 < found.todo[step] == len(found.names[step])
 
 
 def _time_words(found: CampaignState, workers: int, *, on_cluster: bool) -> str:
@@ -236,12 +296,17 @@ def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence
     counts = counts_words(written.sized, written.unsized, written.failed)
     click.echo(f"{output}: {len(campaign.exams)} exams: {counts}")
     if written.pooled:
-        click.echo(f"{written.pooled} masses pooled")
+        click.echo(f"{written.pooled} masses pooled, each at one visit")
     elif campaign.not_pooled:
         click.echo(f"no mass pooled: {campaign.not_pooled}")
     if line := repeatability_words(campaign):
         click.echo(line)
     click.echo(f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs")
+    if any(found.kept.values()):
+        for step, todo in found.todo.items():
+            more = "" if _few(found, step) else f" and {todo - len(found.names[step])} more"
+            if todo:
+                click.echo(f"{step} run: {', '.join(found.names[step])}{more}")
     for name, fault in list(found.faults.items())[:_MOST_NAMED]:
         click.echo(f"failed: {name}: {fault.step}: {fault.reason}", err=True)
     if len(found.faults) > _MOST_NAMED:

@@ -1,9 +1,10 @@
-"""Progress bar on stderr, drawn only on a terminal and only for work that takes a while."""
+"""Progress on stderr: a bar on a terminal for work that takes a while, lines in a log where a command asks for them."""
 
 from __future__ import annotations
 
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
@@ -20,7 +21,11 @@ _WIDTH = 30
 
 @contextmanager
 def progress_bar(
-    label: str, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+    label: str,
+    *,
+    stream: TextIO | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    log_every_s: float | None = None,
 ) -> Iterator[Progress]:
     """Give a ``progress(done, total)`` callback; the bar is erased when the block ends.
 
@@ -32,10 +37,12 @@ def progress_bar(
         Where to draw; stderr by default, so that output can be piped.
     clock
         Seconds from anywhere.
+    log_every_s
+        Where the stream is no terminal: a line so often, from then on. Default: none.
     """
     out = raw_stream(sys.stderr) if stream is None else stream
     if not out.isatty():
-        yield untold
+        yield untold if log_every_s is None else _Log(label, out, clock, log_every_s).update
         return
     bar = _Bar(label, out, clock)
     try:
@@ -44,41 +51,75 @@ def progress_bar(
         bar.erase()
 
 
-class _Bar:
-    """A line that is redrawn."""
+class _Teller(ABC):
+    """What is told of work, and how often.
 
-    def __init__(self, label: str, out: TextIO, clock: Callable[[], float]) -> None:
-        self._label = label
-        self._out = out
-        self._clock = clock
+    Parameters
+    ----------
+    quiet_s, every_s
+        Until the first is told, and from one to the next.
+    """
+
+    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], *, quiet_s: float, every_s: float) -> None:
+        self._label, self._out, self._clock, self._every_s = label, out, clock, every_s
         self._begun = clock()
-        self._next = self._begun + QUIET_S
-        self._drawn = 0
+        self._next = self._begun + quiet_s
         self._first: int | None = None  # what a resumed run had before it began
 
     def update(self, done: int, total: int, *, left_s: float | None = None) -> None:
-        """Redraw the bar at `done` of `total`, at most every so often; `left_s` stands in for what it would reckon."""
+        """Tell `done` of `total`, at most every so often; `left_s` stands in for what it would reckon."""
         now = self._clock()
         self._first = done if self._first is None else self._first
         if now < self._next or total <= 0:
             return
-        self._next = now + REDRAW_S
-        filled = _WIDTH * done // total
-        left = self._left(now, done, total, left_s)
-        line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{left}"
-        self._out.write("\r" + line.ljust(self._drawn))
+        self._next = now + self._every_s
+        self._tell(done, total, self._left(now, done, total, left_s))
         self._out.flush()
-        self._drawn = len(line)
+
+    @abstractmethod
+    def _tell(self, done: int, total: int, left: str) -> None:
+        """Write what is done of how much, and the time left where it is known, which begins with a blank."""
 
     def _left(self, now: float, done: int, total: int, left_s: float | None) -> str:
         new = done - (self._first or 0)
         if new <= 0 or done >= total:
             return ""
         seconds = round((now - self._begun) * (total - done) / new if left_s is None else left_s)
-        return f" {seconds // 60}:{seconds % 60:02d} left"
+        return f" {duration(seconds)} left"
+
+
+class _Log(_Teller):
+    """Lines in a file or a pipe, for work of hours."""
+
+    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], every_s: float) -> None:
+        super().__init__(label, out, clock, quiet_s=every_s, every_s=every_s)
+
+    def _tell(self, done: int, total: int, left: str) -> None:
+        self._out.write(f"{self._label}: {done} of {total} done{',' if left else ''}{left}\n")
+
+
+class _Bar(_Teller):
+    """A line that is redrawn."""
+
+    def __init__(self, label: str, out: TextIO, clock: Callable[[], float]) -> None:
+        super().__init__(label, out, clock, quiet_s=QUIET_S, every_s=REDRAW_S)
+        self._drawn = 0
+
+    def _tell(self, done: int, total: int, left: str) -> None:
+        filled = _WIDTH * done // total
+        line = f"{self._label} [{'#' * filled}{'-' * (_WIDTH - filled)}] {done}/{total}{left}"
+        self._out.write("\r" + line.ljust(self._drawn))
+        self._drawn = len(line)
 
     def erase(self) -> None:
         """Erase the line."""
         if self._drawn:
             self._out.write("\r" + " " * self._drawn + "\r")
             self._out.flush()
+
+
+def duration(seconds: int) -> str:
+    """Minutes and seconds, with hours where there are any: 4:07, 2:42:05."""
+    hours, rest = divmod(seconds, 3600)
+    short = f"{rest // 60:02d}:{rest % 60:02d}"
+    return f"{hours}:{short}" if hours else short.removeprefix("0")

@@ -237,11 +237,13 @@ def _spread(part: FatTerms) -> dict[str, float]:
 
 def _table(path: Path, head: bytes) -> dict[str, Any]:
     """Describe a CSV table whose header fits one of the schemas."""
+    from tactile_bayes.files.csv_cells import separator_in
     from tactile_bayes.files.schema import load_schema
     from tactile_bayes.files.tables import read_table
 
     try:
-        header = next(csv.reader(io.StringIO(head.decode("utf-8-sig"))), [])
+        text = head.decode("utf-8-sig")
+        header = next(csv.reader(io.StringIO(text), delimiter=separator_in(text)), [])
     except (UnicodeDecodeError, csv.Error):
         raise _foreign(path) from None
     for name in _TABLES:

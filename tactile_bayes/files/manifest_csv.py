@@ -10,13 +10,14 @@ from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.campaign_names import exam_name, mass_name
+from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
 from tactile_bayes.files.remote import check_address, is_address
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.shipped import NONE, SHIPPED
-from tactile_bayes.files.tables import Table, read_table
+from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
 from tactile_bayes.records import dataclass
 
 SCHEMA: Final = "exams.table.json"
@@ -185,7 +186,37 @@ def _check_masses(table: Table, exams: Sequence[Exam]) -> None:
 
 def write_manifest(path: Path, rows: Iterable[Mapping[str, object]], *, force: bool = False) -> None:
     """Write a table of exams; keys of the rows are columns, those that no row has are left out."""
-    write_text(path, table_text(list(rows), _columns()), force=force)
+    held = list(rows)
+    filled = [name for name in _columns() if any(row.get(name) is not None for row in held)]
+    write_text(path, table_text(held, filled or _columns()), force=force)
+
+
+def read_rows(path: Path) -> RawTable:
+    """Read the rows of a table as they stand, cells that are still blank included.
+
+    Raises
+    ------
+    BadDataError
+        When it is no CSV table, or lacks one of the columns that every table of exams has.
+    """
+    table = read_raw(path)
+    for name in ("file", "patient", "visit", "mass", "replicate"):
+        if name not in table.header:
+            raise BadDataError(f"line 1, column {name}: is missing", way_out="add it", path=str(path))
+    return table
+
+
+def add_rows(table: RawTable, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write a table again with rows after those that it has, whose cells stay; its separator and columns stay too."""
+    more = [name for name in _columns() if name not in table.header and any(row.get(name) for row in rows)]
+    header = [*table.header, *more]
+    out = io.StringIO(newline="")
+    writer = csv.writer(out, delimiter=table.separator, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows([row.get(name, "") for name in header] for row in table.rows)
+    writer.writerows([_cell(row.get(name)) for name in header] for row in rows)
+    mark = "\ufeff" if read_bytes(table.path, most=TABLE_BYTES).startswith(b"\xef\xbb\xbf") else ""
+    write_text(table.path, mark + out.getvalue(), force=True)
 
 
 def _columns() -> list[str]:
@@ -193,12 +224,11 @@ def _columns() -> list[str]:
 
 
 def table_text(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> str:
-    """CSV text of rows; columns that no row fills are left out, None is a blank cell, numbers keep every digit."""
-    filled = [name for name in columns if any(row.get(name) is not None for row in rows)] or list(columns)
+    """CSV text of rows; None is a blank cell, numbers keep every digit."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(filled)
-    writer.writerows([_cell(row.get(name)) for name in filled] for row in rows)
+    writer.writerow(columns)
+    writer.writerows([_cell(row.get(name)) for name in columns] for row in rows)
     return out.getvalue()
 
 

@@ -2,14 +2,13 @@
 
 Nothing is guessed or repaired. Each fault is one `BadDataError` naming the file, the line, the column, the value
 and what to do. Two properties of a field go beyond the Table Schema standard: ``"column": "required"`` (the column
-must be there although its cells may be blank) and ``ifZero`` (what to ask when a cell that must exceed 0 holds 0).
+must be there although its cells may be blank) and ``ifZero`` (what to ask when a cell that must exceed 0 holds 0). One
+of a schema does: ``wide`` (how tables with other columns are read).
 """
 
 from __future__ import annotations
 
-import csv
 import difflib
-import io
 import math
 import operator
 import re
@@ -19,25 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.kinds import ZIP_MAGIC
-from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
+from tactile_bayes.files.csv_cells import DECIMAL_COMMA, cells_of, may_be_thousands, read_text
 from tactile_bayes.files.schema import load_schema
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
-_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+")
 _NOT_FINITE = {"nan", "inf", "infinity"}
 _TO_MM = {"cm": "10", "m": "1000", "in": "25.4", "inch": "25.4", "um": "0.001"}
-_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
-_AS_UTF8 = "save it as CSV UTF-8"
-_EXPORT = "export the sheet as CSV UTF-8, comma-separated"
-# First bytes of files that are no UTF-8 text, what they are, and the way out.
-_NOT_TEXT = (
-    (_BYTE_ORDER_MARKS, "is UTF-16 text", _AS_UTF8),
-    ((ZIP_MAGIC,), "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
-    ((b"\xd0\xcf\x11\xe0",), "is an old Office file (xls), not CSV", _EXPORT),
-    ((b"\x1f\x8b",), "is compressed with gzip", "decompress it first"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,18 +78,18 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
 
     Notes
     -----
-    The file is UTF-8, with or without a byte order mark, with commas between cells and points in numbers. Blank
-    lines are skipped, and so are rows without a filled cell, which spreadsheets write.
+    The file is UTF-8, with or without a byte order mark. Between the cells are commas, semicolons or tabs, and with the
+    last two a number may have a decimal comma. Blank lines are skipped, and so are rows without a filled cell and
+    columns without a name or a filled cell, which spreadsheets write.
     """
     schema = load_schema(schema_name)
     fields = {field["name"]: field for field in schema["fields"]}
-    path, text = (source.name, source.text) if isinstance(source, Sheet) else (source, _decode(source))
-    _check_separator(path, text)
-    rows = _split(path, text)
-    if not rows:
+    path, text = (source.name, source.text) if isinstance(source, Sheet) else (source, read_text(source))
+    cells_in = cells_of(path, text)
+    header, body = cells_in.header, cells_in.body
+    if not header:
         raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}", path=str(path))
-    (_, header), *body = rows
-    _check_header(path, header, fields)
+    _check_header(path, header, fields, wide=schema.get("wide", ""))
     if not body:
         raise BadDataError("holds a header and no rows", way_out="add at least one row", path=str(path))
     columns: dict[str, list[Any]] = {name: [] for name in fields}
@@ -110,32 +97,61 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
         _check_length(path, line, cells, header)
         row = dict(zip(header, cells, strict=True))
         for name, field in fields.items():
-            columns[name].append(_parse_cell(path, line, row.get(name, ""), field=field))
+            cell = row.get(name, "")
+            columns[name].append(_parse_cell(path, line, cell, field=field, decimal_comma=cells_in.decimal_comma))
     table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
     _check_primary_key(table, schema.get("primaryKey", []))
     return table
 
 
-def read_raw(path: Path) -> tuple[list[int], list[dict[str, str]]]:
-    """Read the cells of any CSV table as text, under its header, with the line number of each row."""
-    rows = _split(path, _decode(path))
-    if len(rows) < 2:
+@dataclass(frozen=True, slots=True)
+class RawTable:
+    """A CSV table under no schema.
+
+    Parameters
+    ----------
+    path
+        Where it was read.
+    header
+        Names of its columns.
+    line_numbers
+        The line at which each row begins.
+    rows
+        Cells as text, without blanks around them, by their columns.
+    decimal_comma
+        Whether its numbers are written as 12,5.
+    separator
+        Between its cells.
+    """
+
+    path: Path
+    header: list[str]
+    line_numbers: list[int]
+    rows: list[dict[str, str]]
+    decimal_comma: bool = False
+    separator: str = ","
+
+    def number(self, line: int, column: str, text: str) -> float:
+        """Parse a finite number; an error names its cell."""
+        try:
+            return _parse_number(_with_point(text) if self.decimal_comma else text, {"name": column})
+        except _CellError as refusal:
+            raise _fault(self.path, line, column, refusal.what, way_out=refusal.way_out) from None
+
+
+def read_raw(path: Path) -> RawTable:
+    """Read the cells of any CSV table as text; for the errors see `read_table`."""
+    cells = cells_of(path, read_text(path))
+    header, body = cells.header, cells.body
+    if not body:
         raise BadDataError("holds no rows", way_out="give a header and at least one row", path=str(path))
-    (_, header), *body = rows
     for name in header:
         if header.count(name) > 1:
             raise _fault(path, 1, name, "appears more than once", way_out="keep one of them")
-    for line, cells in body:
-        _check_length(path, line, cells, header)
-    return [line for line, _ in body], [dict(zip(header, (c.strip() for c in cells), strict=True)) for _, cells in body]
-
-
-def parse_number(path: Path, line: int, column: str, text: str) -> float:
-    """Parse a finite number; an error names its cell."""
-    try:
-        return _parse_number(text, {"name": column})
-    except _CellError as refusal:
-        raise _fault(path, line, column, refusal.what, way_out=refusal.way_out) from None
+    for line, row in body:
+        _check_length(path, line, row, header)
+    rows = [dict(zip(header, (cell.strip() for cell in row), strict=True)) for _, row in body]
+    return RawTable(path, header, [line for line, _ in body], rows, cells.decimal_comma, cells.separator)
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
@@ -164,48 +180,11 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
                 )
 
 
-def _decode(path: Path) -> str:
-    data = read_bytes(path, most=TABLE_BYTES)
-    for marks, what, way_out in _NOT_TEXT:
-        if data.startswith(marks):
-            raise BadDataError(what, way_out=way_out, path=str(path))
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        what = f"line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text"
-        raise BadDataError(what, way_out=_AS_UTF8, path=str(path)) from None
-
-
-def _split(path: Path, text: str) -> list[tuple[int, list[str]]]:
-    """Rows that are not blank, each with its first line number."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    rows: list[tuple[int, list[str]]] = []
-    before = 0
-    try:
-        for cells in reader:
-            if any(cells):
-                rows.append((before + 1, cells))
-            before = reader.line_num
-    except csv.Error as error:
-        way_out = "check the quotes and line ends around it"
-        raise BadDataError(f"line {before + 1}: not CSV ({error})", way_out=way_out, path=str(path)) from None
-    return rows
-
-
-def _check_separator(path: Path, text: str) -> None:
-    """Refuse other separators than commas by the first line, before quotes between them are taken for faults."""
-    first = text.lstrip("\r\n").partition("\n")[0]
-    for separator, word in ((";", "semicolons"), ("\t", "tabs")):
-        if separator in first and "," not in first:
-            way_out = "save it with commas between cells and points in numbers"
-            raise BadDataError(f"line 1: the cells are separated by {word}", way_out=way_out, path=str(path))
-
-
-def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any]) -> None:
+def _check_header(path: Path, header: Sequence[str], fields: Mapping[str, Any], *, wide: str) -> None:
     for name in header:
         if name not in fields:
             advice = _other_table(header, fields) or _advice_on_column(name, header, fields)
+            advice += f", or {wide}" if wide else ""
             raise _fault(path, 1, name, "is not known here", way_out=advice)
         if header.count(name) > 1:
             raise _fault(path, 1, name, "appears more than once", way_out="keep one of them")
@@ -246,7 +225,7 @@ def _check_length(path: Path, line: int, cells: Sequence[str], header: Sequence[
     raise BadDataError(what, way_out=way_out, path=str(path))
 
 
-def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any]) -> Any:
+def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any], decimal_comma: bool) -> Any:
     """Parse a cell by the schema's type; None where it is blank and may be."""
     name = field["name"]
     if text == "":
@@ -256,6 +235,8 @@ def _parse_cell(path: Path, line: int, text: str, *, field: Mapping[str, Any]) -
     try:
         if text != text.strip() or not text.isprintable():
             raise _CellError(f"{_shown(text)} has blanks or unprintable characters around or in it", "remove them")
+        if decimal_comma and field["type"] == "number":
+            text = _with_point(text)
         value = _PARSERS[field["type"]](text, field)
         _check_constraints(value, text, field)
     except _CellError as refusal:
@@ -284,17 +265,25 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
             return value
     if text.lstrip("+-").lower() in _NOT_FINITE or _NUMBER.fullmatch(text):
         raise _CellError(f"{_shown(text)} is not a finite number", _blank_advice(field))
-    if _DECIMAL_COMMA.fullmatch(text):
+    if DECIMAL_COMMA.fullmatch(text):
         raise _CellError(*_comma_fault(text))
     unit = " in mm" if field["name"].endswith("_mm") else ""
     raise _CellError(f"{_shown(text)} is not a number", f"write digits only{unit}; {_blank_advice(field)}")
+
+
+def _with_point(text: str) -> str:
+    """A number of a table with decimal commas, with a point; one that has a point may mean thousands by it."""
+    if "." in text:
+        what = f"{_shown(text)} has a point, and other numbers have decimal commas"
+        raise _CellError(what, "write all numbers one way")
+    return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
 
 
 def _comma_fault(text: str) -> tuple[str, str]:
     """Explain a comma in a number: three digits after it may be thousands, otherwise it is a decimal comma."""
     whole, _, rest = text.partition(",")
     decimal = f"{whole}.{rest}"
-    if len(rest) != 3 or whole.lstrip("+-").startswith("0"):
+    if not may_be_thousands(text):
         return f"{_shown(text)} has a decimal comma", f"write {decimal}"
     return (
         f"{_shown(text)} has a comma that may separate thousands or decimals",

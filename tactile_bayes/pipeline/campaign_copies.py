@@ -7,7 +7,8 @@ from pathlib import Path
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.campaign_keys import digest_of
-from tactile_bayes.pipeline.campaign_steps import UNWRITTEN, Result, Task, Writes
+from tactile_bayes.pipeline.campaign_staging import Writes
+from tactile_bayes.pipeline.campaign_steps import UNWRITTEN, Result, Task
 
 
 def copy_tasks(folder: Path, names: Sequence[str], results: Sequence[Mapping[str, Result]], *, to: str) -> list[Task]:

@@ -14,6 +14,7 @@ from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.campaign_names import EXAMS, JOURNAL, MASSES
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.campaign_keys import stamp
+from tactile_bayes.pipeline.campaign_staging import STAGED, clear_staged, put_in_place
 from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
 
 _HEADER: Final = {"campaign": 1}
@@ -50,10 +51,16 @@ def _make(folder: Path) -> None:
 
 
 def _taken(result: Result) -> Result:
-    """Stop the campaign where the disk did not take a result; others go into the journal."""
-    if UNWRITTEN in result:
-        raise UsageError(f"{result[UNWRITTEN]}; what is done is kept: run again to go on")
-    return result
+    """Put a result's files in place for the journal; the campaign stops where the disk does not take them."""
+    fault = result.get(UNWRITTEN)
+    if fault is None:
+        try:
+            return put_in_place(result)
+        except FileNotFoundError:
+            fault = f"a worker's files are not in {result[STAGED]['folder']}: do all machines see this folder?"
+        except OSError as error:
+            fault = str(error)
+    raise UsageError(f"{fault}; what is done is kept: run again to go on")
 
 
 def unchanged(folder: Path, result: Result) -> bool:
@@ -137,6 +144,7 @@ def _names_in(folder: Path) -> list[str]:
 def _clear(place: Path, *, known: Collection[str], made: Collection[str]) -> None:
     """Remove the files of a folder that a step makes and this run did not, and the folder when none is left."""
     names = _names_in(place)
+    clear_staged(place, names)
     for name in names:
         if name in known and name not in made:
             (place / name).unlink(missing_ok=True)

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.campaign_names import ESTIMATE, MAP, REPEATABILITY, SHAPE, SIZED, SIZED_FIGURE
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.pipeline.campaign_steps import Result, Task, Writes
+from tactile_bayes.pipeline.campaign_staging import Writes
+from tactile_bayes.pipeline.campaign_steps import Result, Task
 from tactile_bayes.pipeline.repeatability import ExamFolder, learn_from_exams, repeatability_setting
 
 if TYPE_CHECKING:

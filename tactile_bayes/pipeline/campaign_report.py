@@ -30,6 +30,7 @@ from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.manifest_csv import Exam
+    from tactile_bayes.files.tables import Table
     from tactile_bayes.pipeline.trial import TrialSettings
     from tactile_bayes.report.campaign_html import Card
 
@@ -41,6 +42,33 @@ _MOST_INLINE: Final = 300
 _MOST_CARDS: Final = 10_000
 """More exams than a browser shows at ease."""
 _LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
+
+
+@dataclass(frozen=True, slots=True)
+class Excision:
+    """Where the sizes after excision are.
+
+    Parameters
+    ----------
+    path
+        Of the table.
+    columns
+        The mapping of a wide table; None for a tidy one.
+    """
+
+    path: Path
+    columns: Path | None = None
+
+    def table(self) -> Table:
+        """Read and check the table."""
+        from tactile_bayes.pipeline.trial_inputs import read_excision
+
+        return read_excision(self.path, self.columns)
+
+    def masses(self) -> set[tuple[str, str]]:
+        """Patient and mass of each row."""
+        columns = self.table().columns
+        return set(zip(columns["patient"], columns["mass"], strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +101,7 @@ class Written:
     unnamed: tuple[str, ...] = ()
 
 
-def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | None = None) -> Written:
+def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
     """Write tables, contact sheet and, where excision sizes are given, the trial's report.
 
     Raises
@@ -86,7 +114,7 @@ def write_outputs(campaign: Campaign, excision: Path | None, protocol: Path | No
     from tactile_bayes.files.atomic import write_text
 
     rows = exam_rows(campaign)
-    masses = None if excision is None else excised(excision)
+    masses = None if excision is None else excision.masses()
     write_tables(campaign, rows, masses, campaign.folder)
     counts = _counts(rows)
     report, fault = "", ""
@@ -121,7 +149,7 @@ def copy_outputs(folder: Path, address: str) -> None:
             put(folder / name, f"{address}/{name}")
 
 
-def check_inputs(exams: Iterable[Exam], excision: Path | None, protocol: Path | None) -> None:
+def check_inputs(exams: Iterable[Exam], excision: Excision | None, protocol: Path | None) -> None:
     """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
 
     Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there.
@@ -141,11 +169,9 @@ def check_inputs(exams: Iterable[Exam], excision: Path | None, protocol: Path | 
         _trial_settings(protocol)
 
 
-def _check_spelling(excision: Path, exams: Iterable[Exam]) -> None:
+def _check_spelling(excision: Excision, exams: Iterable[Exam]) -> None:
     """Refuse a row that is of a mass of the exams but for capitals: the mass would be left out of the trial."""
-    from tactile_bayes.files.tables import read_table
-
-    table = read_table(excision, "excision.table.json")
+    table = excision.table()
     known = {(exam.patient.casefold(), exam.mass.casefold()): exam for exam in exams}
     for row, (patient, mass) in enumerate(zip(table.columns["patient"], table.columns["mass"], strict=True)):
         exam = known.get((patient.casefold(), mass.casefold()))
@@ -170,21 +196,13 @@ def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
     return TrialSettings(**fixed), read.title
 
 
-def excised(excision: Path) -> set[tuple[str, str]]:
-    """Patient and mass of each row of a table of excision sizes."""
-    from tactile_bayes.files.tables import read_table
-
-    columns = read_table(excision, "excision.table.json").columns
-    return set(zip(columns["patient"], columns["mass"], strict=True))
-
-
 def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:
     sized = sum(row.size is not None for row in rows)
     failed = sum(row.document is None for row in rows)
     return sized, len(rows) - sized - failed, failed
 
 
-def _write_report(folder: Path, excision: Path, protocol: Path | None) -> tuple[str, str]:
+def _write_report(folder: Path, excision: Excision, protocol: Path | None) -> tuple[str, str]:
     """Write what `validate` writes for the trial table; returns its text, or why there is none."""
     from tactile_bayes.files.atomic import write_text
     from tactile_bayes.files.schema import check_document, dump_json
@@ -195,7 +213,7 @@ def _write_report(folder: Path, excision: Path, protocol: Path | None) -> tuple[
 
     settings, title = _trial_settings(protocol)
     try:
-        inputs = load_trial(folder / TRIAL, excision, None)
+        inputs = load_trial(folder / TRIAL, excision.path, excision.columns, tidy_trial=True)
         outcome = analyse(inputs, settings, protocol=protocol, title=title)
     except BadDataError as error:
         return "", error.what
@@ -214,7 +232,8 @@ def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int],
     if len(cards) <= _MOST_INLINE:
         cards = [_self_contained(card, campaign.folder) for card in cards]
     masses = len(campaign.found.results["pool"])
-    lines = [f"{len(rows)} exams: {counts_words(*counts)}."] + ([f"{masses} masses pooled."] if masses else [])
+    lines = [f"{len(rows)} exams: {counts_words(*counts)}."]
+    lines += [f"{masses} masses pooled, each at one visit."] if masses else []
     if len(cards) < len(rows):
         lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
     lines += [repeatability_words(campaign)] if campaign.repeatability else []

@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import field
+from typing import Final
 
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
@@ -16,6 +17,9 @@ from tactile_bayes.pipeline.campaign_steps import FILES, Result, Task, run_step
 from tactile_bayes.pipeline.campaign_time import Pace, mean_seconds
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.records import dataclass
+
+FEW: Final = 5
+"""So many exams are named in a line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,8 @@ class CampaignState:
         By the name of the exam or mass.
     kept, todo
         Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do.
+    names
+        By step, the first few exams or masses of `todo`.
     seconds
         Mean time that one of each step took so far.
     """
@@ -46,6 +52,7 @@ class CampaignState:
     faults: dict[str, Fault] = field(default_factory=dict)
     kept: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     todo: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    names: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     seconds: dict[str, float] = field(default_factory=dict)
 
     def of(self, step: str, name: str) -> Result | None:
@@ -109,6 +116,7 @@ class Stages:
         missing = [task for task in tasks if task.key not in done]
         self.found.kept[step] += len(kept)
         self.found.todo[step] += len(missing) + (without if self._dry else 0)
+        self.found.names[step] += [task.name for task in missing[: FEW - len(self.found.names[step])]]
         self.needed[step] -= len(kept) + without
         if self._dry:
             return

@@ -28,8 +28,8 @@ from tactile_bayes.files.campaign_names import (
     SIZED_FIGURE,
     THUMBNAIL,
 )
-from tactile_bayes.pipeline.campaign_keys import stamp
 from tactile_bayes.pipeline.campaign_match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
+from tactile_bayes.pipeline.campaign_staging import Writes, write_staged
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.records import dataclass
@@ -120,7 +120,9 @@ class Task:
 
 
 def run_step(task: Task) -> Result:
-    """Run a step; returns digests and stamps of its files by name, the seconds it took and what else it found.
+    """Run a step; returns digests of its files by name, where they wait, the seconds it took and what else it found.
+
+    `put_in_place` brings the files to their place: a worker that outlives its command must not.
 
     Raises
     ------
@@ -135,28 +137,11 @@ def run_step(task: Task) -> Result:
     if UNWRITTEN in found:
         return found
     try:
-        task.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for name, write in writes.items():
-            write(task.folder / name)
-        for name in FILES[task.step]:
-            if name not in writes:  # of an earlier run
-                (task.folder / name).unlink(missing_ok=True)
+        made = write_staged(task.folder, writes, step=task.step, digest=task.digest, names=FILES[task.step])
     except (UsageError, OSError) as error:
         return {UNWRITTEN: str(error)}
-    files, stamps = _digests(task.folder, [*writes])
     spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.thread_time() - begun_cpu}
-    return {"files": files, "stamps": stamps, **{name: round(one, 3) for name, one in spent.items()}, **found}
-
-
-Writes = dict[str, Callable[[Path], object]]
-
-
-def _digests(folder: Path, names: list[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Digests and stamps of files; each stamp is taken before the digest, so that a later change shows."""
-    from tactile_bayes.files.atomic import sha256
-
-    stamps = {name: stamp(folder / name) for name in names}
-    return {name: sha256(folder / name) for name in names}, stamps
+    return {**made, **{name: round(one, 3) for name, one in spent.items()}, **found}
 
 
 def _map(task: Task) -> tuple[Result, Writes]:

@@ -11,6 +11,7 @@ from typing import Any, Final
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, MASSES, POOLED, SIZED, TRIAL
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.manifest_csv import Exam, table_text
+from tactile_bayes.files.schema import load_schema
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_match import unnamed
 from tactile_bayes.records import dataclass
@@ -20,12 +21,6 @@ _TRIAL_COLUMNS: Final = (
     "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",
     "reader", "visit", "reason", "synthetic",
 )  # fmt: skip
-_DONE_COLUMNS: Final = (
-    "patient", "visit", "mass", "replicate", "side", "reader", "file", "folder", "scan_sha256", "status", "reason",
-    "size_mm", "sd_mm", "low_mm", "high_mm", "probability", "smallest_mm", "detected_probability", "centre_x_mm",
-    "centre_y_mm", "cautions", "checks", "synthetic",
-)  # fmt: skip
-_FAILURE_COLUMNS: Final = ("patient", "visit", "mass", "replicate", "file", "step", "reason")
 _OF_ESTIMATE: Final = (
     "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "side_caution",
 )  # fmt: skip
@@ -153,7 +148,11 @@ def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
 
 def done_text(rows: Sequence[Row]) -> str:
     """``exams_done.csv``: exams with an estimate, or with the reason for none."""
-    return table_text([_done(row) for row in rows if row.document is not None], _DONE_COLUMNS)
+    return table_text([_done(row) for row in rows if row.document is not None], _columns("exams_done"))
+
+
+def _columns(table: str) -> list[str]:
+    return [one["name"] for one in load_schema(f"{table}.table.json")["fields"]]
 
 
 def _done(row: Row) -> dict[str, object]:
@@ -198,7 +197,7 @@ def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
     lines = [
         failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
     ]
-    return table_text(lines, _FAILURE_COLUMNS)
+    return table_text(lines, _columns("failures"))
 
 
 def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None) -> str:
@@ -214,12 +213,16 @@ def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple
     readings = [_reading(row.exam, TACTILE, count, row.document, reason=row.reason, of=row) for row in taken]
     count = {}
     visits = {row.exam.of_mass: row for row in taken}
+    simulated: dict[str, bool] = {}
+    for row in taken:  # a failed exam does not say
+        if row.synthetic is not None:
+            simulated[row.exam.of_mass] = row.synthetic or simulated.get(row.exam.of_mass, False)
     pooled = pooled_documents(campaign)
     for name, row in visits.items() if campaign.found.results["pool"] else ():
         document = pooled.get(name)
         reason = _unpooled(campaign, name) if document is None else str(document["reason"])
         readings.append(_reading(row.exam, POOLED_MODALITY, count, document, reason=reason))
-        readings[-1] |= {"synthetic": row.synthetic}
+        readings[-1] |= {"synthetic": simulated.get(name)}
     return table_text(readings, _TRIAL_COLUMNS)
 
 

@@ -102,9 +102,8 @@ def exams_in(folder: Path) -> list[ExamFolder]:
     table = folder / DONE
     if not table.is_file():
         raise BadDataError(f"holds no {DONE}", way_out="give a folder of `campaign run`", path=str(folder))
-    _, rows = read_raw(table)
     found = []
-    for row in rows:
+    for row in read_raw(table).rows:
         try:
             patient, visit, mass, replicate = (row[name] for name in ("patient", "visit", "mass", "replicate"))
         except KeyError as missing:

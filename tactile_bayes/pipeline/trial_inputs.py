@@ -22,20 +22,26 @@ class TrialInputs:
     files: dict[str, Path]
 
 
-def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None) -> TrialInputs:
-    """Read and check both tables; `columns` is the mapping file of a wide table."""
-    from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
+def load_trial(
+    trial: Path | Sheet, excision: Path | Sheet, columns: Path | None, *, tidy_trial: bool = False
+) -> TrialInputs:
+    """Read and check both tables.
+
+    Parameters
+    ----------
+    columns
+        The mapping file of a wide table; None where both are tidy. One without ``[[reading]]`` is for the excision
+        sizes alone.
+    tidy_trial
+        Whether the trial is tidy whatever the mapping holds.
+    """
+    from tactile_bayes.files.column_map import read_mapping, read_wide
     from tactile_bayes.files.size_posterior import fill_from_posteriors
     from tactile_bayes.files.tables import Sheet, check_references, read_table
     from tactile_bayes.trial.readings import readings_from_columns
 
-    wide_excision = columns is not None and "excision" in read_mapping(columns)
-    sizes: Table = (
-        read_wide_excision(excision, columns)
-        if columns is not None and wide_excision and isinstance(excision, Path)
-        else read_table(excision, "excision.table.json")
-    )
-    if columns is None or isinstance(trial, Sheet):
+    sizes = read_excision(excision, columns)
+    if columns is None or tidy_trial or isinstance(trial, Sheet) or "reading" not in read_mapping(columns):
         table = read_table(trial, "trial.table.json")
     else:
         table = read_wide(trial, columns)
@@ -50,3 +56,13 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
         ex_vivo_sd_mm=dict(zip(keys, sizes.columns["sd_mm"], strict=True)),
         files=files | {f"posterior_{number}": path for number, path in enumerate(posteriors, start=1)},
     )
+
+
+def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
+    """Sizes after excision: from a wide table where the mapping has ``[excision]``, otherwise from a tidy one."""
+    from tactile_bayes.files.column_map import read_mapping, read_wide_excision
+    from tactile_bayes.files.tables import read_table
+
+    if columns is None or not isinstance(excision, Path) or "excision" not in read_mapping(columns):
+        return read_table(excision, "excision.table.json")
+    return read_wide_excision(excision, columns)

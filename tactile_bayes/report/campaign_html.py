@@ -32,6 +32,7 @@ content-visibility:auto;contain-intrinsic-size:auto 20rem}
 article.failed{border-top-color:#c33}article.without{border-top-color:#c8641e}article[hidden]{display:none}
 img{display:block;margin:.35rem 0;max-width:100%;image-rendering:pixelated}ul{margin:.25rem 0;padding-left:1.1rem}
 li,.why{font-size:.86rem;overflow-wrap:anywhere}.caution{color:var(--doubt)}.size{font-size:1.12rem;font-weight:600}
+@media print{form{display:none}}
 """
 _SCRIPT = """
 const form = document.querySelector("form"), cards = [...document.querySelectorAll("article")];
@@ -54,6 +55,11 @@ form.addEventListener("input", filter);
 form.addEventListener("submit", event => event.preventDefault());
 shown.textContent = cards.length + " of " + cards.length + " shown";
 """
+_LEGEND: Final = (
+    "Sizes: median of the largest diameter and, in brackets, its credible interval. Ring: the ellipse of the estimated "
+    "size. Colours of each map span its own values. Maps with landmarks are seen facing the patient, head up, the "
+    "patient's left on the right; others from outside, y up, x to the left; imported grids as their file reads."
+)
 _CLASSES: Final = {FAILED: "failed", UNSIZED: "without", SIZED: "sized"}
 
 
@@ -127,15 +133,15 @@ def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>{title}</title><style>{_STYLE}</style></head><body>",
         f"<h1>{title}</h1>",
+        f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
         *(f"<p>{html.escape(line)}</p>" for line in lines),
         f"<p>{_links(links)}</p>",
+        f'<p class="note">{html.escape(_LEGEND)}</p>',
         *_filters(cards),
         "<main>",
         *(part for card in cards for part in _card(card)),
         "</main>",
-        '<p class="note">Ring: the ellipse of the estimated size. Colours of each map span its own values. '
-        f"tactile-bayes {html.escape(version)}.</p>",
-        f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
+        f'<p class="note">tactile-bayes {html.escape(version)}. {html.escape(RESEARCH_USE)}</p>',
         f"<script>{_SCRIPT}</script></body></html>",
     ]
     return "\n".join(parts) + "\n"
@@ -148,7 +154,8 @@ def _filters(cards: Sequence[Card]) -> Iterator[str]:
     yield (
         '<form hidden><label>Find <input type="search" name="words" placeholder="patient, visit, reason..."></label>'
         f'<label>Show <select name="status"><option value="">all ({len(cards)})</option>{options}</select></label>'
-        '<label><input type="checkbox" name="flagged"> with cautions or checks</label><span id="shown"></span></form>'
+        '<label><input type="checkbox" name="flagged"> with cautions or checks</label>'
+        '<span id="shown" role="status"></span></form>'
     )
 
 
@@ -158,7 +165,7 @@ def _card(card: Card) -> Iterator[str]:
     yield f"<h2>{html.escape(card.name)}</h2>"
     yield f'<p class="note">{html.escape(", ".join(card.facts))}</p>'
     if card.thumbnail is not None:
-        yield f'<img loading="lazy" alt="Map of {html.escape(card.name)}" src="{_source(card.thumbnail)}">'
+        yield f'<img loading="lazy" alt="{html.escape(_alt(card))}" src="{_source(card.thumbnail)}">'
     yield _size(card)
     flags = [("caution", one) for one in card.cautions] + [("check", one) for one in card.checks]
     if flags:
@@ -166,6 +173,12 @@ def _card(card: Card) -> Iterator[str]:
     if card.links:
         yield f'<p class="note">{_links(card.links)}</p>'
     yield "</article>"
+
+
+def _alt(card: Card) -> str:
+    """What the picture shows, for those who do not see it."""
+    ring = "no lump ringed" if card.size is None else f"a ring around the lump of {card.size['median']:.1f} mm"
+    return f"Map of {card.name}, {ring}"
 
 
 def _source(thumbnail: bytes | str) -> str:

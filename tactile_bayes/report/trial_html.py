@@ -23,7 +23,9 @@ th,td{padding:.22rem .7rem .22rem 0;text-align:left;vertical-align:top;border-bo
 th{font-weight:600}td small{color:#5a5a5a;white-space:nowrap}img{max-width:100%;height:auto}
 .wide{overflow-x:auto}.note{color:#5a5a5a;font-size:.86rem}pre{font-size:.76rem;overflow-x:auto;background:#f6f6f4;padding:.8rem}
 .mark{background:#fff3d6;padding:.35rem .7rem;border-left:4px solid #c8641e}code{font-size:.8rem;overflow-wrap:anywhere}
-@media print{body{margin:0;max-width:none}h2{break-after:avoid}img,tr{break-inside:avoid}}
+@media print{body{margin:0;max-width:none;padding:0}h2{break-after:avoid}img,tr{break-inside:avoid}
+.wide{overflow:visible}table{font-size:7.5pt}th,td{padding-right:.3rem}td small{white-space:normal}
+pre{white-space:pre-wrap}}
 """
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
@@ -300,7 +302,7 @@ def _found(report: ModalityReport) -> str:
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{html.escape(one)}</th>" for one in heads)
     body = "".join(f"<tr>{''.join(f'<td>{_cell(one)}</td>' for one in row)}</tr>" for row in rows)
-    return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
+    return f'<div class="wide" tabindex="0"><table><tr>{head}</tr>{body}</table></div>'
 
 
 def _cell(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import random
@@ -18,6 +19,12 @@ import numpy as np
 import pytest
 from campaign_files import JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
 from in_process import run_here
+
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.files.tables import read_table
+from tactile_bayes.pipeline.campaign_folder import open_campaign
+from tactile_bayes.pipeline.campaign_steps import Task, run_step
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 FAST = ("--method", "laplace")
@@ -109,7 +116,7 @@ FAULTS = {
     "a drive": ("C:\\data\\x.mcap,1,1,1,1", "write the path from the table's folder with / between folders"),
     "a patient in capitals": ("a.mcap,p1,1,1,1\nb.mcap,P1,1,1,1", "'P1' differs from 'p1' on line 2 by capitals alone"),
     "a mass in capitals": ("a.mcap,1,1,a,1\nb.mcap,1,1,A,2", "column mass: 'A' differs from 'a' on line 2"),
-    "semicolons and quotes": ('"a.mcap";1;1;1;1', "the cells are separated by semicolons"),
+    "semicolons and quotes": ('"a.mcap";1;1;1;0', "'0' is not at least 1"),
     "a formula": ("=cmd.mcap,1,1,1,1", "does not match"),
     "a path for a patient": ("a.mcap,../p,1,1,1", "does not match"),
     "no replicate": ("a.mcap,1,1,1,0", "'0' is not at least 1"),
@@ -166,6 +173,98 @@ def test_a_table_from_windows_is_read(finished: Path) -> None:
     table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes().replace(b"\n", b"\r\n") + b",,,,,\r\n\r\n")
     assert "2 steps run, 11 kept" in campaign(finished).stdout
     assert contents(finished / "out") == before
+
+
+def test_an_excision_sheet_of_a_german_spreadsheet_is_read_by_its_mapping(finished: Path) -> None:
+    """Semicolons, decimal commas, cm, other names and columns: the report is that of the tidy table in mm."""
+    tidy = campaign(finished, "--excision", "excision.csv").stdout
+    rows = ("Pat.-Nr.;Alter;größter Durchmesser (cm, Patho)", "07;54;1,5", "09;61;1,4", "11;70;0,9", "12;48;1")
+    sheet = "".join(f"{row};;\r\n" for row in rows)
+    (finished / "patho.csv").write_bytes(b"\xef\xbb\xbf" + sheet.encode())
+    mapping = 'patient = "Pat.-Nr."\n[excision]\nsize = "größter Durchmesser (cm, Patho)"\nunit = "cm"\n'
+    (finished / "patho.toml").write_text(mapping, encoding="utf-8")
+    done = campaign(finished, "--excision", "patho.csv", "--columns", "patho.toml")
+    assert done.returncode == 0, done.stderr
+    assert "Sizes against excision: 4 masses of 4 patients" in done.stdout
+    assert done.stdout == tidy
+    by_hand = run_here("validate", "out/trial.csv", "--excision", "patho.csv", "--columns", "patho.toml", cwd=finished)
+    assert by_hand.stdout in done.stdout, by_hand.stderr
+
+
+def test_an_excision_sheet_with_two_rows_of_one_mass_is_refused(finished: Path) -> None:
+    (finished / "patho.csv").write_text("id;cm\n07;1,5\n09;1,4\n07;2,4\n")
+    (finished / "patho.toml").write_text('patient = "id"\n[excision]\nsize = "cm"\nunit = "cm"\n')
+    done = campaign(finished, "--excision", "patho.csv", "--columns", "patho.toml")
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "line 4, column patient: 07 + 1 stands on line 2 already; remove one, or name the column" in done.stderr
+
+
+def test_a_mapping_needs_its_excision_table(finished: Path) -> None:
+    (finished / "patho.toml").write_text('patient = "id"\n[excision]\nsize = "cm"\nunit = "cm"\n')
+    alone = campaign(finished, "--columns", "patho.toml")
+    assert (alone.returncode, alone.stderr.count("\n")) == (2, 1)
+    assert "--columns is the layout of the excision table; give --excision too" in alone.stderr
+    missing = campaign(finished, "--excision", "excision.csv", "--columns", "patho.toml")
+    assert "line 1, column id: is missing; correct the mapping; the table has 'patient', 'mass'" in missing.stderr
+
+
+def test_a_step_that_ends_after_its_command_was_killed_changes_nothing_that_is_read(finished: Path) -> None:
+    """On a cluster a worker goes on; here its step is run after the folder's last run, with another normalisation."""
+    out, exam = finished / "out", "07.v1.m1.r1"
+    before, done = contents(out), steps(out)
+    source = finished / "scans" / "07-a.mcap"
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    task = Task("map", exam, out / "exams" / exam, "late", source=source, source_sha256=digest, normalise="mean")
+    late = run_step(task)
+    assert set(late["files"]) == {"map.nc"}
+    now = contents(out)
+    assert {name: now[name] for name in before} == before
+    assert campaign(finished).returncode == 0
+    assert contents(out) == before
+    assert steps(out) == done
+
+
+@pytest.mark.parametrize("name", ["exams_done", "failures"])
+def test_tables_have_every_column_of_their_schema_in_its_order(undisturbed: Path, name: str) -> None:
+    """Also those that no exam fills: a script must not break on a trial without cautions."""
+    table = read_table(undisturbed / f"{name}.csv", f"{name}.table.json")
+    assert len(table) == {"exams_done": 4, "failures": 2}[name]
+    header = (undisturbed / f"{name}.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert header == ",".join(one["name"] for one in load_schema(f"{name}.table.json")["fields"])
+
+
+def test_the_trial_table_has_its_columns_where_no_exam_has_a_size(own: Path) -> None:
+    write_table(own / "exams.csv", [("scans/11-a.mcap", "11", 1, "left")])
+    done = campaign(own, "--excision", "excision.csv")
+    assert done.returncode == 0, done.stderr
+    table = read_table(own / "out" / "trial.csv", "trial.table.json")
+    assert (table.columns["size_mm"], table.columns["status"]) == ([None], ["not_detected"])
+    assert "Sizes against excision" in done.stdout
+
+
+def test_a_pooled_size_is_synthetic_also_where_the_last_exam_failed(undisturbed: Path) -> None:
+    rows = [row for row in rows_of(undisturbed / "trial.csv") if row["modality"] == "tactile-pooled"]
+    assert {row["patient"]: row["synthetic"] for row in rows} == {"07": "true", "09": "true", "11": "true", "12": ""}
+
+
+def test_a_plan_and_a_run_name_the_few_exams_they_do_again(finished: Path) -> None:
+    write(finished / "scans" / "09-a.mcap", thinned(1, 5, subject="09", side="right"))
+    planned = campaign(finished, "--dry-run").stdout.splitlines()
+    assert "map: 3 to do (07.v1.m1.r3, 09.v1.m1.r1, 12.v1.m1.r1), 3 done" in planned
+    done = campaign(finished).stdout.splitlines()
+    assert "map run: 07.v1.m1.r3, 09.v1.m1.r1, 12.v1.m1.r1" in done
+    assert "estimate run: 09.v1.m1.r1" in done
+    assert "pool run: 09.v1.m1" in done
+
+
+def test_workers_that_do_not_see_the_commands_folder_end_the_run_with_the_question(tmp_path: Path) -> None:
+    """As on a cluster whose machines have an output folder each: the worker wrote, and nothing is here."""
+    staged = {"folder": str(tmp_path / "exams" / "P1.v1.m1.r1" / ".new-map-0"), "without": []}
+    result = {"files": {"map.nc": "0"}, "staged": staged, "seconds": 1.0, "cpu_seconds": 1.0}
+    with open_campaign(tmp_path / "out") as store:
+        assert store is not None
+        with pytest.raises(UsageError, match="do all machines see this folder"):
+            store.add("map P1.v1.m1.r1 0", result)
 
 
 def test_half_a_place_is_refused(tmp_path: Path) -> None:

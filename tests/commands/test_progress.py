@@ -31,6 +31,22 @@ def test_nothing_is_drawn_into_a_pipe():
     assert stream.getvalue() == ""
 
 
+def test_a_log_gets_a_line_now_and_then_with_the_hours_left():
+    stream, clock = io.StringIO(), Clock()
+    with progress_bar("steps", stream=stream, clock=clock, log_every_s=60.0) as progress:
+        for done in range(0, 121, 10):
+            progress(done, 20_000)
+            clock.now += 10.0
+        progress(130, 20_000, left_s=7384.6)
+        clock.now += 60.0
+        progress(20_000, 20_000)
+    assert stream.getvalue().splitlines() == [
+        "steps: 60 of 20000 done, 5:32:20 left",
+        "steps: 120 of 20000 done, 5:31:20 left",
+        "steps: 20000 of 20000 done",
+    ]
+
+
 def test_short_work_draws_nothing():
     stream, clock = Terminal(), Clock()
     with progress_bar("cases", stream=stream, clock=clock) as progress:

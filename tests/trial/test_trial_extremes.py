@@ -70,6 +70,18 @@ def test_every_report_is_valid_and_can_be_shown(name: str) -> None:
     assert trial_html(made, document, text="").endswith("</html>\n")
 
 
+def test_a_printed_page_cuts_no_table_and_a_narrow_one_scrolls_by_keys() -> None:
+    """On A4 the last column of errors was cut off, and the one before it in the middle."""
+    name, make = next(iter(TRIALS.items()))
+    made = make()
+    provenance = {"program": "x", "version": "1", "command": name, "settings": {}, "seed": 0, "inputs": []}
+    page = trial_html(made, {**as_document(made), "provenance": provenance}, text="")
+    printed = page.split("@media print{", 1)[1].split("</style>", 1)[0]
+    assert ".wide{overflow:visible}" in printed
+    assert "table{font-size:7.5pt}" in printed
+    assert page.count('<div class="wide" tabindex="0">') == page.count("<table>")
+
+
 @pytest.mark.parametrize("name", TRIALS)
 def test_whatever_is_missing_has_its_reason(name: str) -> None:
     for part in (sections(name), sections(name)["method_comparison"], sections(name)["replicates"]):

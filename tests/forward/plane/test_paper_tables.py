@@ -12,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
+from tactile_bayes.files.csv_cells import separator_in
+from tactile_bayes.files.identify import describe
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.tables import check_references, read_table
 
@@ -52,6 +54,36 @@ def test_spreadsheets_write_marks_and_line_ends(tmp_path: Path, prefix: bytes, e
     assert read_table(path, TRIAL).columns["size_mm"] == [12.5]
 
 
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_spreadsheet_of_another_country_is_read(tmp_path: Path, separator: str) -> None:
+    """Semicolons or tabs, decimal commas, a byte order mark, and the blank columns right of a table."""
+    rows = (HEADER.strip(), "P1,1,tactile,1,12!5,detected", "P2,1,tactile,1,9,detected")
+    text = "".join(f"{row},,\n" for row in rows).replace(",", separator)
+    table = read_table(write(tmp_path, "\ufeff" + text.replace("!", ",").replace("\n", "\r\n")), TRIAL)
+    assert table.columns["size_mm"] == [12.5, 9.0]
+    assert table.columns["status"] == ["detected", "detected"]
+    assert describe(table.path)["kind"] == "table: trial"
+
+
+@pytest.mark.parametrize(
+    ("text", "separator"),
+    [
+        ("a,b\n1,2\n", ","),
+        ("a;b\n1,5;2\n", ";"),
+        ("size (cm, largest, pathology);patient\n1,5;P1\n", ";"),
+        ('"size (cm, largest)";patient\n"1,5";P1\n', ";"),
+        ("note; free,patient\nx,P1\n", ","),
+        ("a\tb\n1,5\t2\n", "\t"),
+        ("patient\nP1\n", ","),
+        ("a,b,c\n1,2\n", ","),
+        ("a;b", ";"),
+        ("", ","),
+    ],
+)
+def test_the_separator_is_told_by_two_lines(text: str, separator: str) -> None:
+    assert separator_in(text) == separator
+
+
 def test_size_table_needs_three_columns(tmp_path: Path) -> None:
     table = read_table(write(tmp_path, "d_mm,amplitude,sigma_x_mm\n15,-0.1,8\n"), SIZES)
     assert table.columns["amplitude"] == [-0.1]
@@ -64,9 +96,15 @@ FAULTS = {
     "header only": (HEADER, ["no rows"]),
     "utf-16": ((HEADER + ROW).encode("utf-16"), ["UTF-16", "CSV UTF-8"]),
     "latin-1": ((HEADER + "P\xe9,1,tactile,1,1,detected\n").encode("latin-1"), ["line 2", "0xe9", "CSV UTF-8"]),
-    "semicolons": ((HEADER + ROW).replace(",", ";"), ["line 1", "semicolons", "commas"]),
-    "semicolons and quotes": ('"patient";"mass"\n"P1";1\n', ["line 1", "semicolons", "commas"]),
-    "tabs": ((HEADER + ROW).replace(",", "\t"), ["line 1", "tabs"]),
+    "semicolons, a point and a comma": (
+        (HEADER + ROW + "P2,1,tactile,1,9!5,detected\n").replace(",", ";").replace("!", ","),
+        ["line 2", "'12.5' has a point", "one way"],
+    ),
+    "semicolons and thousands": (
+        (HEADER + "P1,1,tactile,1,1!234,detected\n").replace(",", ";").replace("!", ","),
+        ["write 1234 or 1.234"],
+    ),
+    "semicolons and a cell too many": ((HEADER + ROW).replace(",", ";").strip() + ";7\n", ["line 2", "7 cells"]),
     "open quote": (HEADER + 'P1,1,"tactile,1,12.5,detected\n', ["line 2", "not CSV", "quotes"]),
     "ragged short": (HEADER + "P1,1,tactile,1,12.5\n", ["line 2", "5 cells under 6 columns"]),
     "bare decimal comma": (HEADER + "P1,1,tactile,1,12,5,detected\n", ["line 2", "7 cells", "12.5, not 12,5"]),
@@ -77,7 +115,10 @@ FAULTS = {
     "size in cm": (HEADER.replace("size_mm", "size_cm") + ROW, ["size_cm", "size_mm", "multiply by 10"]),
     "size without unit": (HEADER.replace("size_mm", "size") + ROW, ["did you mean size_mm, in millimetres?"]),
     "strange column": (HEADER.strip() + ",zzz\n" + ROW, ["zzz", "remove it"]),
-    "nameless column": (HEADER.strip() + ",\n" + ROW.strip() + ",\n", ["column ''", "remove it"]),
+    "nameless column": (
+        HEADER.strip() + ",\n" + ROW.strip() + ",x\n",
+        ["column ''", "remove it", "--columns MAP.toml"],
+    ),
     "missing column": (HEADER.replace(",status", "") + "P1,1,tactile,1,12.5\n", ["status", "is missing"]),
     "missing size column": (HEADER.replace(",size_mm", "") + "P1,1,cbe,1,not_done\n", ["size_mm", "is missing"]),
     "column twice": (HEADER.strip() + ",mass\n", ["mass", "more than once"]),

@@ -1,0 +1,85 @@
+"""The way of a step's files to their place: a worker writes them beside it, and the command puts them there.
+
+A worker of a cluster may end a step after the command that asked for it was killed, while another command goes on in
+the same folder with other settings. So workers write into a folder named by the step's key, and nothing but the command
+that holds the journal changes what tables and later steps read.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.pipeline.campaign_keys import stamp
+
+STAGED: Final = "staged"
+"""Key of a result whose files wait beside their place: the folder they are in, and the names that have no file."""
+_PREFIX: Final = ".new-"
+_DIGITS: Final = 16
+
+Writes = dict[str, Callable[[Path], object]]
+
+
+def write_staged(folder: Path, writes: Writes, *, step: str, digest: str, names: Collection[str]) -> dict[str, Any]:
+    """Write a step's files beside their place; returns their digests and where they are.
+
+    Parameters
+    ----------
+    folder
+        Where the files belong.
+    writes
+        How to write each file, by its name.
+    digest
+        Of all that the step's files depend on: equal files have equal folders.
+    names
+        Of all files that the step may write; those of earlier runs are removed when the others are put in place.
+
+    Raises
+    ------
+    UsageError, OSError
+        When the disk does not take a file.
+    """
+    from tactile_bayes.files.atomic import sha256
+
+    staged = folder / f"{_PREFIX}{step}-{digest[:_DIGITS]}"
+    try:
+        if writes:
+            staged.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for name, write in writes.items():
+            write(staged / name)
+        files = {name: sha256(staged / name) for name in writes}
+    except BaseException:
+        shutil.rmtree(staged, ignore_errors=True)
+        raise
+    return {"files": files, STAGED: {"folder": str(staged), "without": [name for name in names if name not in writes]}}
+
+
+def put_in_place(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Move the files of a result to their place, and remove those of earlier runs; returns it with their stamps.
+
+    Raises
+    ------
+    OSError
+        When a file cannot be moved.
+    """
+    if STAGED not in result:
+        return dict(result)
+    staged = Path(result[STAGED]["folder"])
+    folder = staged.parent
+    for name in result["files"]:
+        (staged / name).replace(folder / name)
+    for name in result[STAGED]["without"]:
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(staged, ignore_errors=True)
+    stamps = {name: stamp(folder / name) for name in result["files"]}
+    placed = {"files": result["files"], "stamps": stamps}
+    return {**placed, **{name: value for name, value in result.items() if name not in (*placed, STAGED)}}
+
+
+def clear_staged(folder: Path, names: Collection[str]) -> None:
+    """Remove what steps of ended commands left beside their place; `names` are those in the folder."""
+    for name in names:
+        if name.startswith(_PREFIX):
+            shutil.rmtree(folder / name, ignore_errors=True)
