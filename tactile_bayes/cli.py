@@ -6,12 +6,13 @@ import atexit
 import gc
 import importlib
 import os
+import signal
 import sys
 
 import click
 
 from tactile_bayes import __version__
-from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, TactileBayesError
+from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
 from tactile_bayes.printing import ReaderGoneError, protect_streams, release_streams
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
@@ -99,9 +100,23 @@ def main() -> None:
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()
-    status = _run()
+    _end_in_order()
+    try:
+        status = _run()
+    except KeyboardInterrupt:  # once more, while the first was answered
+        status = EXIT_INTERRUPTED
     release_streams()
     sys.exit(status)
+
+
+def _end_in_order() -> None:
+    """Let SIGTERM (`kill`, `timeout`, a batch system) and SIGHUP (a closed terminal) end a command as Ctrl-C does.
+
+    What is ignored stays so: `nohup` ignores SIGHUP.
+    """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
 
 
 def _run() -> int:
@@ -123,6 +138,9 @@ def _run() -> int:
     except ReaderGoneError:
         return EXIT_READER_GONE
     except (OSError, MemoryError) as error:
+        if isinstance(error, FileNotFoundError) and error.filename is None:  # of os.getcwd
+            click.echo("error: the current folder is no longer there; change to one that is (cd)", err=True)
+            return EXIT_USAGE
         click.echo(f"error: {_system_fault(error)}", err=True)
         return EXIT_FAULT
     return status if isinstance(status, int) else 0

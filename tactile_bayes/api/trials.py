@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.paths import PathLike, output_path, path_of
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def calibrate_size(
             raise TypeError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
         corrected = correct_size(source, str(correct), given, seed=seed)
         if path is not None:
-            corrected.write(path_of(path), force=force)
+            corrected.write(output_path(path, "JSON"), force=force)
         return corrected.calibration
     inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
     if over_bodies_alone:
@@ -180,13 +180,13 @@ def calibrate_size(
         )
         if path is not None:
             provenance = Provenance("calibrate size", settings, inputs)
-            write_body_calibration(path_of(path), over_bodies, provenance=provenance, force=force)
+            write_body_calibration(output_path(path, "JSON"), over_bodies, provenance=provenance, force=force)
         return over_bodies
     rows = read_table(source, "size_table.table.json")
     learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)
     if path is not None:
         provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)
-        write_size_calibration(path_of(path), learned.calibration, provenance=provenance, force=force)
+        write_size_calibration(output_path(path, "JSON"), learned.calibration, provenance=provenance, force=force)
     return learned.calibration
 
 
@@ -221,7 +221,7 @@ def calibrate_repeatability(
     given = None if size_calibration is None else str(size_calibration)
     learned = learn_from_exams(exams_in(path_of(folder)), size_calibration=given)
     if path is not None:
-        learned.write(path_of(path), force=force)
+        learned.write(output_path(path, "JSON"), force=force)
     return learned.repeatability
 
 

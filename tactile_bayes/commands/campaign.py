@@ -32,7 +32,9 @@ def command() -> None:
 
 @command.command("init")
 @click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
-@click.option("-o", "--output", required=True, metavar="EXAMS.csv", type=_FILE, help="Where to write the table.")
+@click.option(
+    "-o", "--output", required=True, metavar="EXAMS.csv", type=FilePath(writes="CSV"), help="Where to write the table."
+)
 @FORCE
 def init(folder: Path | str, output: Path, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry.

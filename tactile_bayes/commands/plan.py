@@ -73,7 +73,9 @@ _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other
 @seed_option(1999)
 @WORKERS
 @JSON
-@click.option("-o", "--output", metavar="PLAN.json", type=_FILE, help="Write the plan as JSON to this file.")
+@click.option(
+    "-o", "--output", metavar="PLAN.json", type=FilePath(writes="JSON"), help="Write the plan as JSON to this file."
+)
 @FORCE
 def command(
     patients: tuple[int, ...],
@@ -117,9 +119,11 @@ def command(
     sources = _sources(typed, pilot=pilot is not None)
     document = _document(cases, _simulate(cases, workers=workers), errors, sources, files)
     check_document(document, "plan.schema.json", path=output or Path("the plan"))
-    if output:
-        write_text(output, dump_json(document), force=force)
-    click.echo(dump_json(document) if as_json else _text(document), nl=False)
+    try:
+        if output:
+            write_text(output, dump_json(document), force=force)
+    finally:  # what was computed is not lost with the file
+        click.echo(dump_json(document) if as_json else _text(document), nl=False)
 
 
 def _sources(typed: set[str], *, pilot: bool) -> dict[str, str]:

@@ -21,7 +21,9 @@ _FILE = FilePath()
 
 
 @click.command("population")
-@click.option("-o", "--output", required=True, metavar="TABLE.csv", type=_FILE, help="Where to write the table.")
+@click.option(
+    "-o", "--output", required=True, metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Where to write the table."
+)
 @click.option(
     "--masses", type=click.IntRange(min=1), default=400, show_default=True, help="Number of bodies, one lump each."
 )

@@ -25,7 +25,9 @@ _CODE = "A code, not a name."
 
 
 @click.command("record")
-@click.option("-o", "--output", required=True, metavar="SCAN.mcap", type=_FILE, help="Scan file to write.")
+@click.option(
+    "-o", "--output", required=True, metavar="SCAN.mcap", type=FilePath(writes="MCAP"), help="Scan file to write."
+)
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
 @click.option("--tracker", "tracker_url", metavar="URL", help="Port of the tracker; without, there are no poses.")
 @click.option(

@@ -20,7 +20,7 @@ _FILE = FilePath()
 
 @click.command("replay")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
-@click.option("-o", "--output", metavar="OUT.mcap", type=_FILE, help="Save what is recorded.")
+@click.option("-o", "--output", metavar="OUT.mcap", type=FilePath(writes="MCAP"), help="Save what is recorded.")
 @live_options
 @SPEED
 @FORCE

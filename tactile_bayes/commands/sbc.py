@@ -48,7 +48,7 @@ _FILE = FilePath()
     "-o",
     "--output",
     metavar="TABLE.csv",
-    type=_FILE,
+    type=FilePath(writes="CSV"),
     help="Write truths and ranks; an interrupted run resumes from it.",
 )
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the ECDFs of the ranks with their bands.")
@@ -104,10 +104,12 @@ def command(
     found = [outcome.value for outcome in outcomes if outcome.value is not None]
     if output is not None:
         write_text(output, table_text(found), force=force)
-    if figure is not None:
-        sbc_figure(found, figure, force=force)
     failed = _finish(outcomes, output)
-    report(found, speed)
+    try:
+        if figure is not None:
+            sbc_figure(found, figure, force=force)
+    finally:  # what was computed is not lost with the figure
+        report(found, speed)
     if failed:
         raise TactileBayesError(f"{failed} of {len(outcomes)} maps are missing from this report")
 

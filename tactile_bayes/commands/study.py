@@ -54,7 +54,9 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
     metavar="centred|resting|0..2",
     help="How far the lump stands out of the gland, if the grid does not state it.",
 )
-@click.option("-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write the table. Default: print it.")
+@click.option(
+    "-o", "--output", metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Write the table. Default: print it."
+)
 @click.option(
     "--figures",
     metavar="DIR",

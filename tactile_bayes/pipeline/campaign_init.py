@@ -41,10 +41,10 @@ def find_exams(folder: Path | str, table: Path) -> Found:
     Raises
     ------
     UsageError
-        When the folder is none, or the table would lie outside it and not above it.
+        When the folder is none or cannot be read, or the table would lie outside it and not above it.
     """
     found = Found()
-    for where, name in _local(folder, table) if isinstance(folder, Path) else _stored(folder):
+    for where, name in _local(folder, table, found) if isinstance(folder, Path) else _stored(folder):
         try:
             facts = _facts(where, name)
         except BadDataError as error:
@@ -56,14 +56,14 @@ def find_exams(folder: Path | str, table: Path) -> Found:
     return found
 
 
-def _local(folder: Path, table: Path) -> Iterator[tuple[Path, str]]:
+def _local(folder: Path, table: Path, found: Found) -> Iterator[tuple[Path, str]]:
     """Files of a folder that may be scans, each with its name from the table's folder."""
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a directory; give the folder of the scans")
     base = Path(os.path.realpath(table.parent))
     if not Path(os.path.realpath(folder)).is_relative_to(base):
         raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; write the table beside the scans")
-    for path in _files(folder):
+    for path in _files(folder, found):
         yield path, os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)
 
 
@@ -73,9 +73,15 @@ def _stored(address: str) -> Iterator[tuple[str, str]]:
         yield one, one
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    """Files that may be scans, in a fixed order; folders that a campaign wrote are passed over."""
-    for place, folders, names in os.walk(folder):
+def _files(folder: Path, found: Found) -> Iterator[Path]:
+    """Files that may be scans, in a fixed order; folders that a campaign wrote are passed over, closed ones noted."""
+
+    def skip(error: OSError) -> None:
+        if error.filename == os.fspath(folder):
+            raise UsageError(f"{folder} cannot be read ({error.strerror}); give a folder that can")
+        found.skipped.append(f"{error.filename}: cannot be read ({error.strerror})")
+
+    for place, folders, names in os.walk(folder, onerror=skip):
         if JOURNAL in names:
             folders.clear()
             continue
