@@ -243,6 +243,19 @@ def test_a_signal_ends_the_recording_in_order(tmp_path, start, long_scan, number
     assert f"{len(file.scan.frames)} frames" in out
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_all_processes_of_a_recording_ends_it_in_order(tmp_path, start, long_scan, number):
+    """As of `timeout`, a service manager and a closed terminal: the readers died of it, and "the device has gone"."""
+    with head_and_tracker(long_scan) as devices:
+        process = start(devices, start_new_session=True)
+        wait_for_bytes(tmp_path / "a.mcap", 60_000)
+        os.killpg(process.pid, number)
+        out, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    assert f"ended by {number.name}" in out
+    assert read_scan_report(tmp_path / "a.mcap").complete
+
+
 @pytest.mark.parametrize("role", ["head", "tracker"])
 def test_a_pulled_cable_ends_it_with_one_line(record, tmp_path, scan, role):
     pulled = {f"{role}_faults": Faults(disconnect_s=0.3)}
