@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 import gc
 import importlib
 import os
-import signal
 import sys
 
 import click
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
+from tactile_bayes.interruption import end_in_order
 from tactile_bayes.printing import ReaderGoneError, protect_streams, release_streams
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
@@ -101,24 +100,13 @@ def main() -> None:
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()
-    _end_in_order()
+    end_in_order()
     try:
         status = _run()
     except KeyboardInterrupt:  # once more, while the first was answered
         status = EXIT_INTERRUPTED
     release_streams()
     sys.exit(status)
-
-
-def _end_in_order() -> None:
-    """Let SIGTERM (`kill`, `timeout`, a batch system) and SIGHUP (a closed terminal) end a command as Ctrl-C does.
-
-    What is ignored stays so: `nohup` ignores SIGHUP.
-    """
-    with contextlib.suppress(ValueError):  # called in a thread, which gets no signals
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is signal.SIG_DFL:
-                signal.signal(number, signal.default_int_handler)
 
 
 def _run() -> int:
