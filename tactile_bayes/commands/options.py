@@ -65,6 +65,8 @@ class NumberOr(_ParamType):
             self.fail(f"{value!r} is not a number, nor {' nor '.join(map(repr, self.words))}", param, ctx)
 
 
+MOST_ITEMS = 1_000_000
+"""Of a batch: memory holds a name and an outcome for each."""
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 SESSION = click.option(
     "--session",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, WORKERS, FiniteRange, seed_option
+from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 
@@ -68,7 +68,11 @@ _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other
 @click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
 @click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot to compare with.")
 @click.option(
-    "--trials", type=click.IntRange(50), default=1000, show_default=True, help="Number of simulated trials per design."
+    "--trials",
+    type=click.IntRange(50, MOST_ITEMS),
+    default=1000,
+    show_default=True,
+    help="Number of simulated trials per design.",
 )
 @seed_option(1999)
 @WORKERS

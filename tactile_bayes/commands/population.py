@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, WORKERS, scheduler_option, seed_option
+from tactile_bayes.commands.options import FORCE, MOST_ITEMS, WORKERS, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
@@ -25,16 +25,20 @@ _FILE = FilePath()
     "-o", "--output", required=True, metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Where to write the table."
 )
 @click.option(
-    "--masses", type=click.IntRange(min=1), default=400, show_default=True, help="Number of bodies, one lump each."
+    "--masses",
+    type=click.IntRange(1, MOST_ITEMS),
+    default=400,
+    show_default=True,
+    help="Number of bodies, one lump each.",
 )
 @click.option(
     "--centred",
-    type=click.IntRange(min=0),
+    type=click.IntRange(0, MOST_ITEMS),
     default=0,
     show_default=True,
     help="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
 )
-@click.option("--scans", type=click.IntRange(min=1), default=2, show_default=True, help="Number of exams per body.")
+@click.option("--scans", type=click.IntRange(1, 1000), default=2, show_default=True, help="Number of exams per body.")
 @click.option(
     "--normalise",
     type=click.Choice(["gain", "mean"]),

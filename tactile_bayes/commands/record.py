@@ -150,7 +150,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
 
     from tactile_bayes.commands.record_keys import Stopper
     from tactile_bayes.commands.record_parts import calibration_age, instrument_of, provenance_of, refuse_calibration
-    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.atomic import refuse_existing, unwritable
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
     from tactile_bayes.files.schema import check_document
     from tactile_bayes.files.session_toml import SCHEMA
@@ -168,13 +168,16 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
         observer = _look_on(request, head, calibration, stack)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
-        writer = RecordingWriter(
-            stream,
-            head=head,
-            element_calibration=calibration,
-            session=session,
-            provenance=provenance_of(request, request.settings(hello)),
-        )
+        provenance = provenance_of(request, request.settings(hello))
+        try:
+            writer = RecordingWriter(
+                stream, head=head, element_calibration=calibration, session=session, provenance=provenance
+            )
+        except OSError as error:
+            with suppress(OSError):  # what is still in its buffer cannot be written either
+                stream.close()
+            request.output.unlink(missing_ok=True)  # it holds nothing of a scan yet
+            raise unwritable(request.output, error) from None
         stack.callback(writer.stop_syncing)
         recorder = Recorder(
             *lines,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, JSON, WORKERS, WholeOrAuto, scheduler_option, seed_option
+from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, WholeOrAuto, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 
@@ -25,7 +25,7 @@ _FILE = FilePath()
 
 
 @click.command("sbc")
-@click.option("--maps", type=click.IntRange(min=1), default=200, show_default=True, help="Maps to simulate.")
+@click.option("--maps", type=click.IntRange(1, MOST_ITEMS), default=200, show_default=True, help="Maps to simulate.")
 @click.option(
     "--method",
     type=click.Choice(["laplace", "importance", "ensemble"]),

@@ -42,7 +42,11 @@ LEARNED = "learned"
     help="Error in size below which more accuracy is not worth its cost.",
 )
 @click.option(
-    "--runs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of runs; the shortest time counts."
+    "--runs",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    help="Number of runs; the shortest time counts.",
 )
 @JSON
 @FORCE

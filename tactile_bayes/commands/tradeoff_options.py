@@ -22,7 +22,7 @@ TOLERANCE = click.option(
 )
 RUNS = click.option(
     "--runs",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 1000),
     default=3,
     show_default=True,
     help="Number of runs of each setting: the least time counts, errors are averaged.",
