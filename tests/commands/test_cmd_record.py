@@ -285,6 +285,21 @@ def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, 
     assert len(read_scan_report(tmp_path / "a.mcap").scan.frames) > 50
 
 
+def test_a_disk_that_was_full_before_it_is_one_line_and_no_file(tmp_path, start, long_scan):
+    """It was: error: No space left on device, with exit code 1 and an empty file."""
+
+    def no_room() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+
+    with head_and_tracker(long_scan) as devices:
+        process = start(devices, preexec_fn=no_room)
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err.count("\n")) == (2, 1), err
+    assert "a.mcap cannot be written (File too large)" in err
+    assert not (tmp_path / "a.mcap").exists()
+
+
 def test_a_duration_is_by_the_heads_clock(record, tmp_path, scan):
     with head_and_tracker(scan, speed=FAST) as devices:
         words = [*devices, "--clock", "shared", "--duration", 0.5]

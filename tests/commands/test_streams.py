@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from in_process import run_here
 from repeated_exams import estimate_document
 
 import tactile_bayes as tb
@@ -88,3 +91,33 @@ def test_a_current_folder_that_is_gone_is_one_line(folder: Path, child_environme
         2,
         ["error: the current folder is no longer there; change to one that is (cd)"],
     )
+
+
+def test_a_file_that_may_not_be_read_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Click told it in four lines and as a fault of usage, before the reader could."""
+    opened = os.open
+
+    def closed(path: str, flags: int, *more: int, **options: int) -> int:
+        if str(path).endswith("map.nc"):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return opened(path, flags, *more, **options)
+
+    monkeypatch.setattr(os, "open", closed)
+    monkeypatch.setattr(os, "access", lambda path, *_, **__: not str(path).endswith("map.nc"))
+    done = run_here("show", "map.nc", cwd=folder)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
+    assert "map.nc: cannot be read (Permission denied)" in done.stderr
+
+
+def test_a_demo_on_a_full_disk_names_its_own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It named the program's file, with exit code 1, and left half a scan."""
+
+    def refusing(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", refusing)
+    done = run_here("demo", "-o", "demo", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.startswith("error: demo/")
+    assert "cannot be written (No space left on device); make room" in done.stderr
+    assert list((tmp_path / "demo").iterdir()) == []
