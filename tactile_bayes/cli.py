@@ -120,7 +120,7 @@ def _run() -> int:
         click.echo(f"interrupted: {told}" if told else "interrupted", err=True)
         return EXIT_INTERRUPTED
     except click.ClickException as error:
-        error.show()
+        _show(error)
         return error.exit_code
     except TactileBayesError as error:
         click.echo(f"error: {error}", err=True)
@@ -134,6 +134,17 @@ def _run() -> int:
         click.echo(f"error: {_system_fault(error)}", err=True)
         return EXIT_FAULT
     return status if isinstance(status, int) else 0
+
+
+def _show(error: click.ClickException) -> None:
+    """Print an error of the words on the command line, in one line as all others; without any words, the help."""
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2 and later
+        error.show()
+        return
+    message = " ".join(error.format_message().split()).rstrip(".")
+    advice = f"; see `{context.command_path} --help`" if context is not None else ""
+    click.echo(f"error: {message}{advice}", err=True)
 
 
 def _system_fault(error: OSError | MemoryError) -> str:

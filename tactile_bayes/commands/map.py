@@ -87,6 +87,7 @@ def command(
     """
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.map_nc import write_map
+    from tactile_bayes.files.provenance import repeated_scans
     from tactile_bayes.mapping import build_map
     from tactile_bayes.pipeline.scans import load_scans, map_provenance
     from tactile_bayes.report.map_text import map_text
@@ -104,6 +105,9 @@ def command(
     }
     clock = _Clock(verbose)
     loaded, lost = load_scans(scans)
+    provenance = map_provenance(scans, loaded, settings)
+    for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():
+        raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
     clock.tell("read")
     with progress_bar("frames") as progress:
         tactile_map = build_map(
@@ -119,7 +123,6 @@ def command(
             progress=progress,
         )
     clock.tell("map")
-    provenance = map_provenance(scans, loaded, settings)
     write_map(output, tactile_map, provenance=provenance, force=force)
     try:
         if figure:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from in_process import run_here
 
 from tactile_bayes import errors
 from tactile_bayes.interruption import end_in_order
@@ -60,6 +61,28 @@ def test_what_nohup_ignores_stays_ignored() -> None:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ("plan", "--map-sd", "nan"),
+            "Invalid value for '--map-sd': 'nan' is not a finite number; see `tactile-bayes plan --help`",
+        ),
+        (("calibrate", "size"), "Missing argument 'TABLE.csv'; see `tactile-bayes calibrate size --help`"),
+        (("mapp",), "No such command 'mapp'. Did you mean 'map'?; see `tactile-bayes --help`"),
+    ],
+)
+def test_wrong_words_are_one_line_too(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    """They came with two lines of usage before the line that says what is wrong."""
+    done = run_here(*words, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (errors.EXIT_USAGE, "", f"error: {said}\n")
+
+
+def test_no_words_at_all_are_answered_by_the_help(tmp_path: Path) -> None:
+    done = run_here(cwd=tmp_path)
+    assert "Commands:" in done.stdout + done.stderr
 
 
 def test_every_error_has_a_documented_code() -> None:
