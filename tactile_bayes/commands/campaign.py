@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.options import FORCE, WORKERS, scheduler_option, seed_option
+from tactile_bayes.commands.options import FORCE, WORKERS, FiniteRange, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath, also_read, refuse_same
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARCH_USE
@@ -83,7 +83,7 @@ def init(folder: Path | str, output: Path, force: bool) -> None:
 )
 @click.option(
     "--match-mm",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     metavar="MM",
     default=15.0,
     show_default=True,

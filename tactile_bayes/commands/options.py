@@ -86,7 +86,7 @@ PRESSURE_WINDOW = click.option(
 )
 SPEED = click.option(
     "--speed",
-    type=click.FloatRange(0.01, 100.0),
+    type=FiniteRange(0.01, 100.0),
     default=1.0,
     show_default=True,
     help="Playback speed; 1 is real time.",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
-from tactile_bayes.commands.options import FORCE, live_options
+from tactile_bayes.commands.options import FORCE, FiniteRange, live_options
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.commands.record_request import Request
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
@@ -54,7 +54,7 @@ _CODE = "A code, not a name."
 @click.option(
     "--duration",
     "duration_s",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     metavar="S",
     help="Stop after this time, s.",
 )
@@ -82,7 +82,7 @@ _CODE = "A code, not a name."
 )
 @click.option(
     "--calibration-days",
-    type=click.FloatRange(min=0.0),
+    type=FiniteRange(min=0.0),
     default=1.0,
     show_default=True,
     help="Age from which an array calibration is stale, days.",
