@@ -64,6 +64,7 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
+        start_new_session=True,  # Ctrl-C and what `timeout` sends are for the recorder: a device goes on meanwhile
     )
     assert process.stdout is not None
     try:

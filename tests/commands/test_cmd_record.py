@@ -9,13 +9,12 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from emulated_devices import head_and_tracker, serving, short_scan
+from emulated_devices import head_and_tracker, serving, short_scan, wait_for_bytes
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -73,15 +72,6 @@ def start(child_environment, tmp_path, source):
         if process.poll() is None:
             process.kill()
         process.communicate()
-
-
-def wait_for_bytes(path: Path, size: int) -> None:
-    """Until a recording has written that much."""
-    for _ in range(1000):
-        if path.exists() and path.stat().st_size >= size:
-            return
-        time.sleep(0.01)
-    raise AssertionError(f"{path} did not grow")
 
 
 @pytest.fixture
