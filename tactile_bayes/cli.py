@@ -12,7 +12,7 @@ import click
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
-from tactile_bayes.interruption import end_in_order
+from tactile_bayes.interruption import ended_in_order
 from tactile_bayes.printing import ReaderGoneError, protect_streams, release_streams
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
@@ -100,9 +100,9 @@ def main() -> None:
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()
-    end_in_order()
     try:
-        status = _run()
+        with ended_in_order():
+            status = _run()
     except KeyboardInterrupt:  # once more, while the first was answered
         status = EXIT_INTERRUPTED
     release_streams()

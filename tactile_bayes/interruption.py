@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import contextlib
 import signal
+from collections.abc import Iterator
+from typing import Any
 
 _asked = False
 
 
-def end_in_order() -> None:
+@contextlib.contextmanager
+def ended_in_order() -> Iterator[None]:
     """Let SIGTERM (`kill`, `timeout`, a batch system) and SIGHUP (a closed terminal) interrupt as Ctrl-C does.
 
     What is ignored stays so: `nohup` ignores SIGHUP.
     """
     global _asked
     _asked = False
+    before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # called in a thread, which gets no signals
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-                signal.signal(number, _interrupt)
+                before[number] = signal.signal(number, _interrupt)
+    try:
+        yield
+    finally:
+        _asked = False
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def raise_if_asked() -> None:
@@ -27,7 +37,7 @@ def raise_if_asked() -> None:
     Raises
     ------
     KeyboardInterrupt
-        When a signal has come since `end_in_order`.
+        When a signal has come in the block of `ended_in_order`.
     """
     if _asked:
         raise KeyboardInterrupt

@@ -25,7 +25,7 @@ from tactile_bayes.batch import BatchInterrupted, fault_lines, run_batch
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.executors import InlineExecutor, cluster_executor, local_executor, open_executor
-from tactile_bayes.interruption import end_in_order
+from tactile_bayes.interruption import ended_in_order
 
 
 def draw(seed: int) -> tuple[int, float]:
@@ -702,7 +702,6 @@ def test_the_inline_executor_holds_what_an_item_raised():
 
 def test_an_interruption_that_an_item_lets_go_is_not_lost() -> None:
     """As compiled modules do while they are imported: a batch went on for hours after SIGTERM."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
 
     def deaf(item: int) -> int:
         if item == 1:
@@ -711,12 +710,8 @@ def test_an_interruption_that_an_item_lets_go_is_not_lost() -> None:
                 time.sleep(5.0)
         return item
 
-    try:
-        end_in_order()
-        with pytest.raises(BatchInterrupted, match=r"2 of 9 done") as stop:
-            run_batch(deaf, range(9), key=str)
-    finally:
-        end_in_order()  # forgets the signal
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    before = signal.getsignal(signal.SIGTERM)
+    with ended_in_order(), pytest.raises(BatchInterrupted, match=r"2 of 9 done") as stop:
+        run_batch(deaf, range(9), key=str)
+    assert signal.getsignal(signal.SIGTERM) is before
     assert [one.value for one in stop.value.outcomes] == [0, 1]

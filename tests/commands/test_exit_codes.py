@@ -11,7 +11,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes import errors
-from tactile_bayes.interruption import end_in_order
+from tactile_bayes.interruption import ended_in_order
 from tests.conftest import ROOT
 
 INTERRUPTED = """
@@ -56,8 +56,8 @@ def test_a_signal_to_end_ends_as_ctrl_c_does(number: signal.Signals, tmp_path: P
 def test_what_nohup_ignores_stays_ignored() -> None:
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:
-        end_in_order()
-        assert all(signal.getsignal(number) is signal.SIG_IGN for number in before)
+        with ended_in_order():
+            assert all(signal.getsignal(number) is signal.SIG_IGN for number in before)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
