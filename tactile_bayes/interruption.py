@@ -27,8 +27,8 @@ def ended_in_order() -> Iterator[None]:
         yield
     finally:
         _asked = False
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for changed, handler in before.items():
+            signal.signal(changed, handler)
 
 
 def raise_if_asked() -> None:
