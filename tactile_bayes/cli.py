@@ -128,7 +128,7 @@ def _run() -> int:
     except ReaderGoneError:
         return EXIT_READER_GONE
     except (OSError, MemoryError) as error:
-        if isinstance(error, FileNotFoundError) and error.filename is None:  # of os.getcwd
+        if _folder_gone():
             click.echo("error: the current folder is no longer there; change to one that is (cd)", err=True)
             return EXIT_USAGE
         click.echo(f"error: {_system_fault(error)}", err=True)
@@ -145,6 +145,15 @@ def _show(error: click.ClickException) -> None:
     message = " ".join(error.format_message().split()).rstrip(".")
     advice = f"; see `{context.command_path} --help`" if context is not None else ""
     click.echo(f"error: {message}{advice}", err=True)
+
+
+def _folder_gone() -> bool:
+    """Whether the folder that the program was started in was removed since."""
+    try:
+        os.getcwd()  # noqa: PTH109 (no pathlib is loaded here)
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _system_fault(error: OSError | MemoryError) -> str:
