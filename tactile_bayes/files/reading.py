@@ -81,12 +81,12 @@ def read_bytes(path: Path, *, most: int) -> bytes:
 
 
 def read_text(path: Path, *, most: int, way_out: str) -> str:
-    """A file's UTF-8 text, without the mark that some editors begin it with; see `read_bytes` for limits and errors."""
+    """A file's UTF-8 text; see `read_bytes` for limits and errors."""
     data = read_bytes(path, most=most)
     if data[:2] in UTF_16:
         raise BadDataError("is UTF-16 text", way_out="save it as UTF-8", path=str(path))
     try:
-        return data.decode("utf-8-sig")
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         what = f"line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text"
