@@ -18,6 +18,7 @@ from typing import Any, Generic, TypeVar
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.errors import BadDataError, one_line
 from tactile_bayes.executors import InlineExecutor, LocalWorkers
+from tactile_bayes.interruption import raise_if_asked
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -198,6 +199,7 @@ class _Run(Generic[Item, Result]):
         """Run all items; on the way out of an interruption or a fault keep what is finished."""
         try:
             while self._rest or self._suspects or self._waiting:
+                raise_if_asked()
                 self._hand_out()
                 self._take()
         except BaseException:

@@ -64,6 +64,8 @@ class BatchStore:
         For messages.
     encode, decode
         To and from what JSON can hold.
+    read_only
+        The file is left as it is.
 
     Attributes
     ----------
@@ -78,8 +80,9 @@ class BatchStore:
         *,
         encode: Callable[[Any], Any],
         decode: Callable[[Any], Any],
+        read_only: bool = False,
     ) -> None:
-        self._descriptor = descriptor
+        self._descriptor, self._read_only = descriptor, read_only
         self.path = path
         self._encode = encode
         self._decode = decode
@@ -108,12 +111,15 @@ class BatchStore:
                 name = _name_in(line[:-1].decode("utf-8", errors="replace"), number=number, path=self.path)
                 self.values.place(name, self._end)
                 self._end += len(line)
-        os.ftruncate(self._descriptor, self._end)
+        if not self._read_only:
+            os.ftruncate(self._descriptor, self._end)
 
     def _begun(self, line: bytes, header: Mapping[str, Any]) -> bool:
         """Whether the file's first line is this header; a missing one, or the beginning of one, is written."""
         wanted = _sealed(json.dumps(header, sort_keys=True, ensure_ascii=False))
         if not line.endswith(b"\n") and wanted.encode().startswith(line):
+            if self._read_only:
+                return False
             os.ftruncate(self._descriptor, 0)
             self._append(wanted)
             return False
@@ -144,6 +150,7 @@ def open_store(
     settings: Mapping[str, Any],
     encode: Callable[[Any], Any] = lambda value: value,
     decode: Callable[[Any], Any] = lambda value: value,
+    read_only: bool = False,
 ) -> Iterator[BatchStore]:
     """Open or create a store, readable by its owner only and locked against a second run.
 
@@ -153,6 +160,8 @@ def open_store(
         All that the results depend on besides the items' keys (options, seed, digests of inputs), as plain data.
     encode, decode
         How a result becomes plain data, and back. JSON keeps floats exactly; tuples come back as lists.
+    read_only
+        Look at a store that exists, and leave it as it is: it may be another's, or on a disk that takes nothing.
 
     Raises
     ------
@@ -161,28 +170,29 @@ def open_store(
     BadDataError
         When the file is something else, or a line in its middle is damaged.
     """
-    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC
+    access = os.O_RDONLY if read_only else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:
-        descriptor = os.open(path, flags, 0o600)
+        descriptor = os.open(path, access | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
     except OSError as error:
         raise UsageError(f"{path} cannot be opened ({error.strerror}); choose another place") from None
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise UsageError(f"{path} is no regular file; choose another name")
-        _lock(descriptor, path)
-        store = BatchStore(descriptor, path, encode=encode, decode=decode)
+        _lock(descriptor, path, shared=read_only)
+        store = BatchStore(descriptor, path, encode=encode, decode=decode, read_only=read_only)
         store.load({"schema": STORE_SCHEMA, "settings": json.loads(json.dumps(settings))})
         yield store
-        os.fsync(descriptor)
+        if not read_only:
+            os.fsync(descriptor)
     finally:
         os.close(descriptor)
 
 
-def _lock(descriptor: int, path: Path) -> None:
+def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
     import fcntl
 
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         raise UsageError(f"{path} is in use by another run; wait for it or choose another name") from None
 

@@ -11,7 +11,8 @@ import sys
 import click
 
 from tactile_bayes import __version__
-from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, TactileBayesError
+from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
+from tactile_bayes.interruption import ended_in_order
 from tactile_bayes.printing import ReaderGoneError, protect_streams, release_streams
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
@@ -99,7 +100,11 @@ def main() -> None:
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()
-    status = _run()
+    try:
+        with ended_in_order():
+            status = _run()
+    except KeyboardInterrupt:  # once more, while the first was answered
+        status = EXIT_INTERRUPTED
     release_streams()
     sys.exit(status)
 
@@ -115,7 +120,7 @@ def _run() -> int:
         click.echo(f"interrupted: {told}" if told else "interrupted", err=True)
         return EXIT_INTERRUPTED
     except click.ClickException as error:
-        error.show()
+        _show(error)
         return error.exit_code
     except TactileBayesError as error:
         click.echo(f"error: {error}", err=True)
@@ -123,9 +128,32 @@ def _run() -> int:
     except ReaderGoneError:
         return EXIT_READER_GONE
     except (OSError, MemoryError) as error:
+        if _folder_gone():
+            click.echo("error: the current folder is no longer there; change to one that is (cd)", err=True)
+            return EXIT_USAGE
         click.echo(f"error: {_system_fault(error)}", err=True)
         return EXIT_FAULT
     return status if isinstance(status, int) else 0
+
+
+def _show(error: click.ClickException) -> None:
+    """Print an error of the words on the command line, in one line as all others; without any words, the help."""
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2 and later
+        error.show()
+        return
+    message = " ".join(error.format_message().split()).rstrip(".")
+    advice = f"; see `{context.command_path} --help`" if context is not None else ""
+    click.echo(f"error: {message}{advice}", err=True)
+
+
+def _folder_gone() -> bool:
+    """Whether the folder that the program was started in was removed since."""
+    try:
+        os.getcwd()  # noqa: PTH109 (no pathlib is loaded here)
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _system_fault(error: OSError | MemoryError) -> str:

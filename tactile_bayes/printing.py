@@ -45,6 +45,11 @@ class PrintableStream:
         self._required = required
         self._failure: Exception | None = None  # told again at the next call: whoever printed may have let it go
 
+    @property
+    def encoding(self) -> str:
+        """UTF-8 in any locale: click writes past a stream that says it is ASCII, and past what is escaped here."""
+        return "utf-8"
+
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
@@ -89,13 +94,29 @@ def _abandon(stream: TextIO) -> None:
 
 
 def protect_streams() -> None:
-    """Make the standard streams of this process printable, in any locale."""
+    """Make the standard streams of this process printable, in any locale; where one is closed, nothing is there."""
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull)  # noqa: PTH123, SIM115 (it stays open)
     for name, required in (("stdout", True), ("stderr", False)):
         stream = getattr(sys, name)
-        if stream is not None and not isinstance(stream, PrintableStream):
+        if stream is None:  # what is printed to None goes to the standard output
+            stream = open(os.devnull, "w")  # noqa: PTH123, SIM115
+        if not isinstance(stream, PrintableStream):
             if isinstance(stream, io.TextIOWrapper):
-                stream.reconfigure(errors="backslashreplace")
+                stream = _buffered(stream)
             setattr(sys, name, PrintableStream(stream, required=required))
+
+
+def _buffered(stream: io.TextIOWrapper) -> io.TextIOWrapper:
+    """The stream with a buffer and without an error of encoding.
+
+    Without a buffer (``PYTHONUNBUFFERED=1``, as in many containers) Python drops what a nearly full disk does not take.
+    """
+    if isinstance(stream.buffer, io.RawIOBase):
+        raw = io.FileIO(stream.fileno(), "w", closefd=False)
+        stream = io.TextIOWrapper(io.BufferedWriter(raw), encoding=stream.encoding, line_buffering=True)
+    stream.reconfigure(errors="backslashreplace")
+    return stream
 
 
 def release_streams() -> None:

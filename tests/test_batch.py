@@ -25,6 +25,7 @@ from tactile_bayes.batch import BatchInterrupted, fault_lines, run_batch
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.executors import InlineExecutor, cluster_executor, local_executor, open_executor
+from tactile_bayes.interruption import ended_in_order
 
 
 def draw(seed: int) -> tuple[int, float]:
@@ -697,3 +698,20 @@ def test_the_inline_executor_holds_what_an_item_raised():
     with InlineExecutor() as executor:
         future = executor.submit(refuse_odd, 1)
     assert isinstance(future.exception(), BadDataError)
+
+
+def test_an_interruption_that_an_item_lets_go_is_not_lost() -> None:
+    """As compiled modules do while they are imported: a batch went on for hours after SIGTERM."""
+
+    def deaf(item: int) -> int:
+        if item == 1:
+            with contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(5.0)
+        return item
+
+    before = signal.getsignal(signal.SIGTERM)
+    with ended_in_order(), pytest.raises(BatchInterrupted, match=r"2 of 9 done") as stop:
+        run_batch(deaf, range(9), key=str)
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert [one.value for one in stop.value.outcomes] == [0, 1]

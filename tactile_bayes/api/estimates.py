@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import Map, map_of
-from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.paths import PathLike, output_path, path_of
 from tactile_bayes.api.sized import MassEstimate, SizedExam
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
@@ -185,7 +185,7 @@ class SizeEstimate(SizedExam):
         """
         if self.status != "estimate":
             raise UsageError(f"there are no draws to write: {self.why}")
-        self.outcome.write(path_of(path), document=self.answer.document, force=force)
+        self.outcome.write(output_path(path, "netCDF"), document=self.answer.document, force=force)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

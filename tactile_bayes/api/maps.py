@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.paths import PathLike, output_path, path_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -95,7 +95,7 @@ class Map:
         """
         from tactile_bayes.files.map_nc import write_map
 
-        write_map(path_of(path), self.tactile_map, provenance=_provenance(self), force=force)
+        write_map(output_path(path, "netCDF"), self.tactile_map, provenance=_provenance(self), force=force)
 
     def __repr__(self) -> str:
         found = self.tactile_map

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import overload
 
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.file_names import Format, check_suffix
 
 PathLike = str | os.PathLike[str]
 
@@ -32,3 +33,16 @@ def path_of(given: PathLike | None) -> Path | None:
     if not isinstance(given, str | os.PathLike):
         raise UsageError(f"a path is wanted, not {type(given).__name__}; give it as text or pathlib.Path")
     return Path(given).expanduser()
+
+
+def output_path(given: PathLike, written: Format) -> Path:
+    """Convert to the path of an output.
+
+    Raises
+    ------
+    UsageError
+        As `path_of`, and when it has the suffix of another format than the one written.
+    """
+    path = path_of(given)
+    check_suffix(path, written)
+    return path

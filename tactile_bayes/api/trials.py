@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.paths import PathLike, output_path, path_of
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -156,6 +156,7 @@ def calibrate_size(
         raise TypeError(f"form is {form!r}; it is one of {', '.join(FORMS)}")
     if fit not in ("joint", "two-stage"):
         raise TypeError(f"fit is {fit!r}; it is 'joint' or 'two-stage'")
+    target = None if path is None else output_path(path, "JSON")
     source = _table(table, "table")
     over_bodies_alone = form != "eq6" or (correct is None and is_population(source))
     names = ("normalise",) if over_bodies_alone else ("normalise", "background", "fit_radius_mm", "noise")
@@ -168,8 +169,8 @@ def calibrate_size(
         if form != "eq6" or fit != "joint" or least_stiffness_ratio:
             raise TypeError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
         corrected = correct_size(source, str(correct), given, seed=seed)
-        if path is not None:
-            corrected.write(path_of(path), force=force)
+        if target is not None:
+            corrected.write(target, force=force)
         return corrected.calibration
     inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
     if over_bodies_alone:
@@ -178,15 +179,15 @@ def calibrate_size(
         over_bodies, settings = learn_population(
             read_table(source, "population.table.json"), form, declared.get("normalise")
         )
-        if path is not None:
+        if target is not None:
             provenance = Provenance("calibrate size", settings, inputs)
-            write_body_calibration(path_of(path), over_bodies, provenance=provenance, force=force)
+            write_body_calibration(target, over_bodies, provenance=provenance, force=force)
         return over_bodies
     rows = read_table(source, "size_table.table.json")
     learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)
-    if path is not None:
+    if target is not None:
         provenance = Provenance("calibrate size", learned.settings, inputs, seed=seed)
-        write_size_calibration(path_of(path), learned.calibration, provenance=provenance, force=force)
+        write_size_calibration(target, learned.calibration, provenance=provenance, force=force)
     return learned.calibration
 
 
@@ -218,10 +219,11 @@ def calibrate_repeatability(
     """
     from tactile_bayes.pipeline.repeatability import exams_in, learn_from_exams
 
+    target = None if path is None else output_path(path, "JSON")
     given = None if size_calibration is None else str(size_calibration)
     learned = learn_from_exams(exams_in(path_of(folder)), size_calibration=given)
-    if path is not None:
-        learned.write(path_of(path), force=force)
+    if target is not None:
+        learned.write(target, force=force)
     return learned.repeatability
 
 

@@ -27,7 +27,14 @@ def command() -> None:
 
 @command.command("size")
 @click.argument("table", metavar="TABLE.csv", type=_FILE)
-@click.option("-o", "--output", required=True, metavar="SIZE.json", type=_FILE, help="Where to write the calibration.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="SIZE.json",
+    type=FilePath(writes="JSON"),
+    help="Where to write the calibration.",
+)
 @click.option(
     "--form",
     type=click.Choice(["eq6", "log-quadratic", "gaussian-process"]),
@@ -224,7 +231,14 @@ def _over_bodies(table: Path, output: Path, form: PopulationForm, normalise: str
 
 @command.command("repeatability")
 @click.argument("folder", metavar="OUT", type=_FILE)
-@click.option("-o", "--output", required=True, metavar="SITE.json", type=_FILE, help="Where to write the spread.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="SITE.json",
+    type=FilePath(writes="JSON"),
+    help="Where to write the spread.",
+)
 @click.option(
     "--size-calibration",
     metavar="SIZE.json",
@@ -263,7 +277,14 @@ def repeatability(folder: Path, output: Path, size_calibration: str | None, forc
     required=True,
     help="The bladder's pressure and what the head recorded under it.",
 )
-@click.option("-o", "--output", required=True, metavar="ARRAY.json", type=_FILE, help="Where to write the calibration.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="ARRAY.json",
+    type=FilePath(writes="JSON"),
+    help="Where to write the calibration.",
+)
 @click.option("--head-id", metavar="ID", help="Identifier of the head. Default: what the scans state.")
 @click.option(
     "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="Day of the measurement. Default: today."

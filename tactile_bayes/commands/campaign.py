@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.options import FORCE, WORKERS, scheduler_option, seed_option
+from tactile_bayes.commands.options import FORCE, WORKERS, FiniteRange, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath, also_read, refuse_same
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARCH_USE
@@ -35,7 +35,9 @@ def command() -> None:
 
 @command.command("init")
 @click.argument("folder", metavar="FOLDER", type=FilePath(addresses=True))
-@click.option("-o", "--output", required=True, metavar="EXAMS.csv", type=_FILE, help="Where to write the table.")
+@click.option(
+    "-o", "--output", required=True, metavar="EXAMS.csv", type=FilePath(writes="CSV"), help="Where to write the table."
+)
 @click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
 @FORCE
 def init(folder: Path | str, output: Path, add: bool, force: bool) -> None:
@@ -128,7 +130,7 @@ def _to_correct(output: Path) -> str:
 )
 @click.option(
     "--match-mm",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     metavar="MM",
     default=15.0,
     show_default=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,26 +151,30 @@ def command(
     if figure is not None:
         refuse_existing(figure, force=force)
     also_read(None if size_calibration is None else size_calibration_path(size_calibration))
-    outcome = _compare(visits, settings, comparing, figure, force=force)
+    outcome, draw = _compare(visits, settings, comparing)
     check_document(outcome.document, "compare.schema.json", path=Path("the report"))
     text_of = dump_json if as_json else compare_text if verbose else compare_summary
-    click.echo(text_of(outcome.document), nl=False)
+    try:
+        if figure is not None:
+            draw(figure, force)
+    finally:  # what was computed is not lost with the figure
+        click.echo(text_of(outcome.document), nl=False)
     ctx.exit(outcome.exit_code)
 
 
 def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
     """Refuse a map that is given twice, and a checkpoint."""
-    every = [path for maps in visits for path in maps]
-    twice = [path for i, path in enumerate(every) if path in every[:i]]
-    if twice:
-        raise UsageError(f"{twice[0]} is given twice; give each map once, at its own visit")
+    from tactile_bayes.files.file_names import given_twice
+
+    if twice := given_twice(path for maps in visits for path in maps):
+        raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
     refuse_checkpoint(settings)
 
 
 def _compare(
-    visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing, figure: Path | None, *, force: bool
-) -> ComparedOutcome:
-    """Estimate every map, compare, and draw the figure; an error with one map stops it."""
+    visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing
+) -> tuple[ComparedOutcome, Callable[[Path, bool], None]]:
+    """Estimate every map and compare; also gives what draws the figure. An error with one map stops it."""
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.pipeline.compared import compare_answers, drawn_maps
     from tactile_bayes.pipeline.one_map import answer_of, estimate_file
@@ -183,9 +188,11 @@ def _compare(
     names = [[str(path) for path in maps] for maps in visits]
     inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
     compared = compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs)
-    if figure is not None:
+
+    def draw(figure: Path, force: bool) -> None:
         from tactile_bayes.report.compare_figure import draw_comparison
 
         drawn = drawn_maps([[outcome.tactile_map for outcome in maps] for maps in outcomes], answers)
         draw_comparison(compared.compared, compared.document, drawn, figure, force=force)
-    return compared
+
+    return compared, draw

@@ -138,15 +138,18 @@ class Steps:
 
 def _prepare(output: Path, *, force: bool) -> None:
     """Copy the embedded inputs to where the user can look at them."""
+    from tactile_bayes.files.atomic import unwritable, write_bytes
+
     if output.exists() and not output.is_dir():
         raise UsageError(f"{output} is a file; choose another name")
     if output.exists() and any(output.iterdir()) and not force:
         raise UsageError(f"{output} is not empty; choose another name or give --force")
-    output.mkdir(parents=True, exist_ok=True)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(output, error) from None
     for name in EMBEDDED:
-        target = output / name
-        shutil.copyfile(Path(__file__).resolve().parent.parent / "demo" / name, target)
-        target.chmod(0o600)
+        write_bytes(output / name, (Path(__file__).resolve().parent.parent / "demo" / name).read_bytes(), force=True)
 
 
 def _how_to_type(which: Callable[[str], str | None] = shutil.which) -> str:

@@ -7,6 +7,7 @@ import time
 import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
+from tactile_bayes.commands.options import FiniteRange
 
 
 @click.command("devices")
@@ -28,7 +29,7 @@ from tactile_bayes.commands.emulate import PROTOCOLS
 )
 @click.option(
     "--duration",
-    type=click.FloatRange(min=0.2),
+    type=FiniteRange(min=0.2),
     default=10.0,
     show_default=True,
     metavar="S",

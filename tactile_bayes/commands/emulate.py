@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.options import SPEED
+from tactile_bayes.commands.options import SPEED, FiniteRange
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import BadDataError, UsageError
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tactile_bayes.scan import Scan
 
 PROTOCOLS = ("open", "fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "igtlink", "ndi")
-_SHARE = click.FloatRange(0.0, 1.0)
+_SHARE = FiniteRange(0.0, 1.0)
 
 
 @click.command("emulate")
@@ -43,11 +43,11 @@ _SHARE = click.FloatRange(0.0, 1.0)
 @click.option("--corrupt", type=_SHARE, default=0.0, help="Share of the records with one bit changed.")
 @click.option(
     "--stall",
-    type=(float, float),
+    type=(FiniteRange(min=0.0), FiniteRange(min=0.0)),
     metavar="AT FOR",
     help="Send nothing for FOR s from AT s on; those records are lost.",
 )
-@click.option("--disconnect", type=click.FloatRange(min=0.0), metavar="AT", help="Disconnect at AT s.")
+@click.option("--disconnect", type=FiniteRange(min=0.0), metavar="AT", help="Disconnect at AT s.")
 @click.option(
     "--hold", type=click.IntRange(min=1), default=1, show_default=True, help="Tracker: measure only every n-th pose."
 )

@@ -22,6 +22,7 @@ from tactile_bayes.presets import METHODS, SCENES
 
 if TYPE_CHECKING:
     from tactile_bayes.batch import Outcome
+    from tactile_bayes.pipeline.one_map import Outcome as MapOutcome
 
 _FILE = FilePath()
 _DEFAULTS = Settings()
@@ -51,7 +52,13 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 @click.option(
     "--interval", type=_PROBABILITY, default=_DEFAULTS.interval, show_default=True, help="Probability of the intervals."
 )
-@click.option("-o", "--output", metavar="POST.nc", type=_FILE, help="Write all draws (netCDF that arviz opens).")
+@click.option(
+    "-o",
+    "--output",
+    metavar="POST.nc",
+    type=FilePath(writes="netCDF"),
+    help="Write all draws (netCDF that arviz opens).",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
 @click.option(
     "--figure", metavar=METAVAR, type=FigurePath(), help="Draw the size posterior, or the map where there is no size."
@@ -188,13 +195,19 @@ def command(
         printed = {"as_json": as_json, "verbose": verbose}
         ctx.exit(estimate_pool(maps, answers, settings, output, figure, **printed, force=force))
     if len(maps) == 1:
-        answers = [_one_map(maps[0], settings, output, (figure, map_figure, fit_figure), force=force)]
+        outcome = _one_map(maps[0], settings)
+        answers = [answer_of(outcome)]
     else:
+        outcome = None
         with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
-    if verbose:
-        print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
-    _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
+    try:
+        if outcome is not None:
+            _write(outcome, answers[0], output, (figure, map_figure, fit_figure), name=maps[0].stem, force=force)
+    finally:  # what was computed is not lost with a file
+        if verbose:
+            print(f"estimate: {time.perf_counter() - begun:.3f} s", file=sys.stderr)
+        _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
     ctx.exit(_exit_code(answers))
 
 
@@ -207,40 +220,43 @@ def _named(calibration: str | None) -> Path | None:
 def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, force: bool) -> None:
     """Raise an error, before any work is done, if an output cannot be written."""
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.file_names import given_twice
 
-    twice = [path for index, path in enumerate(maps) if path in maps[:index]]
-    if twice:
-        raise UsageError(f"{twice[0]} is given twice; give each map once")
+    if twice := given_twice(maps):
+        raise UsageError(f"{twice} is given twice; give each map once")
     if outputs and len(maps) > 1 and not pool:
         raise UsageError("--output and the figures take one map at a time; use --json for several")
     for path in outputs:
         refuse_existing(path, force=force)
 
 
-def _one_map(
-    path: Path,
-    settings: Settings,
-    output: Path | None,
-    figures: tuple[Path | None, Path | None, Path | None],
-    *,
-    force: bool,
-) -> Answer:
+def _one_map(path: Path, settings: Settings) -> MapOutcome:
     from tactile_bayes.commands.progress import progress_bar
 
     with progress_bar("effective draws") as progress:
-        outcome = estimate_file(
+        return estimate_file(
             path, settings, progress=progress, notice=lambda line: click.echo(f"{path}: {line}", err=True)
         )
-    tactile_map, estimate, answer = outcome.tactile_map, outcome.estimate, answer_of(outcome)
+
+
+def _write(
+    outcome: MapOutcome,
+    answer: Answer,
+    output: Path | None,
+    figures: tuple[Path | None, Path | None, Path | None],
+    *,
+    name: str,
+    force: bool,
+) -> None:
+    tactile_map, estimate = outcome.tactile_map, outcome.estimate
     if output and estimate.status == "estimate":
         outcome.write(output, document=answer.document, force=force)
     if any(figures):
         from tactile_bayes.report.estimate_figures import draw_figures
         from tactile_bayes.report.figure_title import named_exam
 
-        name = named_exam(path.stem, outcome.provenance.scans)
-        draw_figures(tactile_map, estimate, *figures, name=name, probability=settings.interval, force=force)
-    return answer
+        name = named_exam(name, outcome.provenance.scans)
+        draw_figures(tactile_map, estimate, *figures, name=name, probability=outcome.settings.interval, force=force)
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:

@@ -42,10 +42,12 @@ def estimate_pool(
     inputs = {f"map_{i + 1}": one for i, one in enumerate(maps)}
     found = pool_answers(answers, settings, names=[str(one) for one in maps], inputs=inputs)
     check_document(found.document, "pooled.schema.json", path=Path("the report"))
-    if found.pooled.size is not None:
-        _write(found.pooled, maps, settings, output, figure, provenance=found.provenance, force=force)
     text_of = dump_json if as_json else pooled_text if verbose else pooled_summary
-    click.echo(text_of(found.document), nl=False)
+    try:
+        if found.pooled.size is not None:
+            _write(found.pooled, maps, settings, output, figure, provenance=found.provenance, force=force)
+    finally:  # what was computed is not lost with a file
+        click.echo(text_of(found.document), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
 
 

@@ -61,9 +61,11 @@ def command(
     """
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.file_names import check_suffix
 
     refuse_existing(output, force=force)
     kind = kind or _kind_of(source, output)
+    check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
     if kind == "scan" and (spacing_mm is not None or normalise is not None or units is not None):
         raise UsageError("--spacing-mm, --normalise and --units are for maps; leave them out or give --as map")
     if kind == "map" and session_file is not None:

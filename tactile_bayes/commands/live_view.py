@@ -265,7 +265,8 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
     from tactile_bayes.hardware.live import LiveMap
     from tactile_bayes.hardware.serve import LiveServer, address_of
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the recording, and that ends the view
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends the recording, and that ends the view
     reader = FeedReader(pipe)
     live = LiveMap(head_from_document(setup["head"]), calibration_from_document(setup["calibration"]))
     estimator = Estimator(setup["size_calibration"])

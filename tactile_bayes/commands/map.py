@@ -19,7 +19,9 @@ _FILE = FilePath()
 
 @click.command("map")
 @click.argument("scans", metavar="SCAN.mcap...", nargs=-1, required=True, type=_FILE)
-@click.option("-o", "--output", required=True, metavar="MAP.nc", type=_FILE, help="Where to write the map.")
+@click.option(
+    "-o", "--output", required=True, metavar="MAP.nc", type=FilePath(writes="netCDF"), help="Where to write the map."
+)
 @click.option("--cell-mm", type=float, default=CELL_MM, show_default=True, help="Side of the square cells, mm.")
 @PRESSURE_WINDOW
 @click.option(
@@ -85,6 +87,7 @@ def command(
     """
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.map_nc import write_map
+    from tactile_bayes.files.provenance import repeated_scans
     from tactile_bayes.mapping import build_map
     from tactile_bayes.pipeline.scans import load_scans, map_provenance
     from tactile_bayes.report.map_text import map_text
@@ -102,6 +105,9 @@ def command(
     }
     clock = _Clock(verbose)
     loaded, lost = load_scans(scans)
+    provenance = map_provenance(scans, loaded, settings)
+    for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():
+        raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
     clock.tell("read")
     with progress_bar("frames") as progress:
         tactile_map = build_map(
@@ -117,24 +123,26 @@ def command(
             progress=progress,
         )
     clock.tell("map")
-    provenance = map_provenance(scans, loaded, settings)
     write_map(output, tactile_map, provenance=provenance, force=force)
-    if figure:
-        from tactile_bayes.report.figure_title import named_exam
-        from tactile_bayes.report.map_figure import map_figure
+    try:
+        if figure:
+            from tactile_bayes.report.figure_title import named_exam
+            from tactile_bayes.report.map_figure import map_figure
 
-        title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
-        map_figure(tactile_map, figure, title=title, force=force)
-    clock.tell("write")
-    click.echo(map_text(tactile_map, lost=lost), nl=False)
+            title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
+            map_figure(tactile_map, figure, title=title, force=force)
+        clock.tell("write")
+    finally:  # the map is written, whatever becomes of the figure
+        click.echo(map_text(tactile_map, lost=lost), nl=False)
 
 
 def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:
     """Raise an error, before any work, for an output that cannot be written or a scan given twice."""
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.file_names import given_twice
 
-    if len({path.absolute() for path in scans}) < len(scans):
-        raise UsageError("a scan is given twice; its frames would count twice")
+    if twice := given_twice(scans):
+        raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
     for path in [output, *([figure] if figure else [])]:
         refuse_existing(path, force=force)
 

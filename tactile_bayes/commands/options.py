@@ -65,6 +65,8 @@ class NumberOr(_ParamType):
             self.fail(f"{value!r} is not a number, nor {' nor '.join(map(repr, self.words))}", param, ctx)
 
 
+MOST_ITEMS = 1_000_000
+"""Of a batch: memory holds a name and an outcome for each."""
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 SESSION = click.option(
     "--session",
@@ -84,7 +86,7 @@ PRESSURE_WINDOW = click.option(
 )
 SPEED = click.option(
     "--speed",
-    type=click.FloatRange(0.01, 100.0),
+    type=FiniteRange(0.01, 100.0),
     default=1.0,
     show_default=True,
     help="Playback speed; 1 is real time.",

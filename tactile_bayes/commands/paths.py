@@ -10,6 +10,7 @@ from typing import Any, Final
 import click
 
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.file_names import Format, check_suffix, same_file
 
 WRITTEN: Final = frozenset(
     {"output", "figure", "map_figure", "fit_figure", "figures", "html", "pdf", "trace", "rank", "corner", "dictionary"}
@@ -27,11 +28,13 @@ class FilePath(click.Path):
     ----------
     addresses
         Whether the address of an object store may stand instead; it stays a text.
+    writes
+        Format of the output that it names; a suffix of another one is refused.
     """
 
-    def __init__(self, *, addresses: bool = False) -> None:
-        super().__init__(path_type=Path)
-        self._addresses = addresses
+    def __init__(self, *, addresses: bool = False, writes: Format | None = None) -> None:
+        super().__init__(path_type=Path, readable=False)  # its reader says it in one line
+        self._addresses, self._writes = addresses, writes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Record and return the path.
@@ -39,7 +42,8 @@ class FilePath(click.Path):
         Raises
         ------
         UsageError
-            When it is written and another argument of the command reads or writes it.
+            When it is written and another argument of the command reads or writes it, or it has the suffix of another
+            format.
         """
         if self._addresses and "://" in str(value):
             return str(value)
@@ -53,6 +57,8 @@ class FilePath(click.Path):
                 elif written or other_written:
                     refuse_same([path], [other])
             seen.append((path, written))
+        if self._writes is not None:
+            check_suffix(path, self._writes)
         return path
 
 
@@ -83,12 +89,5 @@ def refuse_same(
     """
     read = list(inputs)
     for path in outputs:
-        if path is not None and any(_same(path, one) for one in read):
+        if path is not None and any(same_file(path, one) for one in read):
             raise UsageError(f"{path} is {what}; choose another name for the output")
-
-
-def _same(one: Path, other: Path) -> bool:
-    try:
-        return os.path.realpath(one) == os.path.realpath(other) or one.samefile(other)
-    except OSError:  # one of them does not exist, or its name is too long: opening it says so
-        return False

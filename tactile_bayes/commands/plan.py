@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, WORKERS, FiniteRange, seed_option
+from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, FiniteRange, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.errors import UsageError
 
@@ -68,12 +68,18 @@ _ERRORS = ("tactile_bias", "mass_sd", "map_sd", "other_bias", "other_sd", "other
 @click.option("--excision", metavar="EX.csv", type=_FILE, help="Sizes measured after excision in the pilot.")
 @click.option("--against", default="ultrasound", show_default=True, help="Modality of the pilot to compare with.")
 @click.option(
-    "--trials", type=click.IntRange(50), default=1000, show_default=True, help="Number of simulated trials per design."
+    "--trials",
+    type=click.IntRange(50, MOST_ITEMS),
+    default=1000,
+    show_default=True,
+    help="Number of simulated trials per design.",
 )
 @seed_option(1999)
 @WORKERS
 @JSON
-@click.option("-o", "--output", metavar="PLAN.json", type=_FILE, help="Write the plan as JSON to this file.")
+@click.option(
+    "-o", "--output", metavar="PLAN.json", type=FilePath(writes="JSON"), help="Write the plan as JSON to this file."
+)
 @FORCE
 def command(
     patients: tuple[int, ...],
@@ -117,9 +123,11 @@ def command(
     sources = _sources(typed, pilot=pilot is not None)
     document = _document(cases, _simulate(cases, workers=workers), errors, sources, files)
     check_document(document, "plan.schema.json", path=output or Path("the plan"))
-    if output:
-        write_text(output, dump_json(document), force=force)
-    click.echo(dump_json(document) if as_json else _text(document), nl=False)
+    try:
+        if output:
+            write_text(output, dump_json(document), force=force)
+    finally:  # what was computed is not lost with the file
+        click.echo(dump_json(document) if as_json else _text(document), nl=False)
 
 
 def _sources(typed: set[str], *, pilot: bool) -> dict[str, str]:

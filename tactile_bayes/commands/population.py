@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, WORKERS, scheduler_option, seed_option
+from tactile_bayes.commands.options import FORCE, MOST_ITEMS, WORKERS, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
@@ -21,18 +21,24 @@ _FILE = FilePath()
 
 
 @click.command("population")
-@click.option("-o", "--output", required=True, metavar="TABLE.csv", type=_FILE, help="Where to write the table.")
 @click.option(
-    "--masses", type=click.IntRange(min=1), default=400, show_default=True, help="Number of bodies, one lump each."
+    "-o", "--output", required=True, metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Where to write the table."
+)
+@click.option(
+    "--masses",
+    type=click.IntRange(1, MOST_ITEMS),
+    default=400,
+    show_default=True,
+    help="Number of bodies, one lump each.",
 )
 @click.option(
     "--centred",
-    type=click.IntRange(min=0),
+    type=click.IntRange(0, MOST_ITEMS),
     default=0,
     show_default=True,
     help="Further bodies whose lump is centred on the gland's surface, as the paper has it.",
 )
-@click.option("--scans", type=click.IntRange(min=1), default=2, show_default=True, help="Number of exams per body.")
+@click.option("--scans", type=click.IntRange(1, 1000), default=2, show_default=True, help="Number of exams per body.")
 @click.option(
     "--normalise",
     type=click.Choice(["gain", "mean"]),

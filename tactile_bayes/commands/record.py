@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.emulate import PROTOCOLS
-from tactile_bayes.commands.options import FORCE, live_options
+from tactile_bayes.commands.options import FORCE, FiniteRange, live_options
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.commands.record_request import Request
 from tactile_bayes.errors import EXIT_INTERRUPTED, DeviceError, UsageError
@@ -25,7 +25,9 @@ _CODE = "A code, not a name."
 
 
 @click.command("record")
-@click.option("-o", "--output", required=True, metavar="SCAN.mcap", type=_FILE, help="Scan file to write.")
+@click.option(
+    "-o", "--output", required=True, metavar="SCAN.mcap", type=FilePath(writes="MCAP"), help="Scan file to write."
+)
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
 @click.option("--tracker", "tracker_url", metavar="URL", help="Port of the tracker; without, there are no poses.")
 @click.option(
@@ -52,7 +54,7 @@ _CODE = "A code, not a name."
 @click.option(
     "--duration",
     "duration_s",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     metavar="S",
     help="Stop after this time, s.",
 )
@@ -80,7 +82,7 @@ _CODE = "A code, not a name."
 )
 @click.option(
     "--calibration-days",
-    type=click.FloatRange(min=0.0),
+    type=FiniteRange(min=0.0),
     default=1.0,
     show_default=True,
     help="Age from which an array calibration is stale, days.",
@@ -148,7 +150,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
 
     from tactile_bayes.commands.record_keys import Stopper
     from tactile_bayes.commands.record_parts import calibration_age, instrument_of, provenance_of, refuse_calibration
-    from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.atomic import refuse_existing, unwritable
     from tactile_bayes.files.scan_recording import RecordingWriter, create_exclusive, full_disk
     from tactile_bayes.files.schema import check_document
     from tactile_bayes.files.session_toml import SCHEMA
@@ -166,13 +168,16 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         refuse_calibration(request, head_id=hello.device_id, today=date.today())
         observer = _look_on(request, head, calibration, stack)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
-        writer = RecordingWriter(
-            stream,
-            head=head,
-            element_calibration=calibration,
-            session=session,
-            provenance=provenance_of(request, request.settings(hello)),
-        )
+        provenance = provenance_of(request, request.settings(hello))
+        try:
+            writer = RecordingWriter(
+                stream, head=head, element_calibration=calibration, session=session, provenance=provenance
+            )
+        except OSError as error:
+            with suppress(OSError):  # what is still in its buffer cannot be written either
+                stream.close()
+            request.output.unlink(missing_ok=True)  # it holds nothing of a scan yet
+            raise unwritable(request.output, error) from None
         stack.callback(writer.stop_syncing)
         recorder = Recorder(
             *lines,

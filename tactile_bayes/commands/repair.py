@@ -14,7 +14,11 @@ from tactile_bayes.presets import RESEARCH_USE
 @click.command("repair")
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
 @click.option(
-    "-o", "--output", metavar="OUT.mcap", type=FilePath(), help="Write to this file instead of replacing SCAN.mcap."
+    "-o",
+    "--output",
+    metavar="OUT.mcap",
+    type=FilePath(writes="MCAP"),
+    help="Write to this file instead of replacing SCAN.mcap.",
 )
 @FORCE
 def command(*, scan: Path, output: Path | None, force: bool) -> None:

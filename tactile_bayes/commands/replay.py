@@ -20,7 +20,7 @@ _FILE = FilePath()
 
 @click.command("replay")
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
-@click.option("-o", "--output", metavar="OUT.mcap", type=_FILE, help="Save what is recorded.")
+@click.option("-o", "--output", metavar="OUT.mcap", type=FilePath(writes="MCAP"), help="Save what is recorded.")
 @live_options
 @SPEED
 @FORCE
@@ -64,6 +64,7 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
+        start_new_session=True,  # Ctrl-C and what `timeout` sends are for the recorder: a device goes on meanwhile
     )
     assert process.stdout is not None
     try:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, JSON, WORKERS, WholeOrAuto, scheduler_option, seed_option
+from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, WholeOrAuto, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath
 from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 
@@ -25,7 +25,7 @@ _FILE = FilePath()
 
 
 @click.command("sbc")
-@click.option("--maps", type=click.IntRange(min=1), default=200, show_default=True, help="Maps to simulate.")
+@click.option("--maps", type=click.IntRange(1, MOST_ITEMS), default=200, show_default=True, help="Maps to simulate.")
 @click.option(
     "--method",
     type=click.Choice(["laplace", "importance", "ensemble"]),
@@ -48,7 +48,7 @@ _FILE = FilePath()
     "-o",
     "--output",
     metavar="TABLE.csv",
-    type=_FILE,
+    type=FilePath(writes="CSV"),
     help="Write truths and ranks; an interrupted run resumes from it.",
 )
 @click.option("--figure", metavar=METAVAR, type=FigurePath(), help="Draw the ECDFs of the ranks with their bands.")
@@ -104,10 +104,12 @@ def command(
     found = [outcome.value for outcome in outcomes if outcome.value is not None]
     if output is not None:
         write_text(output, table_text(found), force=force)
-    if figure is not None:
-        sbc_figure(found, figure, force=force)
     failed = _finish(outcomes, output)
-    report(found, speed)
+    try:
+        if figure is not None:
+            sbc_figure(found, figure, force=force)
+    finally:  # what was computed is not lost with the figure
+        report(found, speed)
     if failed:
         raise TactileBayesError(f"{failed} of {len(outcomes)} maps are missing from this report")
 

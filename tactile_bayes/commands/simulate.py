@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.command("simulate")
 @click.argument("scene", type=FilePath())
-@click.option("-o", "--output", required=True, type=FilePath(), help="Scan file to write (.mcap).")
+@click.option("-o", "--output", required=True, type=FilePath(writes="MCAP"), help="Scan file to write (.mcap).")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the random numbers, in place of the scene's.")
 @click.option(
     "--fidelity",

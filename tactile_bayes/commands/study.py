@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _FILE = FilePath()
 _ABOVE_0 = FiniteRange(min=0.0, min_open=True)
+_RADIUS = FiniteRange(min=0.0, max=1e6, min_open=True)
 # The line is a map that does not change in y: a bump of this width there.
 _NO_CHANGE_MM = 1e6
 _GRID_SCHEMA = "study_grid.table.json"
@@ -54,7 +55,9 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
     metavar="centred|resting|0..2",
     help="How far the lump stands out of the gland, if the grid does not state it.",
 )
-@click.option("-o", "--output", metavar="TABLE.csv", type=_FILE, help="Write the table. Default: print it.")
+@click.option(
+    "-o", "--output", metavar="TABLE.csv", type=FilePath(writes="CSV"), help="Write the table. Default: print it."
+)
 @click.option(
     "--figures",
     metavar="DIR",
@@ -74,7 +77,7 @@ RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
     metavar="D H/D",
     help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
 )
-@click.option("--head-radius-mm", type=_ABOVE_0, default=35.0, show_default=True, help="Radius of the head's arc.")
+@click.option("--head-radius-mm", type=_RADIUS, default=35.0, show_default=True, help="Radius of the head's arc.")
 @click.option(
     "--shoulder-mm",
     type=float,

@@ -65,6 +65,7 @@ def command(
     from tactile_bayes.commands.tradeoff_options import forecast, show
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.file_names import given_twice
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.pipeline.tradeoff import pooled_rows, tradeoff_of_map
@@ -74,8 +75,8 @@ def command(
         also_read(size_calibration_path(size_calibration))
     if figure is not None:
         refuse_existing(figure, force=force)
-    if len(set(maps)) < len(maps):
-        raise UsageError("a map is given twice; give each map once")
+    if twice := given_twice(maps):
+        raise UsageError(f"{twice} is given twice; give each map once")
     settings = settings_of(settings_file, calibration=size_calibration, centre_mm=centre_mm, seed=seed)
     if len(maps) > 1 and centre_mm is not None:
         raise UsageError("--centre-mm is a place on one map; give one map")

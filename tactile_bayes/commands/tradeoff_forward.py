@@ -42,7 +42,11 @@ LEARNED = "learned"
     help="Error in size below which more accuracy is not worth its cost.",
 )
 @click.option(
-    "--runs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of runs; the shortest time counts."
+    "--runs",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    help="Number of runs; the shortest time counts.",
 )
 @JSON
 @FORCE
@@ -84,14 +88,15 @@ def command(
     if size_calibration not in (None, "learned"):
         also_read(size_calibration_path(size_calibration))
     report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
-    if figure is not None:
-        from tactile_bayes.report.tradeoff_figures import draw_tradeoff
+    try:
+        if figure is not None:
+            from tactile_bayes.report.tradeoff_figures import draw_tradeoff
 
-        draw_tradeoff(report, figure, force=force)
+            draw_tradeoff(report, figure, force=force)
+    finally:  # what was measured is not lost with the figure
+        click.echo(json.dumps(tradeoff_document(report), indent=2) if as_json else tradeoff_text(report))
     if as_json:
-        click.echo(json.dumps(tradeoff_document(report), indent=2))
         return
-    click.echo(tradeoff_text(report))
     if figure is not None:
         click.echo(f"the figure is in {figure}")
     click.echo(RESEARCH_USE)

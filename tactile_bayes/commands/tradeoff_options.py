@@ -22,7 +22,7 @@ TOLERANCE = click.option(
 )
 RUNS = click.option(
     "--runs",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 1000),
     default=3,
     show_default=True,
     help="Number of runs of each setting: the least time counts, errors are averaged.",
@@ -56,12 +56,14 @@ def show(
     from tactile_bayes.report.ladder_figure import draw_ladder
     from tactile_bayes.report.ladder_text import ladder_text
 
-    if figure is not None:
-        draw_ladder(ladder, figure, title=title, force=force)
-    if as_json:
-        document = ladder_document(ladder, what=what, provenance=provenance)
-        check_document(document, SCHEMA_FILE, path=Path("the report"))
-        click.echo(dump_json(document), nl=False)
-    else:
-        click.echo(ladder_text(ladder))
+    try:
+        if figure is not None:
+            draw_ladder(ladder, figure, title=title, force=force)
+    finally:  # what was measured is not lost with the figure
+        if as_json:
+            document = ladder_document(ladder, what=what, provenance=provenance)
+            check_document(document, SCHEMA_FILE, path=Path("the report"))
+            click.echo(dump_json(document), nl=False)
+        else:
+            click.echo(ladder_text(ladder))
     return EXIT_NO_ESTIMATE if ladder.reference.answer is None else EXIT_DONE

@@ -57,8 +57,15 @@ _DEFAULTS = TrialSettings()
 )
 @click.option("--methods", is_flag=True, help="Also print lines, limits of agreement, repeatability and pairs.")
 @JSON
-@click.option("-o", "--output", metavar="REPORT.json", type=_FILE, help="Write the report as JSON to this file.")
-@click.option("--html", metavar="REPORT.html", type=_FILE, help="Write tables and figures as one self-contained page.")
+@click.option(
+    "-o", "--output", metavar="REPORT.json", type=FilePath(writes="JSON"), help="Write the report as JSON to this file."
+)
+@click.option(
+    "--html",
+    metavar="REPORT.html",
+    type=FilePath(writes="HTML"),
+    help="Write tables and figures as one self-contained page.",
+)
 @click.option(
     "--protocol", metavar="FILE.toml", type=_FILE, help="Pre-specified analysis; the report records its hash."
 )
@@ -96,14 +103,16 @@ def command(
     outcome = analyse(inputs, chosen, protocol=protocol, title=title)
     if output or as_json:
         check_document(outcome.document, "validate.schema.json", path=output or Path("the report"))
-    if output:
-        write_text(output, dump_json(outcome.document), force=force)
-    if html:
-        _write_html(html, outcome, force=force)
-    if as_json:
-        for doubt in outcome.report.doubts:
-            click.echo(f"doubtful: {doubt}", err=True)
-    click.echo(dump_json(outcome.document) if as_json else _text(outcome, methods=methods), nl=False)
+    try:
+        if output:
+            write_text(output, dump_json(outcome.document), force=force)
+        if html:
+            _write_html(html, outcome, force=force)
+    finally:  # what was computed is not lost with a file
+        if as_json:
+            for doubt in outcome.report.doubts:
+                click.echo(f"doubtful: {doubt}", err=True)
+        click.echo(dump_json(outcome.document) if as_json else _text(outcome, methods=methods), nl=False)
 
 
 def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, TrialSettings]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.exports.run import Exported
+    from tactile_bayes.files.file_names import Format
+
+_WRITTEN: Final[dict[str, Format]] = {"csv": "CSV", "fhir": "JSON", "nrrd": "NRRD"}
+"""Formats of exports that are one file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,7 @@ class Outputs:
         UsageError
         """
         from tactile_bayes.files.atomic import refuse_existing
+        from tactile_bayes.files.file_names import check_suffix, same_file
 
         if not files and self.dictionary is None:
             raise UsageError("no file was given to export; give a map, an estimate or both")
@@ -51,10 +55,11 @@ class Outputs:
             raise UsageError(f"no file was given to export to {self.path}; give a map, an estimate or both")
         if self.dictionary is not None and self.to != "csv":
             raise UsageError("--dictionary is REDCap's; give it with --to csv")
-        if None not in (self.path, self.dictionary) and _real(self.path) == _real(self.dictionary):
+        if self.path is not None and self.dictionary is not None and same_file(self.path, self.dictionary):
             raise UsageError(f"{self.path} is to hold records and dictionary; choose another name for one of them")
-        for path in (self.dictionary, None if self.to == "dicom" else self.path):
-            if path is not None:
+        for path, written in ((self.dictionary, "CSV"), (self.path, _WRITTEN.get(self.to))):
+            if path is not None and written is not None:
+                check_suffix(path, written)
                 refuse_existing(path, force=self.force)
 
     def write(self, exported: Exported | None) -> tuple[Path, ...]:
@@ -82,10 +87,6 @@ class Outputs:
                 folder.rmdir()
             raise
         return tuple(paths)
-
-
-def _real(path: Path | None) -> str:
-    return "" if path is None else os.path.realpath(path)
 
 
 def _prepared_folder(folder: Path, names: set[str], *, force: bool) -> Path | None:

@@ -73,7 +73,8 @@ def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
         When it cannot be read or is not TOML, is too large or too deep, or holds a number that no double holds.
     """
     try:
-        return parse_toml(read_text(path, most=TOML_BYTES, way_out=way_out), way_out=way_out)
+        text = read_text(path, most=TOML_BYTES, way_out=way_out)
+        return parse_toml(text.removeprefix("\ufeff"), way_out=way_out)  # the mark that some editors begin a file with
     except BadDataError as error:
         raise error.at(path) from None
 

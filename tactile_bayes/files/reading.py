@@ -24,6 +24,8 @@ TABLE_BYTES: Final = 32 * 10**6
 IMAGE_BYTES: Final = 128 * 10**6
 NETCDF_BYTES: Final = 256 * 10**6
 CELLS: Final = 2**24
+UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
+"""Marks that text of this encoding begins with."""
 _UNPACKED_BYTES: Final = 64 * 10**6
 _UNPACKED_TIMES: Final = 32
 
@@ -81,6 +83,8 @@ def read_bytes(path: Path, *, most: int) -> bytes:
 def read_text(path: Path, *, most: int, way_out: str) -> str:
     """A file's UTF-8 text; see `read_bytes` for limits and errors."""
     data = read_bytes(path, most=most)
+    if data[:2] in UTF_16:
+        raise BadDataError("is UTF-16 text", way_out="save it as UTF-8", path=str(path))
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:

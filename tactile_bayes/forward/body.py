@@ -12,6 +12,8 @@ POISSON = 0.495
 THICKNESS_MM = 70.0
 LEAST_DEPTH_RATIO = 0.52
 MOST_SEAT = 2.0
+# Lumps and layers outside are no breast's: a mesh of them would have elements without end, or none that differ.
+LEAST_MM, MOST_MM = 0.1, 1e4
 # A lump that reaches less than this far into the gland, in radii, rests on it: the mesh could not tell its nodes apart.
 _RESTS = 1e-4
 # A film of fat under the lump that is thinner than this, in radii, is none: no element could be as thin.
@@ -46,6 +48,7 @@ class Layers:
 
     def __post_init__(self) -> None:
         _require(0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"above 0 and below {self.thickness_mm:g}")
+        _require(self.thickness_mm < MOST_MM, "thickness_mm", self.thickness_mm, f"below {MOST_MM:g}")
         _require(self.fat_kpa > 0, "fat_kpa", self.fat_kpa, "above 0")
         _require(self.gland_ratio > 0, "gland_ratio", self.gland_ratio, "above 0")
         _require(0 <= self.poisson < 0.5, "poisson", self.poisson, "at least 0 and below 0.5")
@@ -84,7 +87,7 @@ class Body:
     poisson: float = POISSON
 
     def __post_init__(self) -> None:
-        _require(0 < self.d_mm < 1e4, "d_mm", self.d_mm, "above 0, in mm")
+        _require(LEAST_MM <= self.d_mm < MOST_MM, "d_mm", self.d_mm, f"at least {LEAST_MM:g} and below {MOST_MM:g}")
         limit = f"at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
         _require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
         _require(0 <= self.seat <= MOST_SEAT, "seat", self.seat, f"between 0 (centred) and {MOST_SEAT:g}; 1 is resting")

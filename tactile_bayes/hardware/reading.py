@@ -65,7 +65,8 @@ def ask_for_priority() -> None:
 
 def main() -> None:
     """Run the reader with the garbage collector frozen."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the recorder, which still needs what is on its way
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # for the recorder, which ends in order and needs what is on its way
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     ask_for_priority()
     gc.freeze()

@@ -101,7 +101,7 @@ class Stream:
     def stop(self) -> None:
         """Stop the reader; what it has passed on can still be read."""
         with contextlib.suppress(ProcessLookupError):
-            self.process.terminate()
+            self.process.kill()  # it ignores what a terminal or a service manager sends to all of a recording
 
     def close(self) -> None:
         """Stop the reader, add up its CPU time, and close the pipe."""

@@ -24,22 +24,26 @@ _BESIDE: Final = ("repeatability",)
 
 @contextlib.contextmanager
 def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | None]:
-    """Open the journal of a folder, which is made if need be; None for a dry run in a folder without one.
+    """Open the journal of a folder, which is made if need be; for a dry run read it only, None where there is none.
 
     Raises
     ------
     UsageError
-        When the folder holds something else, another run is using it, or it cannot be made.
+        When the folder holds something else, another run is using it, or it cannot be made or read.
     """
     journal = folder / JOURNAL
-    if not journal.exists():
-        if folder.is_dir() and any(folder.iterdir()):
+    try:
+        begun, used = journal.exists(), folder.is_dir() and any(folder.iterdir())
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be read ({error.strerror}); choose another folder") from None
+    if not begun:
+        if used:
             raise UsageError(f"{folder} holds files, and no campaign; choose a new folder")
         if dry:
             yield None
             return
         _make(folder)
-    with open_store(journal, settings=_HEADER, encode=_taken) as store:
+    with open_store(journal, settings=_HEADER, encode=_taken, read_only=dry) as store:
         yield store
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.file_names import given_twice
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.one_map import Answer, answer_of, estimate_one
 from tactile_bayes.pipeline.pooled import pool_answers
@@ -85,9 +86,8 @@ class ExamFiles:
         UsageError
             When a file is given twice, or several estimates are.
         """
-        twice = [path for index, path in enumerate(paths) if path in paths[:index]]
-        if twice:
-            raise UsageError(f"{twice[0]} is given twice; give each file once")
+        if twice := given_twice(paths):
+            raise UsageError(f"{twice} is given twice; give each file once")
         estimates = tuple(path for path in paths if _is_json(path) or _is_posterior(path))
         maps = tuple(path for path in paths if path not in estimates)
         if len(estimates) > 1 or (estimates and len(maps) > 1):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,15 +34,19 @@ class PageFiles:
         Raises
         ------
         UsageError
-            When a file exists and `force` is false, both are one file, or nothing is installed that prints.
+            When a file exists and `force` is false, both are one file, one has the suffix of another format, or nothing
+            is installed that prints.
         """
         from tactile_bayes.files.atomic import refuse_existing
+        from tactile_bayes.files.file_names import check_suffix, same_file
         from tactile_bayes.report.printed import find_printer
 
+        check_suffix(self.html, "HTML")
         refuse_existing(self.html, force=self.force)
         if self.pdf is not None:
-            if os.path.realpath(self.pdf) == os.path.realpath(self.html):
+            if same_file(self.pdf, self.html):
                 raise UsageError(f"{self.pdf} is page and PDF at once; choose another name for one of them")
+            check_suffix(self.pdf, "PDF")
             refuse_existing(self.pdf, force=self.force)
             find_printer()
 

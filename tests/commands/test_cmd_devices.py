@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
-from emulated_devices import serving, short_scan
+from emulated_devices import serving, short_scan, wait_for_bytes
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
@@ -109,3 +114,25 @@ def test_a_replay_goes_the_way_of_a_recording(run_cli, tmp_path):
     shown = run_cli("show", "b.mcap", cwd=tmp_path)
     assert "frames_missing  0" in shown.stdout
     assert "the head stopped" in shown.stdout
+
+
+def test_a_signal_to_a_replay_and_its_devices_ends_it_in_order(tmp_path, child_environment):
+    """With `timeout` the emulated devices died first: "the device has gone", exit code 4."""
+    write_scan(tmp_path / "a.mcap", short_scan(20.0), provenance=Provenance("test", {}))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactile_bayes", "replay", "a.mcap", "-o", "b.mcap"],
+        cwd=tmp_path,
+        env=child_environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        wait_for_bytes(tmp_path / "b.mcap", 60_000)
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "ended by SIGTERM" in out

@@ -10,6 +10,7 @@ from pathlib import Path
 import mapping_scans as scans
 import numpy as np
 import pytest
+from in_process import run_here
 
 from tactile_bayes.files.map_nc import read_map, read_map_header
 from tactile_bayes.files.provenance import Provenance
@@ -126,6 +127,23 @@ def test_what_cannot_be_mapped_ends_in_one_line_and_no_file(folder, run_cli, wor
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
     assert sorted(path.name for path in folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("kind", ["symbolic link", "hard link", "copy"])
+def test_a_recording_counts_once_under_any_name(kind, folder):
+    """Its frames counted twice, and the map's errors came out too small."""
+    again = folder / "again.mcap"
+    if kind == "symbolic link":
+        again.symlink_to("one.mcap")
+    elif kind == "hard link":
+        again.hardlink_to(folder / "one.mcap")
+    else:
+        again.write_bytes((folder / "one.mcap").read_bytes())
+    done = run_here("map", "one.mcap", "two.mcap", "again.mcap", "-o", "map.nc", cwd=folder)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    said = "holds the recording of one.mcap; give each" if kind == "copy" else "is given twice; its frames would count"
+    assert f"again.mcap {said}" in done.stderr
+    assert not (folder / "map.nc").exists()
 
 
 def test_outputs_and_inputs_are_not_overwritten(folder, run_cli):

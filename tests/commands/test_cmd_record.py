@@ -9,13 +9,12 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from emulated_devices import head_and_tracker, serving, short_scan
+from emulated_devices import head_and_tracker, serving, short_scan, wait_for_bytes
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -73,15 +72,6 @@ def start(child_environment, tmp_path, source):
         if process.poll() is None:
             process.kill()
         process.communicate()
-
-
-def wait_for_bytes(path: Path, size: int) -> None:
-    """Until a recording has written that much."""
-    for _ in range(1000):
-        if path.exists() and path.stat().st_size >= size:
-            return
-        time.sleep(0.01)
-    raise AssertionError(f"{path} did not grow")
 
 
 @pytest.fixture
@@ -243,6 +233,19 @@ def test_a_signal_ends_the_recording_in_order(tmp_path, start, long_scan, number
     assert f"{len(file.scan.frames)} frames" in out
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_all_processes_of_a_recording_ends_it_in_order(tmp_path, start, long_scan, number):
+    """As of `timeout`, a service manager and a closed terminal: the readers died of it, and "the device has gone"."""
+    with head_and_tracker(long_scan) as devices:
+        process = start(devices, start_new_session=True)
+        wait_for_bytes(tmp_path / "a.mcap", 60_000)
+        os.killpg(process.pid, number)
+        out, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    assert f"ended by {number.name}" in out
+    assert read_scan_report(tmp_path / "a.mcap").complete
+
+
 @pytest.mark.parametrize("role", ["head", "tracker"])
 def test_a_pulled_cable_ends_it_with_one_line(record, tmp_path, scan, role):
     pulled = {f"{role}_faults": Faults(disconnect_s=0.3)}
@@ -270,6 +273,21 @@ def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, 
     assert err.count("\n") == 1
     assert "`tactile-bayes repair`" in err
     assert len(read_scan_report(tmp_path / "a.mcap").scan.frames) > 50
+
+
+def test_a_disk_that_was_full_before_it_is_one_line_and_no_file(tmp_path, start, long_scan):
+    """It was: error: No space left on device, with exit code 1 and an empty file."""
+
+    def no_room() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+
+    with head_and_tracker(long_scan) as devices:
+        process = start(devices, preexec_fn=no_room)
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err.count("\n")) == (2, 1), err
+    assert "a.mcap cannot be written (File too large)" in err
+    assert not (tmp_path / "a.mcap").exists()
 
 
 def test_a_duration_is_by_the_heads_clock(record, tmp_path, scan):

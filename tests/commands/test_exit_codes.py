@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from in_process import run_here
+
 from tactile_bayes import errors
+from tactile_bayes.interruption import ended_in_order
 from tests.conftest import ROOT
 
 INTERRUPTED = """
@@ -14,14 +19,14 @@ import os, signal, sys, threading
 from tactile_bayes.cli import main
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is born with it ignored
 sys.argv = ["tactile-bayes", "calibrate", "size", {table!r}, "-o", {output!r}]
-threading.Timer({after}, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+threading.Timer({after}, lambda: os.kill(os.getpid(), {number})).start()
 main()
 """
 
 
-def interrupt(output: Path, *, after: float) -> subprocess.CompletedProcess[str]:
+def interrupt(output: Path, *, after: float, number: int = signal.SIGINT) -> subprocess.CompletedProcess[str]:
     table = str(ROOT / "tactile_bayes" / "demo" / "phantoms.csv")
-    code = INTERRUPTED.format(table=table, output=str(output), after=after)
+    code = INTERRUPTED.format(table=table, output=str(output), after=after, number=int(number))
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
 
 
@@ -37,6 +42,47 @@ def test_ctrl_c_ends_with_130_one_line_and_nothing_left(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
         assert done.stdout == ""
         assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_end_ends_as_ctrl_c_does(number: signal.Signals, tmp_path: Path) -> None:
+    """`kill`, `timeout`, a batch system and a closed terminal; the process died of them without a line."""
+    done = interrupt(tmp_path / "size.json", after=0.3, number=number)
+    assert done.returncode == errors.EXIT_INTERRUPTED
+    assert done.stderr.split() == ["interrupted"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_nohup_ignores_stays_ignored() -> None:
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        with ended_in_order():
+            assert all(signal.getsignal(number) is signal.SIG_IGN for number in before)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ("plan", "--map-sd", "nan"),
+            "Invalid value for '--map-sd': 'nan' is not a finite number; see `tactile-bayes plan --help`",
+        ),
+        (("calibrate", "size"), "Missing argument 'TABLE.csv'; see `tactile-bayes calibrate size --help`"),
+        (("mapp",), "No such command 'mapp'. Did you mean 'map'?; see `tactile-bayes --help`"),
+    ],
+)
+def test_wrong_words_are_one_line_too(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    """They came with two lines of usage before the line that says what is wrong."""
+    done = run_here(*words, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (errors.EXIT_USAGE, "", f"error: {said}\n")
+
+
+def test_no_words_at_all_are_answered_by_the_help(tmp_path: Path) -> None:
+    done = run_here(cwd=tmp_path)
+    assert "Commands:" in done.stdout + done.stderr
 
 
 def test_every_error_has_a_documented_code() -> None:

@@ -127,34 +127,34 @@ def test_a_long_name_is_one_line_and_a_nearly_too_long_one_is_written(tmp_path: 
 
 
 INPUTS = {
-    "settings": ("estimate", "map.nc", "--settings", "p.toml", "-o", "p.toml", "--force"),
-    "settings by a link": ("estimate", "map.nc", "--settings", "p.toml", "--figure", "link.png", "--force"),
-    "settings by a hard link": ("estimate", "map.nc", "--settings", "p.toml", "-o", "hard.toml", "--force"),
-    "a scene": ("simulate", "p.toml", "-o", "p.toml", "--force"),
-    "a table": ("calibrate", "size", "p.toml", "-o", "./p.toml", "--force"),
-    "a protocol": ("validate", "t.csv", "--excision", "e.csv", "--protocol", "p.toml", "--html", "p.toml", "--force"),
-    "a scan": ("repair", "p.toml", "-o", "p.toml", "--force"),
+    "settings": ("estimate", "map.nc", "--settings", "p", "-o", "p", "--force"),
+    "settings by a link": ("estimate", "map.nc", "--settings", "p", "--figure", "link.png", "--force"),
+    "settings by a hard link": ("estimate", "map.nc", "--settings", "p", "-o", "hard", "--force"),
+    "a scene": ("simulate", "p", "-o", "p", "--force"),
+    "a table": ("calibrate", "size", "p", "-o", "./p", "--force"),
+    "a protocol": ("validate", "t.csv", "--excision", "e.csv", "--protocol", "p", "--html", "p", "--force"),
+    "a scan": ("repair", "p", "-o", "p", "--force"),
 }
 
 
 @pytest.mark.parametrize("case", INPUTS)
 def test_an_output_is_never_an_input(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "p.toml"
+    path = tmp_path / "p"
     path.write_text("amplitude_sd = 0.5\n")
     (tmp_path / "link.png").symlink_to(path)
-    (tmp_path / "hard.toml").hardlink_to(path)
+    (tmp_path / "hard").hardlink_to(path)
     with pytest.raises(UsageError, match="is an input of this command; choose another name for the output"):
         cli.main([*INPUTS[case]], standalone_mode=False)
     assert path.read_text() == "amplitude_sd = 0.5\n"
 
 
 CALIBRATIONS = {
-    "record": ("record", "-o", "s.json", "--head", "/dev/nothing", "--size-calibration", "s.json", "--force"),
-    "replay": ("replay", "scan.mcap", "-o", "s.json", "--size-calibration", "s.json", "--force"),
-    "estimate": ("estimate", "map.nc", "--size-calibration", "s.json", "-o", "s.json", "--force"),
-    "tradeoff map": ("tradeoff", "estimate", "m.nc", "--size-calibration", "s.json", "--figure", "link.png", "--force"),
-    "tradeoff": ("tradeoff", "forward", "--size-calibration", "s.json", "--figure", "link.png", "--force"),
+    "record": ("record", "-o", "s", "--head", "/dev/nothing", "--size-calibration", "s", "--force"),
+    "replay": ("replay", "scan.mcap", "-o", "s", "--size-calibration", "s", "--force"),
+    "estimate": ("estimate", "map.nc", "--size-calibration", "s", "-o", "s", "--force"),
+    "tradeoff map": ("tradeoff", "estimate", "m.nc", "--size-calibration", "s", "--figure", "link.png", "--force"),
+    "tradeoff": ("tradeoff", "forward", "--size-calibration", "s", "--figure", "link.png", "--force"),
 }
 
 
@@ -162,18 +162,18 @@ CALIBRATIONS = {
 def test_an_output_is_never_the_size_calibration(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(DEMO / "scan.mcap", tmp_path)
-    (tmp_path / "s.json").write_text("{}")
-    (tmp_path / "link.png").symlink_to(tmp_path / "s.json")
+    (tmp_path / "s").write_text("{}")
+    (tmp_path / "link.png").symlink_to(tmp_path / "s")
     with pytest.raises(UsageError, match="is an input of this command; choose another name for the output"):
         cli.main([*CALIBRATIONS[case]], standalone_mode=False)
-    assert (tmp_path / "s.json").read_text() == "{}"
+    assert (tmp_path / "s").read_text() == "{}"
 
 
 @pytest.mark.parametrize("option", ["-o", "--html"])
 def test_an_output_is_never_a_posterior_that_a_trial_table_names(option: str, plain: Path, tmp_path: Path) -> None:
     for name in ("trial.csv", "excision.csv"):
         shutil.copy(plain / name, tmp_path)
-    stated = tmp_path / "one.json"
+    stated = tmp_path / "one"
     stated.write_text(
         CliRunner().invoke(cli, ["estimate", str(plain / "map.nc"), "--method", "laplace", "--json"]).stdout
     )
@@ -182,7 +182,7 @@ def test_an_output_is_never_a_posterior_that_a_trial_table_names(option: str, pl
     lines = (tmp_path / "trial.csv").read_text().splitlines()
     first = dict(zip(lines[0].split(","), lines[1].split(","), strict=False))
     row = {name: value if name in ("patient", "mass", "modality", "replicate") else "" for name, value in first.items()}
-    row |= {"status": "detected" if found else "not_detected", "posterior": "one.json"}
+    row |= {"status": "detected" if found else "not_detected", "posterior": "one"}
     header = list(dict.fromkeys([*lines[0].split(","), "posterior"]))
     (tmp_path / "trial.csv").write_text(",".join(header) + "\n" + ",".join(row.get(name, "") for name in header) + "\n")
     words = ["validate", tmp_path / "trial.csv", "--excision", tmp_path / "excision.csv", option, stated, "--force"]
@@ -193,7 +193,7 @@ def test_an_output_is_never_a_posterior_that_a_trial_table_names(option: str, pl
 
 def test_two_outputs_of_one_name_are_refused() -> None:
     with pytest.raises(UsageError, match="two outputs"):
-        cli.main(["map", "s.mcap", "-o", "m.png", "--figure", "m.png"], standalone_mode=False)
+        cli.main(["validate", "t.csv", "--excision", "e.csv", "-o", "m", "--html", "m"], standalone_mode=False)
 
 
 def _leaves(command: click.Command, context: click.Context) -> list[click.Command]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
@@ -60,3 +62,12 @@ def head_and_tracker(
         serving(tracker, links[1], tracker_faults, stage=stage, leads=False),
     ):
         yield ["--head", links[0].url, "--tracker", links[1].url, "--tracker-protocol", protocol]
+
+
+def wait_for_bytes(path: Path, size: int) -> None:
+    """Until a recording has written that much."""
+    for _ in range(6000):
+        if path.exists() and path.stat().st_size >= size:
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"{path} did not grow")
