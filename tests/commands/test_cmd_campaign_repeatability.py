@@ -116,7 +116,7 @@ def test_a_changed_exam_redoes_sizes_and_fits_no_other_map(own: Path, monkeypatc
     def tell(done: int, total: int, /, *, left_s: float | None = None) -> None:
         told.append((done, total, left_s))
 
-    monkeypatch.setattr(progress, "progress_bar", lambda _label: nullcontext(tell))
+    monkeypatch.setattr(progress, "progress_bar", lambda _label, **_: nullcontext(tell))
     count = len(steps(own / "out"))
     write(own / "scans" / "03-2.mcap", thinned(2, 6, subject="03", side="left"))
     campaign(own)

@@ -250,7 +250,7 @@ def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
         (["a.nc", "b.nc", "-o", "p.nc"], 2, "one map at a time"),
         (["a.nc", "b.nc", "a.nc"], 2, "a.nc is given twice"),
         (["a.nc", "-o", "a.nc", "--force"], 2, "is an input"),
-        (["a.nc", "-o", "x.png", "--figure", "x.png"], 2, "two outputs of this command"),
+        (["a.nc", "-o", "x", "--figure", "x"], 2, "two outputs of this command"),
         (["none.nc", "--figure", "f.jpg"], 2, "f.jpg has the suffix '.jpg'; a figure is written as one of .png, .pdf"),
         (["none.nc", "--map-figure", "f"], 2, "has the suffix 'none'"),
         (["a.nc", "-o", "no/p.nc"], 2, "not a directory"),
@@ -275,7 +275,7 @@ def test_mistakes_end_in_their_code_and_leave_nothing(
 
 @pytest.mark.parametrize("option", ["-o", "--figure", "--map-figure"])
 def test_existing_outputs_are_left_alone_without_force(folder: Path, tmp_path: Path, option: str) -> None:
-    output = tmp_path / "mine.png"
+    output = tmp_path / ("mine.nc" if option == "-o" else "mine.png")
     output.write_text("mine")
     done = run_here("estimate", "a.nc", *FAST, "--size-calibration", "size.json", option, output, cwd=folder)
     assert done.returncode == 2

@@ -70,10 +70,10 @@ def test_the_unit_of_a_grid_is_unknown_unless_told(tmp_path: Path) -> None:
 )
 def test_a_unit_that_is_none_is_a_usage_error(tmp_path: Path, more: tuple[str, ...], words: str) -> None:
     (tmp_path / "g.csv").write_text("1,1\n1,1\n")
-    done = run_here("import", "g.csv", "-o", "g.nc", "--spacing-mm", 1, *more, cwd=tmp_path)
+    done = run_here("import", "g.csv", "-o", "g", "--spacing-mm", 1, *more, cwd=tmp_path)
     assert done.returncode == 2
     assert words in done.stderr
-    assert not (tmp_path / "g.nc").exists()
+    assert not (tmp_path / "g").exists()
 
 
 def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: Path) -> None:

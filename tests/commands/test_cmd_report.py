@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_map_becomes_a_private_page_that_is_not_overwritten(folder: Path) -> None:
     done = run_here("report", "map.nc", "-o", "map.html", cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("map.html: Lump of about 14.7 mm, 95 % interval ")
+    assert done.stdout.startswith("map.html: Lump of about 14.5 mm, 95 % interval ")
     page = folder / "map.html"
     assert page.stat().st_mode & 0o777 == 0o600
     before = page.read_bytes()

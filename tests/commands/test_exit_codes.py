@@ -18,6 +18,7 @@ INTERRUPTED = """
 import os, signal, sys, threading
 from tactile_bayes.cli import main
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is born with it ignored
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # so is what nohup starts
 sys.argv = ["tactile-bayes", "calibrate", "size", {table!r}, "-o", {output!r}]
 threading.Timer({after}, lambda: os.kill(os.getpid(), {number})).start()
 main()

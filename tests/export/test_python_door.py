@@ -22,6 +22,7 @@ def folder(exam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An exam's files, where Python runs."""
     for name in ("map.nc", "map.json", "map_post.nc", "empty.nc", "size.json"):
         shutil.copy(exam / name, tmp_path)
+    (tmp_path / "old.csv").write_text("mine")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -117,7 +118,7 @@ def test_the_dictionary_is_the_command_lines_alone_and_with_records(folder: Path
         ({"files": "map.json", "path": "r.csv", "to": "fhir", "dictionary": "d.csv"}, "--dictionary is REDCap's"),
         ({"files": "map.json", "path": "r.csv", "to": "csv", "dictionary": "./r.csv"}, "records and dictionary"),
         ({"path": "r.csv", "to": "csv", "dictionary": "d.csv"}, "no file was given to export to r.csv"),
-        ({"files": "map.json", "path": "r.csv", "to": "csv", "dictionary": "size.json"}, "size.json exists"),
+        ({"files": "map.json", "path": "r.csv", "to": "csv", "dictionary": "old.csv"}, "old.csv exists"),
     ],
 )
 def test_a_dictionary_that_does_not_fit_is_refused_before_anything_is_written(

@@ -306,7 +306,7 @@ def test_only_ratios_of_lengths_matter(length: float) -> None:
 
 IMPOSSIBLE: dict[str, tuple[Callable[[], object], list[str]]] = {
     "lump out of the skin": (lambda: Body(15, 0.5), ["depth_ratio is 0.5", "at least 0.52"]),
-    "no lump": (lambda: Body(0, 1), ["d_mm is 0", "above 0"]),
+    "no lump": (lambda: Body(0, 1), ["d_mm is 0", "at least 0.1"]),
     "lump in the wall": (lambda: Body(15, 1, thickness_mm=22.0), ["thickness_mm is 22", "above 22.5 mm"]),
     "seat": (lambda: Body(15, 1, 2.2), ["seat is 2.2", "between 0 (centred) and 2; 1 is resting"]),
     "incompressible": (lambda: Body(15, 1, poisson=0.5).layers, ["poisson is 0.5", "below 0.5"]),
