@@ -33,6 +33,8 @@ DIMENSIONS = 6
 
 Where B is skewed, its score is one more.
 """
+_SCORE = 2
+"""Coordinate of the spread of B."""
 MOST_INVALID = 0.05
 IRREGULAR_SD = 0.15
 """SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
@@ -194,7 +196,15 @@ def pooled_size(
         "irregular_outline": float(2 * sum(one.irregular for one in maps) >= len(maps)),
     }
     form_sd = IRREGULAR_SD * figures["irregular_outline"]
-    pool = _Pool(used, by_map, terms, centre, noise, points, half, replicates, calibration, priors.known, form_sd)
+    of_body = None
+    if len(used) == 1:
+        only = used[0]
+        of_body = calibration.body_and_error(
+            terms[0], only.log_amplitude, only.log_width, normal_quantile(points[:, _SCORE])
+        )
+    pool = _Pool(
+        used, by_map, terms, centre, noise, points, half, replicates, calibration, priors.known, form_sd, of_body
+    )
     between = priors.between_maps or calibration.between_exams
     another = priors.another_exam
     size = pool.size(between, figures)
@@ -227,6 +237,8 @@ class _Pool:
         Half log axis ratio of the lump, in two components.
     form_sd
         SD of ln d because the lump's outline is irregular.
+    of_body
+        `BodyCalibration.body_and_error` of the only map, which no spread between maps moves; None of several.
     """
 
     maps: Sequence[ShapeDraws]
@@ -240,13 +252,14 @@ class _Pool:
     calibration: BodyCalibration
     known: Mapping[str, float]
     form_sd: float
+    of_body: tuple[FloatArray, FloatArray, FloatArray] | None
 
     def size(self, between: BetweenMaps, figures: Mapping[str, float]) -> SizePosterior:
         """Sizes under a prior of the spread between maps."""
         tau = between.at(self.points[:, 1], self.centre, self.noise)
         weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
         weight /= weight.sum(axis=0)
-        z, score, body = normal_quantile(self.points[:, [0, 2, -1]].T)
+        z, score, body = normal_quantile(self.points[:, [0, _SCORE, -1]].T)
         known, own, variances = self._left_open(tau=tau, weight=weight, score=score)
         map_part = np.sum(weight * self.by_map, axis=0)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
@@ -281,8 +294,11 @@ class _Pool:
         """
         log_a, log_width = (np.stack([getattr(m, name) for m in self.maps]) for name in ("log_amplitude", "log_width"))
         middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
-        terms = self.terms[0] if len(weight) == 1 else np.einsum("kn,knt->nt", weight, self.terms)
-        body_sd, shift, error = self.calibration.body_and_error(terms, middle_a, middle_width, score)
+        if self.of_body is None:
+            terms = np.einsum("kn,knt->nt", weight, self.terms)
+            body_sd, shift, error = self.calibration.body_and_error(terms, middle_a, middle_width, score)
+        else:
+            body_sd, shift, error = self.of_body
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
         other_sd = self.calibration.other_sd
         own_sd = self.calibration.own_sd(body_sd)
