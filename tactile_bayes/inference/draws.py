@@ -85,3 +85,13 @@ def student_draws(
     if np.isinf(dof):
         return np.asarray(centre + normal)
     return np.asarray(centre + normal * np.sqrt(dof / rng.chisquare(dof, size=number))[:, None])
+
+
+def picked_rows(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
+    """Indices of draws with the wanted labels, using a replicate's draws equally often."""
+    index = np.empty(len(wanted), dtype=np.intp)
+    for label in range(REPLICATES):
+        members, places = np.flatnonzero(have == label), np.flatnonzero(wanted == label)
+        members = members if len(members) else np.arange(len(have))
+        index[places] = rng.permutation(np.resize(rng.permutation(members), len(places)))
+    return index

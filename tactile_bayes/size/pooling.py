@@ -15,7 +15,7 @@ from dataclasses import field, replace
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import REPLICATES, Labels, even_replicates
+from tactile_bayes.inference.draws import Labels, even_replicates, picked_rows
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.paired import evened, paired_points
 from tactile_bayes.records import dataclass
@@ -181,7 +181,7 @@ def pooled_size(
     maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
     """
     calibration = calibration.at_fat([one.profile for one in maps]).at_places([one.by_place for one in maps])
-    used, replicates = _matched(maps, number, rng)
+    used, replicates = matched_draws(maps, number, rng)
     by_map = np.stack([corrected_log_size(calibration, m) for m in used])
     log_size = by_map if used is maps else [corrected_log_size(calibration, m) for m in maps]
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
@@ -325,24 +325,14 @@ class _Pool:
         return largest, smallest
 
 
-def _matched(
+def matched_draws(
     maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
 ) -> tuple[Sequence[ShapeDraws], Labels]:
-    """Equal numbers of draws of each map, matched by replicate, with their labels."""
+    """As many draws of each map, matched by replicate, with their labels; one map's own where no number is given."""
     if number is None and len(maps) == 1:
         return maps, maps[0].replicates
     replicates = even_replicates(len(maps[0].q) if number is None else number)
-    return [m.rows(_picked(m.replicates, replicates, rng)) for m in maps], replicates
-
-
-def _picked(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
-    """Indices of draws with the wanted labels, using a replicate's draws equally often."""
-    index = np.empty(len(wanted), dtype=np.intp)
-    for label in range(REPLICATES):
-        members, places = np.flatnonzero(have == label), np.flatnonzero(wanted == label)
-        members = members if len(members) else np.arange(len(have))
-        index[places] = rng.permutation(np.resize(rng.permutation(members), len(places)))
-    return index
+    return [m.rows(picked_rows(m.replicates, replicates, rng)) for m in maps], replicates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -450,12 +440,6 @@ def _axis_ratio(one: ShapeDraws) -> tuple[FloatArray, FloatArray]:
         mean[1], sd = one.oblique or (0.0, 2.0 * float(np.sqrt(covariance[0, 0])))
         covariance[1, 1] = sd**2
     return mean, covariance
-
-
-def matched_draws(maps: Sequence[ShapeDraws], number: int, rng: np.random.Generator) -> tuple[list[ShapeDraws], Labels]:
-    """As many draws of each map, matched by replicate, with their labels."""
-    used, replicates = _matched(maps, number, rng)
-    return list(used), replicates
 
 
 def shape_of_lump(maps: Sequence[ShapeDraws], calibration: BodyCalibration, prior: ShapePrior) -> Elongation:
