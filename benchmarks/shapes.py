@@ -153,6 +153,9 @@ class Sized:
         Half the interval of the largest size over its median.
     oval, irregular
         Whether the report says that the lump is oval, and that its outline is irregular.
+    in_two, covers_in_two
+        Whether it lists two masses that may be one lump, and whether the interval of their length holds the largest
+        diameter seen from above.
     """
 
     across: float
@@ -164,10 +167,12 @@ class Sized:
     half_width: float
     oval: bool
     irregular: bool
+    in_two: bool
+    covers_in_two: bool
 
 
-def sized(row: Mapping[str, Any], size: SizePosterior) -> Sized:
-    """Compare a size with the truth of its row."""
+def sized(row: Mapping[str, Any], size: SizePosterior, touching: Sequence[Mapping[str, Any]] = ()) -> Sized:
+    """Compare a size, and the lengths of masses that touch, with the truth of its row."""
     largest, smallest = (size.summarise(name, probability=0.95) for name in ("max_size_mm", "min_size_mm"))
     true, least, any_way = (float(row[n]) for n in ("largest_across_mm", "smallest_across_mm", "largest_mm"))
     return Sized(
@@ -180,15 +185,21 @@ def sized(row: Mapping[str, Any], size: SizePosterior) -> Sized:
         (largest.high - largest.low) / 2 / largest.median,
         size.figures["oval_probability"] >= 0.5,
         size.figures["irregular_outline"] > 0.0,
+        bool(touching),
+        any(one["together_mm"]["low"] <= true <= one["together_mm"]["high"] for one in touching),
     )
 
 
-def measured(path: Path) -> SizePosterior | None:
-    """Size of a map by `estimate` with its defaults; None without an estimate."""
-    from tactile_bayes.pipeline.one_map import estimate_file
+def measured(row: Mapping[str, Any], path: Path) -> Sized | None:
+    """A map by `estimate` with its defaults; None without an estimate."""
+    from tactile_bayes.pipeline.one_map import answer_of, estimate_file
     from tactile_bayes.pipeline.settings import Settings
 
-    return estimate_file(path, Settings()).estimate.size if path.exists() else None
+    if not path.exists():
+        return None
+    outcome = estimate_file(path, Settings())
+    size, document = outcome.estimate.size, answer_of(outcome).document or {}
+    return None if size is None else sized(row, size, document["touching"])
 
 
 def table(folders: Sequence[Path]) -> str:
@@ -198,11 +209,11 @@ def table(folders: Sequence[Path]) -> str:
     for name in CLASSES:
         for path in (p for folder in folders for p in sorted(folder.glob(f"{name.replace(' ', '_')}-*.json"))):
             asked[name] += 1
-            size = measured(path.with_suffix(".nc"))
-            if size is not None:
-                found[name].append(sized(json.loads(path.read_text()), size))
+            one = measured(json.loads(path.read_text()), path.with_suffix(".nc"))
+            if one is not None:
+                found[name].append(one)
     head = f"{'class':14}{'sized':>8}{'median':>8}{'mean |e|':>9}{'covers':>8}{'smallest':>9}{'covers':>8}"
-    lines = [head + f"{'3D |e|':>8}{'covers':>8}{'half':>6}{'oval':>6}{'irregular':>11}"]
+    lines = [head + f"{'3D |e|':>8}{'covers':>8}{'half':>6}{'oval':>6}{'irregular':>11}{'in two':>8}{'covers':>8}"]
     for name, rows in found.items():
         n = len(rows)
 
@@ -215,6 +226,7 @@ def table(folders: Sequence[Path]) -> str:
             f"{share('covers'):>8}{np.mean([abs(r.smallest) for r in rows]):>9.1%}{share('covers_smallest'):>8}"
             f"{np.mean([abs(r.any_way) for r in rows]):>8.1%}{share('covers_any'):>8}"
             f"{np.mean([r.half_width for r in rows]):>6.0%}{share('oval'):>6}{share('irregular'):>11}"
+            f"{share('in_two'):>8}{share('covers_in_two'):>8}"
         )
     return "\n".join(lines)
 

@@ -25,6 +25,8 @@ FLANK_IN_WIDTHS = 2.5
 LEAST_SHARE = 0.15
 """Of the first lump's amplitude, for a size from the map less the first lump: of two with less, 21 mm from a lump 13
 times as high, one came out twice as large as it was, and what a lump leaves of itself is some per cent of it."""
+APART_IN_WIDTHS = 2.0
+"""Two equal Gaussians nearer than this many widths have one maximum."""
 BOTH = "scan again with more lines over both"
 Estimator = Callable[[TactileMap, EstimateOptions], Estimate]
 
@@ -60,8 +62,10 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
 
 
 def _apart(one: Mass, other: Mass) -> bool:
-    """Whether two masses are not the same, found twice."""
-    return bool(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm) > 2 * SMOOTHING_MM)
+    """Whether two masses are not the same, found twice: two narrow bumps may stand close to each other."""
+    widths = [max(m.estimate.bump.sigma_x_mm, m.estimate.bump.sigma_y_mm) for m in (one, other) if m.estimate.bump]
+    least = min(2 * SMOOTHING_MM, APART_IN_WIDTHS * max(widths, default=np.inf))
+    return bool(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm) > least)
 
 
 def _probability(estimate: Estimate) -> float:

@@ -18,6 +18,7 @@ from tactile_bayes.report.masses_document import masses_document
 from tactile_bayes.report.quantities import ANOTHER_EXAM, WIDTHS, another_exam, estimate_quantities, xiphoid_mm
 from tactile_bayes.report.scene_text import scene_document
 from tactile_bayes.report.supposed_text import supposed_document
+from tactile_bayes.report.touching import touching_masses
 from tactile_bayes.size.posterior import SIZES, SizePosterior
 
 SCHEMA = "tactile-bayes/estimate/1"
@@ -45,6 +46,14 @@ def estimate_document(
 
     share = estimate.size.variance_share if estimate.size is not None else None
     detection = estimate.detection
+    masses = masses_document(
+        estimate.masses,
+        tactile_map,
+        probability=probability,
+        quantities=quantities,
+        reason=estimate.reason,
+        scans=provenance.scans,
+    )
     return {
         "schema": SCHEMA,
         "status": estimate.status,
@@ -69,14 +78,8 @@ def estimate_document(
             for c in estimate.candidates
         ],
         "other_rises": [rise.as_dict() for rise in estimate.other_rises],
-        "masses": masses_document(
-            estimate.masses,
-            tactile_map,
-            probability=probability,
-            quantities=quantities,
-            reason=estimate.reason,
-            scans=provenance.scans,
-        ),
+        "masses": masses,
+        "touching": touching_masses(masses),
         "left_out": list(estimate.left_out),
         "prior": prior.as_dict(),
         "research_use": RESEARCH_USE,

@@ -16,6 +16,7 @@ from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
 from tactile_bayes.report.lump_place import from_xiphoid, side_caution, side_of
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
+from tactile_bayes.report.touching import touching_sentences
 
 UNDETECTED: Final = ("undetected", "empty")
 MOST_CAUTIONS: Final = 2
@@ -163,6 +164,7 @@ def caution_sentences(exam: Exam) -> list[str]:
         outside = diagnostics.get("outside_calibration", [])
         found += [f"Caution: outside the calibration's range: {text.rstrip('.')}." for text in outside]
         found += [f"To check: {text}." for text in diagnostics.get("assumptions_to_check", [])]
+        found += [f"To check: {text}." for text in touching_sentences(one.document.get("touching", []))]
     if exam.pooled is not None:
         if exam.pooled["fat_apart_mm"]:
             depths = " and ".join(f"{depth:.1f}" for depth in exam.pooled["fat_apart_mm"])

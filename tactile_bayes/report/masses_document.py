@@ -13,6 +13,7 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.result import Mass
 from tactile_bayes.report.lump_place import lump_place
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, estimate_quantities
+from tactile_bayes.report.touching import together_words, touching_masses
 from tactile_bayes.size.posterior import SIZES
 
 MassDocument = Mapping[str, Any]
@@ -102,6 +103,9 @@ def mass_words(mass: MassDocument, here: MassDocument | None) -> str:
     else:
         share = f"{100 * size['probability']:g} %"
         told = f"largest size {size['median']:.1f} mm ({share} interval {size['low']:.1f} to {size['high']:.1f} mm)"
+    if here is not None:
+        for pair in touching_masses([here, mass]):
+            told += f"; may be one lump with mass {here['number']}, {together_words(pair)}"
     return f"{place}: {told}; probability of a lump {mass['detected_probability']:.3f}"
 
 

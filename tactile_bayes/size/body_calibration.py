@@ -39,6 +39,8 @@ MOST_LEVERAGE = 1.0
 """A map is outside the table where its leverage exceeds this multiple of the table's largest."""
 FARTHEST_LEVERAGE = 3.0
 """Beyond this multiple there is no size."""
+UNLIKE_SD = 0.08
+"""SD of ln d by which a body may differ because its map or its head profile is unlike the table's (record 0123)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,14 +122,16 @@ class BodyCalibration:
     def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
         """The calibration for a mass whose maps have these `presets.HEAD_PROFILE`, None for a map without one.
 
-        Where they tell no depth it is this one, with the reason in `fat_note`.
+        Where they tell no depth it is this one, with the reason in `fat_note`; wider where the profiles are of another
+        body than the table's.
         """
         fat = self.with_fat
         if fat is None:
             return self
         log_depth, why_not = fat.log_depth(profiles)
         if log_depth is None:
-            return replace(self, with_fat=None, fat_note=why_not)
+            without = replace(self, with_fat=None, fat_note=why_not)
+            return without if all(one is None for one in profiles) else without.for_another_kind()
         found: BodyCalibration = fat.at(self, log_depth, profiles)
         return found
 
@@ -153,7 +157,11 @@ class BodyCalibration:
         if self.any_depth is None or self.leverage(amplitude, sigma_mm) <= MOST_LEVERAGE:
             return self
         what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
-        return replace(self.any_depth, fat_note=f"{what} {UNLIKE}")
+        return replace(self.any_depth, fat_note=f"{what} {UNLIKE}").for_another_kind()
+
+    def for_another_kind(self) -> BodyCalibration:
+        """This calibration with room for a body unlike any of the table's: intervals without it held 38 of 48."""
+        return replace(self, other_sd=float(np.hypot(self.other_sd, UNLIKE_SD)))
 
     @property
     def between_exams(self) -> BetweenMaps:
@@ -265,7 +273,7 @@ class BodyCalibration:
 
     def omissions(self) -> list[str]:
         """What a size does not contain, in words."""
-        notes = [omissions.fat_depth(self.fat_note)] if self.fat_note else []
+        notes = [omissions.fat_depth(self.fat_note, other_sd=self.other_sd)] if self.fat_note else []
         notes += [omissions.by_place(self.places_note)] if self.places_note else []
         return [*notes, omissions.bodies(self.bodies)] if self.bodies else notes
 

@@ -14,9 +14,17 @@ def head(calibration_head: object) -> str:
     return f"whether the map's head is the calibration's ({calibration_head}): the map does not name its head"
 
 
-def fat_depth(why: str) -> str:
-    """The depth of fat as a source left out, where maps do not give it."""
-    return f"the depth of the fat, which would narrow the size: {why}"
+def fat_depth(why: str, *, other_sd: float = 0.0) -> str:
+    """The depth of fat as a source left out, where maps do not give it.
+
+    Parameters
+    ----------
+    why
+    other_sd
+        What the interval allows because the body is unlike the calibration's, as the SD of ln d.
+    """
+    left_out = f"the depth of the fat, which would narrow the size: {why}"
+    return f"{left_out}; for such a body the interval allows {100 * other_sd:.0f} % (SD) more" if other_sd else left_out
 
 
 def by_place(why: str) -> str:

@@ -83,6 +83,31 @@ def test_a_second_lump_in_the_window_is_listed_and_sized() -> None:
     assert estimate.masses[1].largest_mm == pytest.approx(alone.largest_mm, rel=0.25)
 
 
+def narrow_bumps(*, second: float, seed: int = 1) -> TactileMap:
+    """A narrow bump, and another 5.5 mm from it: less than two widths of what smooths the map for the search."""
+    rng = np.random.default_rng(seed)
+    values = bump_values(half_mm=30.0, x=-2.0, y=1.0, sigma_x=2.3, sigma_y=2.3, amplitude=0.8)
+    values += bump_values(half_mm=30.0, x=3.5, y=1.0, sigma_x=2.3, sigma_y=2.3, amplitude=second, level=0.0)
+    values += 0.005 * correlated_field(rng, len(values), length_cells=3.0)
+    return grid_map(values + 0.005 * rng.standard_normal(values.shape), normalise="gain")
+
+
+def test_two_narrow_bumps_close_to_each_other_are_two_masses_that_may_be_one_lump() -> None:
+    document = answer_of(found_on(narrow_bumps(second=0.7))).document
+    assert document is not None
+    assert [round(one["centre_mm"]["x"], 0) for one in document["masses"]] in ([-2, 4], [4, -2], [-2, 3], [3, -2])
+    (pair,) = document["touching"]
+    sizes = [one["max_size_mm"]["median"] for one in document["masses"]]
+    assert pair["apart_mm"] == pytest.approx(5.5, abs=0.3)
+    assert pair["together_mm"]["median"] == pytest.approx(pair["apart_mm"] + sum(sizes) / 2, rel=1e-6)
+    check_document(document, "estimate.schema.json", path=Path("estimate.json"))
+    # the control: one bump of that width is one mass
+    alone = answer_of(found_on(narrow_bumps(second=0.0))).document
+    assert alone is not None
+    assert len(alone["masses"]) == 1
+    assert alone["touching"] == []
+
+
 def test_a_mass_has_the_size_that_its_place_alone_gives() -> None:
     two = scene(narrow=0.2)
     listed = found_on(two).estimate.masses[1]

@@ -15,6 +15,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_quadratic_json import write_log_quadratic
 from tactile_bayes.presets import BY_PLACE
+from tactile_bayes.size.body_calibration import UNLIKE_SD
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_process import FatProcess, Kernel, ProcessAtProfile, squared_exponential
 from tactile_bayes.size.learn.fat_depth import FatTable, learn_fat_cubic
@@ -166,6 +167,25 @@ def test_bodies_of_another_kind_widen_the_spread(learned) -> None:
     wider = replace(learned, with_fat=replace(learned.with_fat, other_sd=0.05)).at_fat(one)
     spreads = [at.body_and_error(at.terms(a, p), a, p, np.zeros(1))[0][0] for at in (learned.at_fat(one), wider)]
     assert spreads[1] == pytest.approx(np.hypot(spreads[0], 0.05))
+
+
+def test_a_profile_unlike_the_tables_leaves_room_for_another_kind_of_body(learned) -> None:
+    """And a map without a profile does not: it says nothing of the body."""
+    unlike, without = learned.at_fat([(3.0, 0.0, 0.0)]), learned.at_fat([None])
+    assert unlike.fat_mm is without.fat_mm is None
+    assert (unlike.other_sd, without.other_sd) == (UNLIKE_SD, 0.0)
+    a, p = np.array([0.5]), np.array([1.4])
+    wide, narrow = (at.body_and_error(at.terms(a, p), a, p, np.zeros(1))[0][0] for at in (unlike, without))
+    assert wide == pytest.approx(np.hypot(narrow, UNLIKE_SD))
+    assert "allows 8 % (SD) more" in " ".join(unlike.omissions())
+    assert "allows" not in " ".join(without.omissions())
+
+
+def test_a_map_unlike_the_tables_at_its_depth_leaves_room_for_another_kind_of_body(learned) -> None:
+    at = learned.at_fat([tuple(profile_of(np.array([0.0]))[0])])
+    far, near = at.fitting(np.exp(8.0), np.exp(4.0)), at.fitting(np.exp(-1.0), np.exp(1.4))
+    assert (far.fat_mm, far.other_sd) == (None, UNLIKE_SD)
+    assert near is at
 
 
 def test_slopes_and_terms_are_those_of_the_size(learned) -> None:

@@ -1,0 +1,50 @@
+"""Masses that may be one lump are told with the length over both; those apart are not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tactile_bayes.report.masses_document import mass_words
+from tactile_bayes.report.touching import touching_masses, touching_sentences
+
+
+def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> dict[str, Any]:
+    """A mass on the x axis, with the ends of its interval `half` mm from its size."""
+    quantity = {"median": size, "low": (size or 0) - half, "high": (size or 0) + half, "probability": 0.95}
+    told = {"detected_probability": 1.0, "reason": "too deep", "reported": number == 1, "position": None}
+    return {"number": number, "centre_mm": {"x": x, "y": 0.0}, "max_size_mm": size and quantity, **told}
+
+
+def test_balls_in_a_row_are_as_long_as_their_distance_and_radii() -> None:
+    """Two balls of 12 and 8 mm that touch are 20 mm long: geometry."""
+    (pair,) = touching_masses([mass(1, 0.0, 12.0), mass(2, 10.0, 8.0)])
+    assert pair["masses"] == [1, 2]
+    assert pair["apart_mm"] == 10.0
+    assert pair["together_mm"] == {"median": 20.0, "low": 19.0, "high": 21.0, "probability": 0.95}
+
+
+def test_they_touch_where_the_upper_ends_of_the_intervals_meet() -> None:
+    assert touching_masses([mass(1, 0.0, 12.0), mass(2, 10.9, 8.0)])
+    # the controls: farther than that, or surer
+    assert not touching_masses([mass(1, 0.0, 12.0), mass(2, 11.1, 8.0)])
+    assert not touching_masses([mass(1, 0.0, 12.0, half=0.5), mass(2, 10.9, 8.0, half=0.5)])
+
+
+def test_a_small_one_within_the_outline_of_a_large_one_adds_nothing() -> None:
+    (pair,) = touching_masses([mass(1, 0.0, 20.0), mass(2, 3.0, 6.0)])
+    assert pair["together_mm"]["median"] == 20.0
+
+
+def test_a_mass_without_a_size_takes_no_part() -> None:
+    assert not touching_masses([mass(1, 0.0, 12.0), mass(2, 9.0, None)])
+
+
+@pytest.mark.parametrize(("x", "told"), [(10.0, True), (30.0, False)])
+def test_the_line_of_the_other_mass_tells_it(x: float, told: bool) -> None:
+    first, second = mass(1, 0.0, 12.0), mass(2, x, 8.0)
+    words = "may be one lump with mass 1, together 20.0 mm long (19.0 to 21.0)"
+    assert (words in mass_words(second, first)) == told
+    sentences = touching_sentences(touching_masses([first, second]))
+    assert sentences == (["masses 1 and 2 may be one lump: together 20.0 mm long (19.0 to 21.0)"] if told else [])
