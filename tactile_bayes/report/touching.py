@@ -62,6 +62,4 @@ def together_words(pair: Touching) -> str:
 
 def touching_sentences(pairs: Sequence[Touching]) -> list[str]:
     """For a page: which masses may be one lump."""
-    return [
-        f"masses {one['masses'][0]} and {one['masses'][1]} may be one lump: {together_words(one)}" for one in pairs
-    ]
+    return [f"masses {one['masses'][0]} and {one['masses'][1]} may be one lump: {together_words(one)}" for one in pairs]
