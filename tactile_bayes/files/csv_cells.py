@@ -16,7 +16,7 @@ from typing import Final
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.kinds import ZIP_MAGIC
-from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, decoded, read_bytes
 
 DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]+,[0-9]+")
 _QUOTED: Final = re.compile(r'"[^"]*"')
@@ -66,12 +66,7 @@ def read_text(path: Path) -> str:
     for marks, what, way_out in _NOT_TEXT:
         if data.startswith(marks):
             raise BadDataError(what, way_out=way_out, path=str(path))
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        what = f"line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text"
-        raise BadDataError(what, way_out=_AS_UTF8, path=str(path)) from None
+    return decoded(data, path=path, way_out=_AS_UTF8, encoding="utf-8-sig")
 
 
 def cells_of(path: Path, text: str) -> Cells:

@@ -85,8 +85,13 @@ def read_text(path: Path, *, most: int, way_out: str) -> str:
     data = read_bytes(path, most=most)
     if data[:2] in UTF_16:
         raise BadDataError("is UTF-16 text", way_out="save it as UTF-8", path=str(path))
+    return decoded(data, path=path, way_out=way_out)
+
+
+def decoded(data: bytes, *, path: Path, way_out: str, encoding: str = "utf-8") -> str:
+    """Text of bytes in UTF-8; other bytes are named with their line."""
     try:
-        return data.decode("utf-8")
+        return data.decode(encoding)
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         what = f"line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text"

@@ -1,41 +1,20 @@
-"""Files of a folder that may be exams: what each says of its exam, and which of them are the same exam twice."""
+"""Files of a folder that may be exams, and which of them are the same exam twice."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import field
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import UsageError
 from tactile_bayes.files.campaign_names import JOURNAL
-from tactile_bayes.records import dataclass
+from tactile_bayes.pipeline.campaign_said import MAP, SCANS, Said
 
-SCANS: Final = (".mcap", ".npz")
-_MAP: Final = ".nc"
-_ENDINGS: Final = (*SCANS, _MAP)
-_FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}
-"""Columns of the table of exams, and what a scan calls the same."""
+_ENDINGS: Final = (*SCANS, MAP)
 _ASIDE: Final = (".", "~$")
 """Names of what systems and spreadsheets leave beside files begin so."""
-
-
-@dataclass(frozen=True, slots=True)
-class Said:
-    """What a file says of its exam.
-
-    Parameters
-    ----------
-    facts
-        By the columns of the table of exams.
-    sources
-        SHA-256 of the files that it was made from.
-    """
-
-    facts: Mapping[str, str] = field(default_factory=dict)
-    sources: frozenset[str] = frozenset()
 
 
 class FolderFiles:
@@ -125,7 +104,7 @@ class FolderFiles:
         made = {name: one.sources for name, one in said.items() if one.sources}
         if not made:
             return
-        by_digest = {self._digest(name): name for name in said if not name.lower().endswith(_MAP)}
+        by_digest = {self._digest(name): name for name in said if not name.lower().endswith(MAP)}
         for name, sources in made.items():
             original = next((by_digest[digest] for digest in sorted(sources) if digest in by_digest), None)
             if original is not None and original != name:
@@ -153,46 +132,3 @@ def _walk(folder: Path, closed: list[str]) -> Iterator[Path]:
             continue
         folders.sort()
         yield from (Path(place) / name for name in sorted(names) if not name.startswith(_ASIDE))
-
-
-def said_by(path: Path, name: str) -> Said:
-    """What a scan, arrays of a scan or a map say of the exam.
-
-    Raises
-    ------
-    BadDataError
-        When the table takes no such name, or the file is none of these.
-    """
-    check_name(name)
-    if name.lower().endswith(".npz"):
-        return Said()
-    return _of_map(path) if name.lower().endswith(_MAP) else _of_scan(path)
-
-
-def check_name(name: str) -> None:
-    """Refuse the name of a file that a table of exams does not take."""
-    if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
-        raise BadDataError("the table takes no such file name: rename it")
-
-
-def _of_scan(path: Path) -> Said:
-    from tactile_bayes.files.scan_mcap import json_object, scan_records
-
-    metadata = scan_records(path, keep=()).metadata
-    made = json_object(metadata.get("provenance", {}).get("json", "{}"), name="provenance").get("inputs")
-    inputs = made if isinstance(made, list) else []
-    sources = frozenset(str(one.get("sha256")) for one in inputs if isinstance(one, dict))
-    return Said(_facts([metadata.get("session", {})]), sources)
-
-
-def _of_map(path: Path) -> Said:
-    from tactile_bayes.files.map_nc import read_map_and_scans
-
-    _, scans = read_map_and_scans(path)
-    return Said(_facts(scans), frozenset(one["sha256"] for one in scans if "sha256" in one))
-
-
-def _facts(sessions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Facts on which all scans of a file agree."""
-    told = {column: {session.get(key) or "" for session in sessions} for column, key in _FACTS.items()}
-    return {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}

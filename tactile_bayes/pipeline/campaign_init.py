@@ -11,7 +11,8 @@ from typing import Any, Final
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.manifest_csv import natural
 from tactile_bayes.files.remote import check_address, fetched, files_below, is_address
-from tactile_bayes.pipeline.campaign_files import SCANS, FolderFiles, Said, check_name, said_by
+from tactile_bayes.pipeline.campaign_files import FolderFiles
+from tactile_bayes.pipeline.campaign_said import SCANS, Said, check_name, said_by
 from tactile_bayes.records import dataclass
 
 _DEFAULTS: Final = {"patient": "", "visit": "1", "mass": "1", "side": ""}
