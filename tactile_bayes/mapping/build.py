@@ -28,6 +28,7 @@ from tactile_bayes.mapping.shared_frames import shared_frame_figures
 from tactile_bayes.mapping.source import Progress, no_progress, sources_of
 from tactile_bayes.mapping.stroke_lag import stroke_lag_figures
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
+from tactile_bayes.mapping.strokes import stroke_count
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.mapping.thinning import every_nth
 from tactile_bayes.mapping.timing import timing_figures
@@ -128,6 +129,7 @@ def build_map(
     done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
     figures.update(shared_frame_figures(sources, done.levels, done.sums))
     figures |= evenness_figures(selections, plane) | stroke_lag_figures(sources)
+    figures["stroke_count"] = float(stroke_count(sources))
     recipe = MapRecipe("scan", normalise, float(cell_mm), rules.window_kpa, late_ms, flat_field, register_strokes)
     return _as_map(done, selections, plane, recipe, figures)
 

@@ -68,6 +68,16 @@ def find_strokes(source: Source, number: int) -> list[StrokeShift]:
     return [StrokeShift(a, b, number, 1 if x[min(b, len(x) - 1)] >= x[a] else -1) for a, b in ends if b > a]
 
 
+def stroke_count(sources: Sequence[Source]) -> int:
+    """How many strokes the head made along x; runs less than half as long as the longest are turns or corrections."""
+    reach = [
+        float(np.ptp(source.projection.shift[stroke.start : stroke.stop, 0]))
+        for number, source in enumerate(sources)
+        for stroke in find_strokes(source, number)
+    ]
+    return sum(one >= max(reach) / 2 for one in reach)
+
+
 def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[StrokeShift]]:
     """Estimate each stroke's shift along x against the others, and shift its frames back.
 

@@ -108,6 +108,16 @@ def test_a_latency_shows_as_a_lag_the_other_way() -> None:
     assert broken_assumptions(figures(scan_of(one))) == ()
 
 
+@pytest.mark.parametrize("lines", [1, 3, 4, 6])
+def test_strokes_are_counted_and_few_of_them_told(lines: int) -> None:
+    """The reference is the scene; wandering and turns are no strokes."""
+    found = figures(scan_of(scene(duration_s=1.4 * lines, strokes=Strokes(lines=lines, wander_mm=1.5, tilt_deg=2.0))))
+    assert found["stroke_count"] == lines
+    told = [text for text in assumptions_to_check(found) if "stroke" in text]
+    assert len(told) == (lines < 4)
+    assert all(f"has {lines} stroke{'s' if lines > 1 else ''} only" in text for text in told)
+
+
 def test_a_figure_that_its_error_does_not_tell_from_0_says_nothing() -> None:
     sure = {"profile_change": 0.05, "profile_change_sd": 0.01, "stroke_lag_mm": 3.0, "stroke_lag_sd_mm": 0.2}
     sure |= {"stroke_skew": 0.03, "stroke_skew_sd": 0.002}
