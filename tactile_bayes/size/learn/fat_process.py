@@ -22,7 +22,7 @@ INSIDE: Final = 0.99
 """Share of the table's maps that count as inside it: its largest leverage is an outlier's, ten times what is left."""
 INSIDE_BY_PLACE: Final = 0.95
 """The same for the figures by place: beside a rib that the map does not show, they and sizes by them are wrong."""
-OTHER_SD: Final = 0.02
+OTHER_SD: Final = 0.025
 """Of bodies unlike the population's: another tissue, neighbours, a lump higher or flatter than it is wide, which no map
 shows (record 0123)."""
 
