@@ -226,7 +226,7 @@ def _diagnostics(tactile_map: TactileMap, found: Drawn) -> Diagnostics:
         cells=len(made.fit.cells),
         covered_share=made.fit.covered_share,
         coarse_cells=tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(medians[1:]),
-        outside_calibration=() if calibration is None else tuple(calibration.outside(*medians)),
+        outside_calibration=_outside(found),
         broken_assumptions=broken_assumptions(tactile_map.quality),
         assumptions_to_check=(*assumptions_to_check(tactile_map.quality), *_form_to_check(made.posterior)),
         fat_mm=None if calibration is None else calibration.fat_mm,
@@ -237,6 +237,14 @@ def _diagnostics(tactile_map: TactileMap, found: Drawn) -> Diagnostics:
         by_place=found.by_place,
         by_place_used=calibration is not None and calibration.knows_places,
     )
+
+
+def _outside(found: Drawn) -> tuple[str, ...]:
+    """In what the map and its size lie outside the calibration's table, in words."""
+    if found.calibration is None:
+        return ()
+    beyond = [] if found.size is None else found.calibration.beyond_lumps(found.size.median_mm)
+    return (*found.calibration.outside(*found.made.posterior.medians), *beyond)
 
 
 def _form_to_check(posterior: MapPosterior) -> tuple[str, ...]:

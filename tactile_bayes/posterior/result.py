@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.lump.posterior import MapPosterior
@@ -143,4 +141,4 @@ class Mass:
     def largest_mm(self) -> float | None:
         """Median of the largest diameter; None without a size."""
         size = self.estimate.size
-        return None if size is None else float(np.nanmedian(size.max_size_mm))
+        return None if size is None else size.median_mm

@@ -26,7 +26,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
 from tactile_bayes.size import omissions
 from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.calibration_range import outside_domain, too_far
+from tactile_bayes.size.calibration_range import beyond_lumps, outside_domain, too_far
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import FatTerms
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps
@@ -270,6 +270,10 @@ class BodyCalibration:
         if not found and self.leverage(amplitude, sigma_mm) > FARTHEST_LEVERAGE:
             found.append(self._unlike(amplitude, sigma_mm))
         return found
+
+    def beyond_lumps(self, largest_mm: float) -> list[str]:
+        """In what a size lies beyond the table's lumps, in words; empty when it lies within."""
+        return beyond_lumps(self.domain, largest_mm)
 
     def omissions(self) -> list[str]:
         """What a size does not contain, in words."""

@@ -14,7 +14,7 @@ from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.presets import Background, Noise
 from tactile_bayes.records import dataclass
 from tactile_bayes.size import omissions
-from tactile_bayes.size.calibration_range import outside_domain, too_far
+from tactile_bayes.size.calibration_range import beyond_lumps, outside_domain, too_far
 
 COEFFICIENTS = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
 
@@ -264,6 +264,10 @@ class SizeCalibration:
     def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
         """Quantities of a map so far outside the tables that no size is given, in words."""
         return self._by_axis(self.x.too_far(sigma_x_mm, amplitude), self.y.too_far(sigma_y_mm, amplitude))
+
+    def beyond_lumps(self, largest_mm: float) -> list[str]:
+        """In what a size lies beyond the tables' lumps, in words; empty when it lies within."""
+        return beyond_lumps(self.x.domain, largest_mm)
 
     @staticmethod
     def _by_axis(x: Sequence[str], y: Sequence[str]) -> list[str]:

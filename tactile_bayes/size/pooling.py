@@ -402,6 +402,7 @@ def pool_maps(
         i: float(np.nanmean(corrected_log_size(calibration, shape))) for i, shape in zip(found, used, strict=True)
     }
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
+    outside += calibration.beyond_lumps(size.median_mm)
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
     outlying = tuple(sorted(found[i] for i in size.outliers))
     if len(used) > 1:

@@ -68,6 +68,11 @@ class SizePosterior:
         """(chain, draw) smaller diameter of each draw."""
         return np.minimum(self.d_x_mm, self.d_y_mm)
 
+    @property
+    def median_mm(self) -> float:
+        """Median of the largest diameter over the draws that gave one."""
+        return float(np.nanmedian(self.max_size_mm))
+
     def reshaped(self, shape: tuple[int, ...]) -> SizePosterior:
         """The same draws as arrays of another shape, (chain, draw)."""
         another = None if self.another_exam is None else self.another_exam.reshaped(shape)

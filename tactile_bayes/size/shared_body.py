@@ -49,7 +49,7 @@ class SharedBody:
         return np.asarray(shared)
 
 
-SHARED_BODY: Final = SharedBody(0.19, 0.39)
+SHARED_BODY: Final = SharedBody(0.26, 0.11)
 """Learned from simulated visits, see record 0115: ``python -m benchmarks.visits law``."""
 STRANGERS: Final = SharedBody(1.0, 1.0)
 """Nothing shared: each visit's size for itself, as two separate estimates have it."""
