@@ -39,7 +39,7 @@ MOST_LEVERAGE = 1.0
 """A map is outside the table where its leverage exceeds this multiple of the table's largest."""
 FARTHEST_LEVERAGE = 3.0
 """Beyond this multiple there is no size."""
-UNLIKE_SD = 0.08
+UNLIKE_SD = 0.1
 """SD of ln d by which a body may differ because its map or its head profile is unlike the table's (record 0123)."""
 
 

@@ -29,7 +29,7 @@ def too_far(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
 def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:
     """A size beyond the lumps of a table, in words; empty within. There it is the form that speaks, not the table."""
     low, high = domain.get("d_mm", (0.0, float("inf")))
-    if low <= largest_mm <= high:
+    if not (largest_mm < low or largest_mm > high):
         return []
     return [f"largest size {largest_mm:.3g} mm (the table's lumps: {low:.3g} to {high:.3g} mm)"]
 

@@ -29,7 +29,7 @@ from tactile_bayes.size.pooling import (
     matched_draws,
     shape_of_lump,
 )
-from tactile_bayes.size.shared_body import SHARED_BODY, SharedBody
+from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, SharedBody
 
 MOST_VISITS = 10
 DIMENSIONS = 5
@@ -141,7 +141,7 @@ def joint_sizes(
     priors: SizePriors,
     rng: np.random.Generator,
     between: BetweenMaps | None = None,
-    law: SharedBody = SHARED_BODY,
+    law: SharedBody | None = None,
     number: int = POOLED_DRAWS,
 ) -> JointSizes:
     """Joint posterior of a mass's sizes at several visits.
@@ -157,7 +157,7 @@ def joint_sizes(
     between
         Spread between exams in place of the priors'.
     law
-        How far B is the same at the visits.
+        How far B is the same at the visits; None for `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth.
 
     Raises
     ------
@@ -178,6 +178,8 @@ def joint_sizes(
     tau = _shared_tau(between, parts, points[:, 0])
     half = shape_of_lump(flat, fitted[0], priors.shape).at(points[:, 2:5])
     found = [one.weighted(tau) for one in parts]
+    if law is None:
+        law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in found]))
     covariance = _covariance(found, fitted, correlation, normal_quantile(points[:, 1]))
     mean = np.stack([one.mean for one in found]) + np.hypot(half[:, 0], half[:, 1])

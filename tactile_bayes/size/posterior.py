@@ -70,8 +70,9 @@ class SizePosterior:
 
     @property
     def median_mm(self) -> float:
-        """Median of the largest diameter over the draws that gave one."""
-        return float(np.nanmedian(self.max_size_mm))
+        """Median of the largest diameter over the draws that gave one; NaN where none did."""
+        given = self.max_size_mm[np.isfinite(self.max_size_mm)]
+        return float(np.median(given)) if given.size else float("nan")
 
     def reshaped(self, shape: tuple[int, ...]) -> SizePosterior:
         """The same draws as arrays of another shape, (chain, draw)."""

@@ -51,5 +51,7 @@ class SharedBody:
 
 SHARED_BODY: Final = SharedBody(0.26, 0.11)
 """Learned from simulated visits, see record 0115: ``python -m benchmarks.visits law``."""
+SHARED_WITHOUT_DEPTH: Final = SharedBody(0.19, 0.39)
+"""Where maps tell no depth of fat: most of what they hide is that depth, which stays as the lump grows."""
 STRANGERS: Final = SharedBody(1.0, 1.0)
 """Nothing shared: each visit's size for itself, as two separate estimates have it."""

@@ -123,6 +123,19 @@ def test_one_map_too_far_stops_a_pool_and_a_caution_comes_first(folder: Path, sh
     assert cautioned.stdout.startswith("CAUTION: outside the calibration's range: map 1: amplitude 0.3")
 
 
+@pytest.mark.parametrize(("sigma_mm", "told"), [(14.0, True), (5.0, False)])
+def test_a_size_beyond_the_tables_lumps_is_cautioned(shipped: LogQuadratic, sigma_mm: float, told: bool) -> None:
+    """The shipped table's lumps have 5 to 30 mm; what lies beyond is the form's own."""
+    rng, ones = np.random.default_rng(1), np.ones(400)
+    shape = ShapeDraws.of(0.3 * ones, *(sigma_mm * np.exp(0.01 * rng.standard_normal((2, 400)))), 0.0 * ones)
+    pooled = pool_maps([shape], calibration=shipped, priors=SizePriors(), rng=rng)
+    assert pooled.size is not None
+    assert (pooled.size.median_mm > 30.0) == told
+    assert any(text.endswith("(the table's lumps: 5 to 30 mm)") for text in pooled.outside) == told
+    assert shipped.beyond_lumps(4.0) == ["largest size 4 mm (the table's lumps: 5 to 30 mm)"]
+    assert shipped.beyond_lumps(float("nan")) == []
+
+
 def test_the_live_view_says_it_first() -> None:
     said = live_estimate(gain_map(profile=EVEN, amplitude=0.348, sigma_x=6.1, sigma_y=5.2), str(SHIPPED), Turn()).text
     assert said.startswith("CAUTION: outside the calibration's range: largest size")

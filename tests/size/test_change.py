@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.shipped import size_calibration_path
+from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.change import JointSizes, joint_sizes
 from tactile_bayes.size.elongation import ShapePrior
@@ -18,7 +20,7 @@ from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import RoundLumps, RoundSpread
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
-from tactile_bayes.size.shared_body import SHARED_BODY, STRANGERS, SharedBody
+from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, STRANGERS, SharedBody
 from tactile_bayes.size.site_shift import SiteShift
 from tactile_bayes.size.trend import doubling_days, straight_line
 
@@ -220,6 +222,19 @@ def test_one_visit_and_very_many_are_refused(visits):
 def test_a_visit_without_a_map_is_refused():
     with pytest.raises(UsageError, match="no map"):
         joint([shape(2.7)], [])
+
+
+@pytest.mark.parametrize(("profile", "law"), [(None, SHARED_WITHOUT_DEPTH), ((0.0, 0.0, 0.0), SHARED_BODY)])
+def test_the_law_is_that_of_what_the_maps_hide(profile, law):
+    """Maps that tell the depth of fat hide less, and something else, than those that do not."""
+    path = size_calibration_path("solid")
+    assert path is not None
+    visits = [[replace(shape(p, seed=1), profile=profile)] for p in (2.5, 2.55)]
+    shipped, rng = read_size_calibration(path), np.random.default_rng(1)
+    found = joint_sizes(visits, calibration=shipped, priors=ROUND, rng=rng, number=512)
+    assert (found.calibrations[0].fat_mm is None) == (profile is None)
+    shared = law.correlation(np.array([float(np.nanmean(one)) for one in found.log_size]))
+    assert found.correlation[0, 1] == pytest.approx(shared[0, 1], rel=0.05)
 
 
 def test_a_law_with_impossible_values_is_refused():
