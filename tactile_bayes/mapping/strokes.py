@@ -75,7 +75,8 @@ def stroke_count(sources: Sequence[Source]) -> int:
         for number, source in enumerate(sources)
         for stroke in find_strokes(source, number)
     ]
-    return sum(one >= max(reach) / 2 for one in reach)
+    longest = max(reach, default=0.0)
+    return sum(one >= longest / 2 for one in reach)
 
 
 def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[StrokeShift]]:
