@@ -171,7 +171,7 @@ class Sized:
     covers_in_two: bool
 
 
-def sized(row: Mapping[str, Any], size: SizePosterior, touching: Sequence[Mapping[str, Any]] = ()) -> Sized:
+def sized(row: Mapping[str, Any], size: SizePosterior, touching: Sequence[Mapping[str, Any]]) -> Sized:
     """Compare a size, and the lengths of masses that touch, with the truth of its row."""
     largest, smallest = (size.summarise(name, probability=0.95) for name in ("max_size_mm", "min_size_mm"))
     true, least, any_way = (float(row[n]) for n in ("largest_across_mm", "smallest_across_mm", "largest_mm"))

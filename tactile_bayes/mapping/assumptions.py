@@ -45,13 +45,9 @@ def _few_strokes(quality: Mapping[str, float]) -> str:
     if strokes >= LEAST_STROKES:
         return ""
     return (
-        f"the scan has {_counted(strokes)} only, and sizes were learned from 4 to 7 (simulated ones from 3 came out "
-        "6 % large)"
+        f"the scan has {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
+        "(simulated ones from 3 came out 6 % large)"
     )
-
-
-def _counted(strokes: float) -> str:
-    return "1 stroke" if strokes == 1 else f"{strokes:.0f} strokes"
 
 
 def uneven(quality: Mapping[str, float]) -> bool:

@@ -42,11 +42,9 @@ def touching_masses(masses: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]
             # one may lie within the other's outline
             larger = {end: max(mass["max_size_mm"][end] for mass in (one, other)) for end in _ENDS}
             together = {end: nine_digits(max(apart + radii[end], larger[end])) for end in _ENDS}
-            probability = {"probability": one["max_size_mm"]["probability"]}
+            together["probability"] = one["max_size_mm"]["probability"]
             numbers = [one["number"], other["number"]]
-            found.append(
-                {"masses": numbers, "apart_mm": nine_digits(apart), "together_mm": {**together, **probability}}
-            )
+            found.append({"masses": numbers, "apart_mm": nine_digits(apart), "together_mm": together})
     return found
 
 

@@ -128,10 +128,11 @@ class BodyCalibration:
         fat = self.with_fat
         if fat is None:
             return self
+        if all(one is None for one in profiles):
+            return replace(self, with_fat=None, fat_note="the map has no pressure profile of the head")
         log_depth, why_not = fat.log_depth(profiles)
         if log_depth is None:
-            without = replace(self, with_fat=None, fat_note=why_not)
-            return without if all(one is None for one in profiles) else without.for_another_kind()
+            return replace(self, with_fat=None, fat_note=why_not).for_another_kind()
         found: BodyCalibration = fat.at(self, log_depth, profiles)
         return found
 

@@ -207,12 +207,10 @@ class FatTerms:
         return float(np.exp(log_depth.min())), float(np.exp(log_depth.max()))
 
     def log_depth(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float | None, str]:
-        """ln F of a mass from its maps' profiles, or the reason why there is none.
+        """ln F of a mass from its maps' profiles, of which one is known, or the reason why there is none.
 
         Profiles unlike the table's are left out; those of one mass are averaged, for its exams share the body.
         """
-        if all(one is None for one in profiles):
-            return None, "the map has no pressure profile of the head"
         like = self._log_depths(profiles)
         if not len(like):
             return None, "the head's pressure profile is unlike any of the calibration's"
