@@ -346,7 +346,8 @@ def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.size_json import read_size_calibration
     from tactile_bayes.size.fat_depth import head_profile
     from tactile_bayes.size.log_quadratic import LogQuadratic
-    from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps
+    from tactile_bayes.size.pooling import SizePriors, pool_maps
+    from tactile_bayes.size.shape_draws import ShapeDraws
 
     path = size_calibration_path(DEFAULT)
     assert path is not None

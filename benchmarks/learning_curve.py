@@ -26,6 +26,7 @@ from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import LOGGED
 from tactile_bayes.size.learn.regression import PopulationTable
+from tactile_bayes.size.mass_calibration import MassCalibration
 from tactile_bayes.size.supposed import known_body
 from tactile_bayes.studies.population import UNKNOWNS, population_table
 
@@ -127,13 +128,14 @@ def size_error(
     known
         Properties of which the true value is told.
     """
-    at = calibration.at_fat(_known(exams.profile, len(exams))).at_places(_known(exams.by_place, len(exams)))
-    a, p = exams.log_amplitude, exams.log_width
-    size = at.log_size(a, p)
-    slope = np.stack([(at.log_size(a + _STEP, p) - at.log_size(a - _STEP, p)) / (2 * _STEP), at.width_slope(a, p)])
-    exam = np.einsum("in,nij,jn->n", slope, exams.covariance[:, :2, :2], slope).mean() + np.exp(2 * at.mean[-1])
+    at_depth = calibration.at_fat(_known(exams.profile, len(exams)))
+    fitted = MassCalibration.of(at_depth, _known(exams.by_place, len(exams)))
+    at, a, p = fitted.mass, exams.log_amplitude, exams.log_width
+    by_exam = zip(fitted.maps, a, p, exams.covariance[:, :2, :2], strict=True)
+    size, noise, terms = (np.array(one) for one in zip(*(_by_exam(*one) for one in by_exam), strict=True))
+    exam = noise.mean() + np.exp(2 * at.mean[-1])
     middle = a.mean(keepdims=True), p.mean(keepdims=True)
-    body, _, error = at.body_and_error(at.terms(a, p).mean(axis=0, keepdims=True), *middle, np.zeros(1))
+    body, _, error = at.body_and_error(terms.mean(axis=0, keepdims=True), *middle, np.zeros(1))
     told = {name: float(exams.unknowns[name][0]) for name in known}
     told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
     own_sd = at.own_sd(body)
@@ -141,6 +143,15 @@ def size_error(
     variance = left.variance[0] + at.other_sd**2 + error[0] + exam / len(exams)
     skewness = left.skewness[0] * (left.variance[0] / variance) ** 1.5
     return float(size.mean() + left.expected[0] - np.log(exams.d_mm[0])), float(variance), float(skewness)
+
+
+def _by_exam(
+    at: BodyCalibration, log_a: FloatArray, p: FloatArray, covariance: FloatArray
+) -> tuple[float, float, FloatArray]:
+    """ln d by one exam, its variance by the map, and its terms."""
+    by_a = (at.log_size(log_a + _STEP, p) - at.log_size(log_a - _STEP, p)) / (2 * _STEP)
+    slope = np.array([by_a, at.width_slope(log_a, p)])
+    return float(at.log_size(log_a, p)), at.map_factor * float(slope @ covariance @ slope), at.terms(log_a, p)
 
 
 def _known(figures: FloatArray | None, number: int) -> Sequence[tuple[float, ...] | None]:

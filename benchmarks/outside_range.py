@@ -42,8 +42,9 @@ from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.size.eq6 import Recipe, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.posterior import push_sizes
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 SEED = 20261123
 FRAME_RATE_HZ = 40.0

@@ -17,8 +17,9 @@ from tactile_bayes.geometry import FloatArray, apply, patient_from_base
 from tactile_bayes.report.compare_document import verdict
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.change import JointSizes, joint_sizes
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps
+from tactile_bayes.size.pooling import SizePriors, pool_maps
 from tactile_bayes.size.same_mass import Place, apart
+from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.size.shared_body import SHARED_BODY, STRANGERS, SharedBody
 
 WHOLE = SharedBody(0.0, 1e6)

@@ -12,7 +12,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.npz import load_npz
-from tactile_bayes.size.pooling import ShapeDraws
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 _DRAWS: Final = ("log_amplitude", "log_width", "q", "r")
 

@@ -47,6 +47,7 @@ def process_document(fat: FatProcess) -> dict[str, Any]:
             "scale": number(kernel.scale),
         },
         "other_sd": number(fat.other_sd),
+        "map_factor": number(fat.map_factor),
         **({} if fat.places is None else {"places": _places_document(fat.places)}),
         **({} if fat.with_places is None else {"with_places": process_document(fat.with_places)}),
         "covariance_factor": [[float(f"{value:.6g}") for value in row[: i + 1]] for i, row in enumerate(factor)],
@@ -116,6 +117,7 @@ def parse_process(document: dict[str, Any]) -> FatProcess:
         covariance=factor @ factor.T,
         kernel=Kernel(points, lengths, float(kernel["scale"])),
         other_sd=float(document["other_sd"]),
+        map_factor=float(document.get("map_factor", 1.0)),
         places=None if places is None else _parse_places(places),
         with_places=None if further is None else parse_process(further),
     )

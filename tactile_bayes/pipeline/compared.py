@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.change import JointSizes
     from tactile_bayes.size.comparison import Compared
-    from tactile_bayes.size.pooling import ShapeDraws
     from tactile_bayes.size.same_mass import Apart, Place
+    from tactile_bayes.size.shape_draws import ShapeDraws
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +183,7 @@ def _sized(
         sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
         for maps in visits
     ]
-    fitted = visit_calibrations(shapes, calibration)
+    fitted = [one.mass for one in visit_calibrations(shapes, calibration)]
     far = _by_visit(shapes, fitted, lambda at, middle: at.too_far(*middle))
     if far:
         return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.result import Estimate
     from tactile_bayes.size.calibration import Calibration
-    from tactile_bayes.size.pooling import ShapeDraws, SizePriors
+    from tactile_bayes.size.pooling import SizePriors
+    from tactile_bayes.size.shape_draws import ShapeDraws
 
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
@@ -394,7 +395,7 @@ def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | N
     import math
 
     from tactile_bayes.size.fat_depth import head_profile
-    from tactile_bayes.size.pooling import ShapeDraws
+    from tactile_bayes.size.shape_draws import ShapeDraws
 
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
     if posterior is None or estimate.draws is None:

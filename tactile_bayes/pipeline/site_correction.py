@@ -143,7 +143,7 @@ def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Ma
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.presets import HEAD_PROFILE
     from tactile_bayes.size.learn.site_shift import PhantomMap
-    from tactile_bayes.size.pooling import ShapeDraws
+    from tactile_bayes.size.shape_draws import ShapeDraws
 
     rows = read_table(source, "size_table.table.json")
     _check_recipe(rows, calibration, declared)

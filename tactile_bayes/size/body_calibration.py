@@ -83,6 +83,9 @@ class BodyCalibration:
         Of a calibration for one depth, that for any.
     other_sd
         SD of ln d by which a body may differ because it is none of the table's kind; part of SD(B).
+    map_factor
+        How many times the variance of ln d that a map's posterior gives counts. Figures by place are taken at the bump
+        that the map shows and move against its noise, so sizes by them vary less; without them it is more.
     site
         Correction by a site's own phantoms; `pooling` adds it, no method of this class does.
     """
@@ -105,6 +108,7 @@ class BodyCalibration:
     places_note: str = ""
     any_depth: BodyCalibration | None = None
     other_sd: float = 0.0
+    map_factor: float = 1.0
     site: SiteShift | None = None
 
     def __post_init__(self) -> None:

@@ -14,8 +14,9 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import SizeCalibration
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.posterior import SizePosterior, push_sizes
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 Calibration = SizeCalibration | BodyCalibration
 

@@ -21,14 +21,10 @@ from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.pooling import (
-    POOLED_DRAWS,
-    ShapeDraws,
-    SizePriors,
-    corrected_log_size,
-    matched_draws,
-    shape_of_lump,
-)
+from tactile_bayes.size.elongation import Elongation, ShapePrior
+from tactile_bayes.size.mass_calibration import MassCalibration
+from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors
+from tactile_bayes.size.shape_draws import ShapeDraws, matched_draws
 from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, SharedBody
 
 MOST_VISITS = 10
@@ -165,18 +161,19 @@ def joint_sizes(
         When there are fewer than two visits, more than `MOST_VISITS`, or one has no map.
     """
     _check(visits)
-    fitted = visit_calibrations(visits, calibration)
+    by_visit = visit_calibrations(visits, calibration)
+    fitted = [one.mass for one in by_visit]
     between = between or priors.between_maps or fitted[0].between_exams
     flat = [one for maps in visits for one in maps]
     used, replicates = matched_draws(flat, number, rng)
     parts, start = [], 0
-    for maps, at in zip(visits, fitted, strict=True):
+    for maps, at in zip(visits, by_visit, strict=True):
         parts.append(_Visit.of(used[start : start + len(maps)], at))
         start += len(maps)
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = paired_points(middle, replicates, DIMENSIONS, rng)
     tau = _shared_tau(between, parts, points[:, 0])
-    half = shape_of_lump(flat, fitted[0], priors.shape).at(points[:, 2:5])
+    half = _lump_shape(visits, by_visit, priors.shape).at(points[:, 2:5])
     found = [one.weighted(tau) for one in parts]
     if law is None:
         law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
@@ -188,8 +185,8 @@ def joint_sizes(
     return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fitted))
 
 
-def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[BodyCalibration]:
-    """The calibration at the depth of fat that all maps tell, and at each visit's own figures by place.
+def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[MassCalibration]:
+    """The calibration at the depth of fat that all maps tell, and at each map's own figures by place.
 
     It is one body, so its fat is as deep at each visit. Where a visit has no usable figures by place none are used:
     what the maps hide would be something else with them than without.
@@ -198,9 +195,19 @@ def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: Body
     for maps in visits:
         for one in maps:
             calibration = calibration.fitting(*one.middle)
-    fitted = [calibration.at_places([one.by_place for one in maps]) for maps in visits]
-    without = [one for one in fitted if not one.knows_places]
-    return [without[0]] * len(visits) if without else fitted
+    by_place = [[one.by_place for one in maps] for maps in visits]
+    fitted = [MassCalibration.of(calibration, figures) for figures in by_place]
+    without = [one.mass for one in fitted if not one.mass.knows_places]
+    return [MassCalibration.of(without[0], figures) for figures in by_place] if without else fitted
+
+
+def _lump_shape(
+    visits: Sequence[Sequence[ShapeDraws]], by_visit: Sequence[MassCalibration], prior: ShapePrior
+) -> Elongation:
+    """Form of the lump, the same at all visits, by the balls of the first visit's calibration."""
+    flat = [one for maps in visits for one in maps]
+    all_maps = MassCalibration(by_visit[0].mass, tuple(at for one in by_visit for at in one.maps))
+    return all_maps.elongation(flat, all_maps.log_sizes(flat), prior)[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,10 +232,9 @@ class _Visit:
     terms: FloatArray
 
     @classmethod
-    def of(cls, maps: Sequence[ShapeDraws], calibration: BodyCalibration) -> _Visit:
-        by_map = np.stack([corrected_log_size(calibration, one) for one in maps])
-        terms = np.stack([calibration.terms(one.log_amplitude, one.log_width) for one in maps])
-        return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), terms)
+    def of(cls, maps: Sequence[ShapeDraws], calibration: MassCalibration) -> _Visit:
+        by_map = np.stack(calibration.log_sizes(maps))
+        return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), calibration.terms(maps))
 
     def weighted(self, tau: FloatArray) -> _Weighted:
         """Average the maps with the weights that (n,) spreads between exams give them."""

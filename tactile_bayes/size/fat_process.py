@@ -151,6 +151,8 @@ class FatProcess(FatTerms):
         Of h.
     other_sd
         SD of ln d by which a body may differ because it is none of the population's kind; adds to that of B.
+    map_factor
+        As in `BodyCalibration`.
     places
         The figures by place among the inputs; None where they are none.
     with_places
@@ -159,6 +161,7 @@ class FatProcess(FatTerms):
 
     kernel: Kernel | None = None
     other_sd: float = 0.0
+    map_factor: float = 1.0
     places: PlaceTable | None = None
     with_places: FatProcess | None = None
 
@@ -223,8 +226,8 @@ class FatProcess(FatTerms):
     def at_figures(self, base: DataclassInstance, log_depth: float, figures: FloatArray) -> ProcessAtProfile:
         """The calibration at one depth for (3,) or (9,) standardised figures of the frames."""
         fields: Mapping[str, object] = {name: getattr(base, name) for name in BodyCalibration.__match_args__}
-        own = {"kernel": self._kernel, "profile": figures, "other_sd": self.other_sd, "with_places": self.with_places}
-        found = ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own})
+        own = {name: getattr(self, name) for name in ("kernel", "other_sd", "map_factor", "with_places")}
+        found = ProcessAtProfile(**{**fields, **self.fields_at(base, log_depth), **own, "profile": figures})
         if self.places is None or found.hidden is None:
             return found
         return replace(found, hidden=found.hidden.at_places(figures[len(HEAD_PROFILE) :]))

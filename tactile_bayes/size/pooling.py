@@ -15,16 +15,18 @@ from dataclasses import field, replace
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels, even_replicates, picked_rows
+from tactile_bayes.inference.draws import Labels
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.paired import evened, paired_points
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
-from tactile_bayes.size.elongation import OVAL_SD, Elongation, ShapePrior, elongation, shown_share, turn_matrix
+from tactile_bayes.size.elongation import OVAL_SD, ShapePrior
+from tactile_bayes.size.mass_calibration import MassCalibration
 from tactile_bayes.size.posterior import SizePosterior, shares
-from tactile_bayes.size.site_shift import site_log_shift, site_variance
+from tactile_bayes.size.shape_draws import ShapeDraws, matched_draws
+from tactile_bayes.size.site_shift import site_variance
 from tactile_bayes.size.supposed import BodyLeft, known_body, suppositions
 
 POOLED_DRAWS = 8192
@@ -65,91 +67,6 @@ class SizePriors:
         return self.between_maps if self.between_maps is not None and self.between_maps.log_sd > 0 else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ShapeDraws:
-    """Joint draws of one map's amplitude and shape, each (n,).
-
-    Parameters
-    ----------
-    log_amplitude, log_width
-        ln a, and p, the log of the geometric mean width in mm.
-    q, r
-        Half log axis ratio along the map's x axis and 45 degrees from it.
-    turn_rad
-        From the axes that the maps of a mass share to this map's.
-    oblique
-        Mean and SD of r where the draws have none, as `MapPosterior`'s.
-    irregular
-        Whether the map is that of an irregular lump.
-    profile, by_place
-        `presets.HEAD_PROFILE` and `presets.BY_PLACE` of the map; None where it has none.
-    labels
-        Of the draws' independent replicates, as `ParameterDraws.labels`.
-    """
-
-    log_amplitude: FloatArray
-    log_width: FloatArray
-    q: FloatArray
-    r: FloatArray
-    turn_rad: float = 0.0
-    profile: tuple[float, ...] | None = None
-    by_place: tuple[float, ...] | None = None
-    labels: Labels | None = None
-    oblique: tuple[float, float] | None = None
-    irregular: bool = False
-
-    @property
-    def replicates(self) -> Labels:
-        """(n,) label of the independent replicate of each draw."""
-        return even_replicates(len(self.q)) if self.labels is None else self.labels
-
-    @property
-    def order(self) -> tuple[float, ...]:
-        """Sort key of maps before pooling."""
-        return tuple(float(np.nansum(v)) for v in (self.log_width, self.log_amplitude, self.q, self.r))
-
-    @classmethod
-    def of(
-        cls,
-        amplitude: FloatArray,
-        sigma_x_mm: FloatArray,
-        sigma_y_mm: FloatArray,
-        angle_rad: FloatArray,
-        *,
-        turn_rad: float = 0.0,
-        profile: tuple[float, ...] | None = None,
-        by_place: tuple[float, ...] | None = None,
-        labels: Labels | None = None,
-        oblique: tuple[float, float] | None = None,
-        irregular: bool = False,
-    ) -> ShapeDraws:
-        """Prepare from draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            log_a = np.log(np.where(amplitude > 0, amplitude, np.nan)).ravel()
-        half = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel()
-        angle = angle_rad.ravel()
-        p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
-        q, r = half * np.cos(2 * angle), half * np.sin(2 * angle)
-        return cls(log_a, p, q, r, turn_rad, profile, by_place, labels, oblique, irregular)
-
-    @property
-    def middle(self) -> tuple[float, float]:
-        """Medians of the amplitude and of the geometric mean width, mm."""
-        amplitude, sigma_mm = (float(np.exp(np.nanmedian(v))) for v in (self.log_amplitude, self.log_width))
-        return amplitude, sigma_mm
-
-    def rows(self, index: Labels) -> ShapeDraws:
-        """Subset of the draws, treated as independent."""
-        drawn = {name: getattr(self, name)[index] for name in ("log_amplitude", "log_width", "q", "r")}
-        return replace(self, **drawn, labels=None)
-
-
-def corrected_log_size(calibration: BodyCalibration, shape: ShapeDraws) -> FloatArray:
-    """(n,) ln d of a map's draws without B and E, with the site's correction where there is one."""
-    size = calibration.log_size(shape.log_amplitude, shape.log_width)
-    return size + site_log_shift(calibration.site, shape.log_width)
-
-
 def pooled_size(
     maps: Sequence[ShapeDraws],
     *,
@@ -180,14 +97,15 @@ def pooled_size(
     B, its skewed score and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
     maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
     """
-    calibration = calibration.at_fat([one.profile for one in maps]).at_places([one.by_place for one in maps])
+    fitted = MassCalibration.of(calibration.at_fat([one.profile for one in maps]), [one.by_place for one in maps])
+    calibration = fitted.mass
     used, replicates = matched_draws(maps, number, rng)
-    by_map = np.stack([corrected_log_size(calibration, m) for m in used])
-    log_size = by_map if used is maps else [corrected_log_size(calibration, m) for m in maps]
+    log_size = fitted.log_sizes(maps)
+    by_map = np.stack(log_size if used is maps else fitted.log_sizes(used))
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
-    oval, shown = _elongation(maps, list(log_size), calibration, priors.shape)
+    oval, shown = fitted.elongation(maps, log_size, priors.shape)
     points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS + calibration.is_skewed, rng)
-    terms = np.stack([calibration.terms(m.log_amplitude, m.log_width) for m in used])
+    terms = fitted.terms(used)
     half = oval.at(points[:, 3:DIMENSIONS])
     figures = {
         "oval_probability": oval.probability,
@@ -325,16 +243,6 @@ class _Pool:
         return largest, smallest
 
 
-def matched_draws(
-    maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
-) -> tuple[Sequence[ShapeDraws], Labels]:
-    """As many draws of each map, matched by replicate, with their labels; one map's own where no number is given."""
-    if number is None and len(maps) == 1:
-        return maps, maps[0].replicates
-    replicates = even_replicates(len(maps[0].q) if number is None else number)
-    return [m.rows(picked_rows(m.replicates, replicates, rng)) for m in maps], replicates
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PooledEstimate:
     """Result of pooling the maps of one mass.
@@ -386,64 +294,24 @@ def pool_maps(
     used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
     profiles = [one.profile for one in used]
     fat_apart_mm = None if calibration.with_fat is None else calibration.with_fat.depths_apart(profiles)
-    calibration = calibration.at_fat(profiles)
+    at_depth = calibration.at_fat(profiles)
     middles = [one.middle for one in used]
     for middle in middles:  # one map that does not go with the depth is enough: it is the same body
-        calibration = calibration.fitting(*middle)
-    calibration = calibration.at_places([one.by_place for one in used])
+        at_depth = at_depth.fitting(*middle)
+    fitted = MassCalibration.of(at_depth, [one.by_place for one in used])
     named = sorted(zip(found, middles, strict=True))
-    far = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.too_far(*middle)]
+    far = [f"map {i + 1}: {text}" for i, middle in named for text in fitted.mass.too_far(*middle)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
-    size = pooled_size(used, calibration=calibration, priors=priors, rng=rng, number=POOLED_DRAWS)
+    size = pooled_size(used, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
-    centres = {
-        i: float(np.nanmean(corrected_log_size(calibration, shape))) for i, shape in zip(found, used, strict=True)
-    }
-    outside = [f"map {i + 1}: {text}" for i, middle in named for text in calibration.outside(*middle)]
-    outside += calibration.beyond_lumps(size.median_mm)
+    centres = {i: float(np.nanmean(one)) for i, one in zip(found, fitted.log_sizes(used), strict=True)}
+    outside = [f"map {i + 1}: {text}" for i, middle in named for text in fitted.mass.outside(*middle)]
+    outside += fitted.mass.beyond_lumps(size.median_mm)
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
     outlying = tuple(sorted(found[i] for i in size.outliers))
     if len(used) > 1:
         weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
         size = replace(size, figures={**size.figures, **weights})
-    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), calibration, fat_apart_mm)
-
-
-def _elongation(
-    maps: Sequence[ShapeDraws], log_size: Sequence[FloatArray], calibration: BodyCalibration, prior: ShapePrior
-) -> tuple[Elongation, float]:
-    """Posterior of the lump's shape in the axes the maps share, and the share of it that they show."""
-    excess, covariance, shown = np.zeros(2), np.zeros((2, 2)), 0.0
-    k = len(maps)
-    for one, size in zip(maps, log_size, strict=True):
-        mean, spread = _axis_ratio(one)
-        mean[0] -= float(np.nanmean(calibration.round_excess(one.log_amplitude, one.log_width)))
-        turn = turn_matrix(-one.turn_rad)
-        excess += mean @ turn / k
-        covariance += turn.T @ spread @ turn / k**2
-        shown += shown_share(size, one.log_width) / k
-    balls = calibration.round_lumps.spread
-    whole = balls.map_factor * covariance + (balls.variance(np.zeros(()), maps=k) + 1e-12) * np.eye(2)
-    return elongation(excess, whole, shown=shown, prior=prior), shown
-
-
-def _axis_ratio(one: ShapeDraws) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of q and r; where nobody measured r, it is within twice the SD of q about 0.
-
-    It was left out because the map does not speak for it.
-    """
-    both = np.stack([one.q, one.r], axis=-1)
-    both = both[np.isfinite(both).all(axis=1)]
-    mean, covariance = both.mean(axis=0), np.cov(both.T)
-    if not covariance[1, 1] > 0:
-        mean[1], sd = one.oblique or (0.0, 2.0 * float(np.sqrt(covariance[0, 0])))
-        covariance[1, 1] = sd**2
-    return mean, covariance
-
-
-def shape_of_lump(maps: Sequence[ShapeDraws], calibration: BodyCalibration, prior: ShapePrior) -> Elongation:
-    """Posterior of the half log axis ratio of a lump from all its maps."""
-    log_size = [corrected_log_size(calibration, one) for one in maps]
-    return _elongation(maps, log_size, calibration, prior)[0]
+    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), fitted.mass, fat_apart_mm)

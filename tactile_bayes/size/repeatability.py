@@ -12,8 +12,10 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, corrected_log_size, pooled_size
+from tactile_bayes.size.mass_calibration import corrected_log_size
+from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 PROBABILITY: Final = 0.95
 """Of the interval of a learned spread."""

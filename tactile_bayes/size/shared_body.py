@@ -49,7 +49,7 @@ class SharedBody:
         return np.asarray(shared)
 
 
-SHARED_BODY: Final = SharedBody(0.26, 0.11)
+SHARED_BODY: Final = SharedBody(0.16, 0.12)
 """Learned from simulated visits, see record 0115: ``python -m benchmarks.visits law``."""
 SHARED_WITHOUT_DEPTH: Final = SharedBody(0.19, 0.39)
 """Where maps tell no depth of fat: most of what they hide is that depth, which stays as the lump grows."""

@@ -21,7 +21,7 @@ from tactile_bayes.presets import BY_PLACE, DEFAULT_NORMALISE, HEAD_PROFILE
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.hidden import LOGGED
 from tactile_bayes.size.learn.regression import PopulationTable
-from tactile_bayes.size.pooling import ShapeDraws
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 UNKNOWNS = ("depth_mm", "stiffness_ratio", "seat", "fat_kpa", "gland_ratio", "thickness_mm")
 SHAPE_COVARIANCE = ("var_log_a", "cov_log_a_p", "cov_log_a_q", "var_p", "cov_p_q", "var_q")

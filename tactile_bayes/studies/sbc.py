@@ -48,7 +48,8 @@ from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII
 from tactile_bayes.presets import Method
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pooled_size
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 HALF_MM = 25.0
 CELL_MM = 1.0

@@ -20,7 +20,8 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps
+from tactile_bayes.size.pooling import SizePriors, pool_maps
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 SHIPPED = size_calibration_path("solid")
 EVEN = (0.0, 0.0, 0.0)

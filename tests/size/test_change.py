@@ -19,7 +19,8 @@ from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import RoundLumps, RoundSpread
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pooled_size
+from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, STRANGERS, SharedBody
 from tactile_bayes.size.site_shift import SiteShift
 from tactile_bayes.size.trend import doubling_days, straight_line

@@ -22,7 +22,8 @@ from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.polynomials import monomials, powers
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps
+from tactile_bayes.size.pooling import SizePriors, pool_maps
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 RECIPE = Recipe("mean", "free", 20.0, False, "field")
 BODY_SD, EXAM_SD = 0.04, 0.01

@@ -22,7 +22,8 @@ from tactile_bayes.size.elongation import (
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import IRREGULAR_SD, ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.pooling import IRREGULAR_SD, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 BODY_SD = 0.08
 

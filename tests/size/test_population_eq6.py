@@ -16,8 +16,9 @@ from tactile_bayes.head_shape import DEFAULT_HEAD
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.learn.eq6_population import learn_population_eq6
 from tactile_bayes.size.learn.regression import PopulationTable
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.population_eq6 import PopulationEq6
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 RECIPE = Recipe("gain", "free", 20.0, False, "field", False)
 M, B_MM, E, F = 3.3, -1.5, 0.62, -0.3

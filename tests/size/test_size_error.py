@@ -24,8 +24,9 @@ from tactile_bayes.posterior.assessment import MapDraws
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.posterior import push_sizes
+from tactile_bayes.size.shape_draws import ShapeDraws
 
 SEEDS = 24
 PROBABILITY = 0.95

@@ -27,7 +27,8 @@ from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pooled_size
+from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.studies.forward_tradeoff import (
     EMPIRICAL,
     PLANE,

@@ -15,7 +15,7 @@ from tactile_bayes.size.fat_process import FatProcess, PlaceTable
 from tactile_bayes.size.learn.fat_depth import LEAST_BODIES, FatTable
 from tactile_bayes.size.learn.hidden import hidden_terms
 from tactile_bayes.size.learn.process_fit import Fitted, ProcessRows, fit_process, left_out_density
-from tactile_bayes.size.learn.regression import PopulationTable, error_figures, leverages
+from tactile_bayes.size.learn.regression import ExamSpread, PopulationTable, error_figures, leverages
 from tactile_bayes.size.polynomials import monomials
 
 INSIDE: Final = 0.99
@@ -70,7 +70,7 @@ def place_table(by_place: FloatArray) -> PlaceTable:
 def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> FatProcess:
     rows, fitted, exam = fit_process(found.maps, ProcessRows.of(found, places))
     features = monomials(found.values, POWERS)
-    mean = np.concatenate([fitted.mean, fitted.log_spread, exam[:1]])
+    mean = np.concatenate([fitted.mean, fitted.log_spread, [exam.log_sd]])
     error, variance = fitted.left_out(rows.data.mean_log_d)
     left_out = {"body": -error, "body_sd": np.exp(rows.spread @ fitted.log_spread), "variance": variance}
     by_place = None if places is None else rows.x[:, -len(BY_PLACE) :]
@@ -82,29 +82,30 @@ def _learned(found: FatTable, places: PlaceTable | None, other_sd: float) -> Fat
         fit=_figures(found.maps, rows, fitted, exam),
         kernel=fitted.kernel,
         other_sd=other_sd,
+        map_factor=exam.map_factor,
         places=places,
     )
 
 
-def _covariance(rows: ProcessRows, fitted: Fitted, exam: FloatArray) -> FloatArray:
+def _covariance(rows: ProcessRows, fitted: Fitted, exam: ExamSpread) -> FloatArray:
     """Of coefficients, ln SD(B) and ln SD(E): the second by curvature, kernel kept."""
     from tactile_bayes.inference.laplace import mode_and_covariance
 
     k, s = len(fitted.mean), len(fitted.log_spread)
-    density = left_out_density(rows, fitted, exam_sd=float(np.exp(exam[0])))
+    density = left_out_density(rows, fitted, exam_sd=exam.sd)
 
     def many(spreads: FloatArray) -> FloatArray:
         return np.array([density(one) for one in spreads])
 
     _, of_spread, _ = mode_and_covariance(many, fitted.log_spread, scale=np.full(s, 0.05))
     whole = np.zeros((k + s + 1, k + s + 1))
-    whole[:k, :k], whole[k:-1, k:-1], whole[-1, -1] = fitted.covariance, of_spread, exam[1]
+    whole[:k, :k], whole[k:-1, k:-1], whole[-1, -1] = fitted.covariance, of_spread, exam.variance
     return whole
 
 
-def _figures(table: PopulationTable, rows: ProcessRows, fitted: Fitted, exam: FloatArray) -> dict[str, float]:
+def _figures(table: PopulationTable, rows: ProcessRows, fitted: Fitted, exam: ExamSpread) -> dict[str, float]:
     """Number of rows, spreads, and errors cross-validated by body with the kernel kept."""
     error, variance = fitted.left_out(rows.data.mean_log_d)
-    spreads = {"body_sd": float(np.exp(np.median(rows.spread @ fitted.log_spread))), "exam_sd": float(np.exp(exam[0]))}
+    spreads = {"body_sd": float(np.exp(np.median(rows.spread @ fitted.log_spread))), "exam_sd": exam.sd}
     share_held = float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(variance)))
     return error_figures(table, rows.data, spreads, error, share_held)

@@ -18,7 +18,7 @@ import numpy as np
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.fat_process import LINEAR_POWERS, SPREAD, Kernel, PlaceTable
 from tactile_bayes.size.learn.fat_depth import LEAST_BODIES, FatTable
-from tactile_bayes.size.learn.regression import BodyRegression, PopulationTable
+from tactile_bayes.size.learn.regression import BodyRegression, ExamSpread, PopulationTable
 from tactile_bayes.size.polynomials import monomials
 
 POINTS: Final = 200
@@ -26,6 +26,8 @@ POINTS: Final = 200
 BODIES_PER_POINT: Final = 4
 SEED: Final = 1
 """Of the bodies that are the points."""
+MAP_FACTORS: Final = np.geomspace(0.1, 6.0, 42)
+"""By which the variance of maps may count, in steps of a tenth: figures by place move against a bump's noise."""
 _LINEAR_SD = 10.0
 _LENGTH, _SCALE, _BODY_SD = (np.log(2.0), 1.0), (np.log(0.3), 1.0), (np.log(0.1), 1.0)
 """Centre and width of the normal priors on the logs of lengths, scale and SD(B) at the centre."""
@@ -111,27 +113,28 @@ class Fitted:
         return float(-0.5 * np.sum(np.log(variance) + error**2 / variance))
 
 
-def fit_process(table: PopulationTable, rows: ProcessRows) -> tuple[ProcessRows, Fitted, FloatArray]:
+def fit_process(table: PopulationTable, rows: ProcessRows) -> tuple[ProcessRows, Fitted, ExamSpread]:
     """Kernel and spreads with half of the points, then with all.
 
     Returns
     -------
     rows, fitted, exam
-        The rows with the maps' own variance, the fit, ln SD(E) and its variance.
+        The rows with what the maps' own variance counts, the fit, and the spread between exams.
     """
     count = max(min(POINTS, rows.data.groups // BODIES_PER_POINT), LEAST_BODIES // BODIES_PER_POINT)
-    exam = np.array(rows.data.log_exam_sd(rows.data.least_squares()))
+    exam = rows.data.exam_spread(rows.data.least_squares())
     starts = [_start(rows, length) for length in _START_LENGTHS]
     for points_now in (count // 2, count):
-        fits = [_best(rows, one, points_now, exam_sd=float(np.exp(exam[0]))) for one in starts]
+        fits = [_best(rows, one, points_now, exam_sd=exam.sd) for one in starts]
         theta, points, _ = min(fits, key=lambda one: one[2])
         starts = [theta]
-        fitted = given(rows, points, theta, exam_sd=float(np.exp(exam[0])))
-        rows = replace(rows, data=replace(rows.data, map_variance=_map_variance(table, rows, fitted)))
-        whole = replace(rows.data, terms=all_terms(rows, fitted.kernel))
-        exam = np.array(whole.log_exam_sd(fitted.mean))
-    fitted = given(rows, points, theta, exam_sd=float(np.exp(exam[0])))
-    return rows, _spread_by_left_out(rows, fitted, exam_sd=float(np.exp(exam[0]))), exam
+        fitted = given(rows, points, theta, exam_sd=exam.sd)
+        variance = _map_variance(table, rows, fitted)
+        whole = replace(rows.data, terms=all_terms(rows, fitted.kernel), map_variance=variance)
+        exam = whole.exam_spread(fitted.mean, MAP_FACTORS)
+        rows = replace(rows, data=replace(rows.data, map_variance=exam.map_factor * variance))
+    fitted = given(rows, points, theta, exam_sd=exam.sd)
+    return rows, _spread_by_left_out(rows, fitted, exam_sd=exam.sd), exam
 
 
 def _spread_by_left_out(rows: ProcessRows, fitted: Fitted, *, exam_sd: float) -> Fitted:

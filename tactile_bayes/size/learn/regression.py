@@ -5,9 +5,10 @@ For the means over the exams of body j, with what the maps themselves leave open
 .. math:: \ln d_j = \bar x_j^T\beta + B_j + \bar E_j, \quad B_j \sim N(0, s_j^2),\;
           \bar E_j \sim N(0, (t^2 + \bar m_j) / n_j).
 
-t comes from how the exams of one body differ in :math:`x^T\beta`. That difference says nothing of beta: a body has one
-diameter, so within it a regression of d on the map has slope 0 (errors in variables). Coefficients, spread between
-bodies and spread between exams are so told apart, and a patient's map adds its own m and nothing twice.
+t comes from how the exams of one body differ in :math:`x^T\beta`, and so does a factor of m where one is sought. That
+difference says nothing of beta: a body has one diameter, so within it a regression of d on the map has slope 0 (errors
+in variables). Coefficients, spread between bodies and spread between exams are so told apart, and a patient's map adds
+its own m and nothing twice.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ Terms = Callable[[FloatArray, FloatArray], FloatArray]
 """Takes (n,) ln a and p of a table's rows to (n, k) terms."""
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
+_MAP_FACTOR_SD = 1.0
+"""Width of the prior on the log of kappa, about 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +83,28 @@ class PopulationTable:
             None if self.log_fat is None else self.log_fat[keep],
             None if self.by_place is None else self.by_place[keep],
         )
+
+
+@dataclass(frozen=True, slots=True)
+class ExamSpread:
+    """How far exams of one body differ in their sizes.
+
+    Parameters
+    ----------
+    log_sd, variance
+        Posterior mean and variance of ln t, t beyond the maps' own noise.
+    map_factor
+        Kappa: how many times a map's own variance of ln d counts.
+    """
+
+    log_sd: float
+    variance: float
+    map_factor: float = 1.0
+
+    @property
+    def sd(self) -> float:
+        """T by the mean of its logarithm."""
+        return float(np.exp(self.log_sd))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,17 +174,27 @@ class BodyRegression:
         """(k,) ordinary least-squares coefficients from the bodies' means."""
         return np.asarray(np.linalg.lstsq(self.mean_terms, self.mean_log_d, rcond=None)[0])
 
-    def log_exam_sd(self, coefficients: FloatArray) -> tuple[float, float]:
-        """ln t and its variance, t the SD of sizes between exams of a body beyond their maps' own noise.
+    def exam_spread(self, coefficients: FloatArray, map_factors: FloatArray | None = None) -> ExamSpread:
+        """Spread of sizes between exams of a body beyond their maps' own noise.
 
-        Posterior mean and variance on a grid. Squares of a body's exams about their mean are :math:`(t^2 + m) \\chi^2`,
-        m the mean variance of its maps: a clear lump, whose maps have little noise, tells more of t than a faint one.
-        Without bodies examined twice, the prior.
+        Squares of a body's exams about their mean are :math:`(t^2 + \\kappa m) \\chi^2`, m the mean variance of its
+        maps: a clear lump, whose maps have little noise, tells more of t than a faint one, and both together tell
+        kappa. Without bodies examined twice, the priors.
+
+        Parameters
+        ----------
+        map_factors : (f,) array
+            Kappa is the most probable of these; None takes 1 as known.
         """
+        tried = [self._exam_spread(coefficients, one) for one in (np.ones(1) if map_factors is None else map_factors)]
+        return max(tried, key=lambda one: one[1])[0]
+
+    def _exam_spread(self, coefficients: FloatArray, map_factor: float) -> tuple[ExamSpread, float]:
+        """For one kappa, by t on a grid, with its log evidence."""
         k = self.terms.shape[1]
         size = self.terms @ coefficients[:k] + self.constant
         square = np.bincount(self.group, (size - self.mean(size)[self.group]) ** 2)
-        freedom, noise = self.exams - 1.0, self.mean(self.map_variance)
+        freedom, noise = self.exams - 1.0, map_factor * self.mean(self.map_variance)
         centre, width = _PRIOR[2]
         log_t = centre + width * np.linspace(-4.0, 4.0, 401)
         variance = np.exp(2.0 * log_t)[:, None] + noise
@@ -167,11 +202,12 @@ class BodyRegression:
         log_p -= 0.5 * ((log_t - centre) / width) ** 2
         p = np.exp(log_p - log_p.max())
         mean = float(p @ log_t / p.sum())
-        return mean, float(p @ (log_t - mean) ** 2 / p.sum())
+        found = ExamSpread(mean, float(p @ (log_t - mean) ** 2 / p.sum()), float(map_factor))
+        return found, float(log_p.max() + np.log(p.sum()) - 0.5 * (np.log(map_factor) / _MAP_FACTOR_SD) ** 2)
 
     def log_density(self, theta: FloatArray) -> FloatArray:
         """(m,) log posterior of (m, k + 2) coefficients, ln(sd between bodies) and its slope."""
-        exam = np.exp(2 * self.log_exam_sd(self.least_squares())[0])
+        exam = self.exam_spread(self.least_squares()).sd ** 2
         residual = self.mean_log_d - theta[:, :-2] @ self.mean_terms.T
         variance = np.exp(2 * (theta[:, -2:-1] + theta[:, -1:] * self.mean_u))
         variance = variance + (exam + self.mean(self.map_variance)) / self.exams
@@ -206,10 +242,10 @@ class BodyRegression:
         errors = np.sqrt(left * np.diag(np.linalg.inv(self.mean_terms.T @ self.mean_terms)))
         start, scale = np.append(b, _PRIOR[:2, 0]), np.append(errors, [0.1, 0.05])
         mode, covariance, _ = mode_and_covariance(self.log_density, start, scale=scale)
-        log_exam_sd, its_variance = self.log_exam_sd(mode)
+        exam = self.exam_spread(mode)
         covariance = np.pad(covariance, (0, 1))
-        covariance[-1, -1] = its_variance
-        return np.append(mode, log_exam_sd), covariance
+        covariance[-1, -1] = exam.variance
+        return np.append(mode, exam.log_sd), covariance
 
 
 def leverages(features: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -23,7 +23,8 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.learn.site_cautions import cautions_of, no_depth
-from tactile_bayes.size.pooling import ShapeDraws
+from tactile_bayes.size.mass_calibration import MassCalibration
+from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.size.site_shift import SiteShift, with_site
 
 LEAST_PHANTOMS = 3
@@ -237,17 +238,19 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     centre, used = calibration.centre[1], calibration.at_fat([one.shape.profile for one in maps])
     for one in maps:
         used = used.fitting(*one.shape.middle)
-    used = used.at_places([one.shape.by_place for one in maps])
+    shapes = [one.shape for one in maps]
+    fitted = MassCalibration.of(used, [one.by_place for one in shapes])
+    used = fitted.mass
     for one in maps:
         note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
         if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
             return "; ".join(outside)
-    log_size = [used.log_size(one.shape.log_amplitude, one.shape.log_width) for one in maps]
+    log_size = fitted.log_sizes(shapes)
     log_a, log_width = (
         np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
     )
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
-    terms = used.terms(log_a, log_width)
+    terms = fitted.mass.terms(log_a, log_width)
     body_sd = used.body_and_error(terms, log_a, log_width, np.zeros(len(maps)))[0].mean()
     own_sd = float(used.own_sd(body_sd))
     expected, alone, together = _known(used, maps[0].known, (float(log_a.mean()), float(log_width.mean())), own_sd)

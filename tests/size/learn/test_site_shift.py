@@ -29,7 +29,8 @@ from tactile_bayes.size.learn.site_shift import (
     shift_posterior,
 )
 from tactile_bayes.size.log_quadratic import LogQuadratic
-from tactile_bayes.size.pooling import ShapeDraws, SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
+from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.size.site_shift import with_site
 
 BODY_SD, EXAM_SD, CENTRE = 0.10, 0.03, (-1.0, 1.5)
