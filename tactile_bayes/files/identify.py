@@ -228,11 +228,13 @@ def _with_fat(part: FatTerms | None) -> dict[str, Any]:
 
 
 def _spread(part: FatTerms) -> dict[str, float]:
-    """What a part knows of the spread between bodies besides its fit."""
+    """What a part knows of the spread between bodies and of maps besides its fit."""
     from tactile_bayes.size.fat_process import FatProcess
 
     found = {} if part.hidden is None else {"body_skewness": part.hidden.skewness}
-    return {**found, "other_sd": part.other_sd} if isinstance(part, FatProcess) else found
+    if isinstance(part, FatProcess):
+        found |= {"other_sd": part.other_sd, "map_factor": part.map_factor}
+    return found
 
 
 def _table(path: Path, head: bytes) -> dict[str, Any]:

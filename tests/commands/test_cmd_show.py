@@ -86,6 +86,7 @@ def test_a_calibration_of_the_program_is_known_by_its_name_and_tells_all_its_par
     by_place, place = found["with_figures_by_place"], stored["fat_process"]["with_places"]
     assert by_place["body_skewness"] == place["hidden"]["skewness"] > 0
     assert by_place["other_sd"] == place["other_sd"] > 0
+    assert 0 < by_place["map_factor"] == place["map_factor"] < 1 < found["with_depth_of_fat"]["map_factor"]
 
 
 def test_a_file_goes_before_a_calibration_of_its_name(tmp_path: Path) -> None:
