@@ -20,6 +20,7 @@ from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import open_input
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.touching import touching_sentences
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
@@ -269,8 +270,10 @@ def _cautions(document: Mapping[str, Any]) -> Iterable[str]:
     for text in (*_texts(document.get("outside_calibration")), *_texts(diagnostics.get("outside_calibration"))):
         yield f"outside the calibration's range: {text}"
     yield from _texts(diagnostics.get("broken_assumptions"))
+    yield from touching_sentences(document.get("touching", ()))
     for i, one in enumerate(document.get("maps", ()), start=1):
-        yield from (f"map {i}: {text}" for text in _texts(one["broken_assumptions"]))
+        told = [*_texts(one["broken_assumptions"]), *touching_sentences(one.get("touching", ()))]
+        yield from (f"map {i}: {text}" for text in told)
         if one["outlying"]:
             yield f"map {i} lies apart from the others"
     if document.get("fat_apart_mm"):

@@ -15,6 +15,7 @@ from tactile_bayes.files.schema import load_schema
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_match import unnamed
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.touching import touching_sentences
 
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
 _TRIAL_COLUMNS: Final = (
@@ -23,6 +24,7 @@ _TRIAL_COLUMNS: Final = (
 )  # fmt: skip
 _OF_ESTIMATE: Final = (
     "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "side_caution",
+    "touching",
 )  # fmt: skip
 _OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
 _OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
@@ -91,7 +93,8 @@ class Row:
         """What is to be looked at besides."""
         if self.document is None:
             return []
-        return [*self.document["diagnostics"].get("assumptions_to_check", []), *self.unnamed]
+        touching = touching_sentences(self.document.get("touching") or [])
+        return [*self.document["diagnostics"].get("assumptions_to_check", []), *touching, *self.unnamed]
 
 
 def _status(document: Mapping[str, Any] | None) -> str:

@@ -26,6 +26,7 @@ from tactile_bayes.report.size_text import (
     table_row,
 )
 from tactile_bayes.report.supposed_text import supposed_document, supposed_line, supposed_lines
+from tactile_bayes.report.touching import touching_sentences
 from tactile_bayes.size import omissions
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.pooling import PooledEstimate
@@ -102,6 +103,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
     return {
         "map": name,
         "other_rises": list(document["other_rises"]),
+        "touching": list(document.get("touching", [])),
         "status": document["status"],
         "reason": document["reason"],
         "detected_probability": document["detected_probability"],
@@ -152,7 +154,12 @@ def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
     apart = [one["map"] for one in maps if one["outlying"]]
     lines += joined(apart, most=2, lead="Apart from the others, look at these maps: ")
     rises = [_rise_line(one["map"], rise).rstrip(".") for one in maps for rise in one["other_rises"]]
-    return lines + joined(rises, most=1, lead="")
+    return lines + joined(_touching(maps), most=1, lead="To check: ") + joined(rises, most=1, lead="")
+
+
+def _touching(maps: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Masses that may be one lump, with the map's name; files of earlier versions name none."""
+    return [f"{one['map']}: {text}" for one in maps for text in touching_sentences(one.get("touching", []))]
 
 
 def _broken(maps: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -166,6 +173,7 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines = [*_bodies(document), *range_cautions(document["outside_calibration"])]
     lines += [f"CAUTION: {text}." for text in _broken(document["maps"])]
     lines += [_map_line(one) for one in document["maps"]]
+    lines += [f"To check: {text}." for text in _touching(document["maps"])]
     lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"

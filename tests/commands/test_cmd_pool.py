@@ -18,7 +18,7 @@ from tactile_bayes.files.schema import check_document
 from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.size_posterior import read_stated_size
-from tactile_bayes.report.pooled import pooled_text
+from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 FAST = ("--method", "laplace")
 
@@ -201,3 +201,15 @@ def test_mistakes_end_in_one_line(folder: Path, arguments: list[str], code: int,
     done = run_here("estimate", *arguments, *FAST, cwd=folder)
     assert (done.returncode, done.stdout) == (code, "")
     assert words in done.stderr
+
+
+def test_masses_of_a_map_that_may_be_one_lump_are_told_with_the_pooled_size(pooled: dict) -> None:
+    together = {"median": 19, "low": 17, "high": 21, "probability": 0.95}
+    pair = {"masses": [1, 2], "apart_mm": 9.0, "together_mm": together}
+    first = pooled["maps"][0]
+    told = pooled | {"maps": [first | {"touching": [pair]}, *pooled["maps"][1:]]}
+    check_document(told, "pooled.schema.json", path=Path("told"))
+    words = f"To check: {first['map']}: masses 1 and 2 may be one lump: together 19.0 mm long (17.0 to 21.0)."
+    for report in (pooled_text, pooled_summary):
+        assert words in report(told).splitlines()
+        assert "may be one lump" not in report(pooled)

@@ -127,6 +127,14 @@ def test_markup_in_words_stays_words(estimate: dict[str, Any], tmp_path: Path) -
     assert "CAUTION: <script>alert(1)</script>" in report["conclusion"]
 
 
+def test_masses_that_may_be_one_lump_are_told(estimate: dict[str, Any], tmp_path: Path) -> None:
+    together = {"median": 19, "low": 17, "high": 21, "probability": 0.95}
+    pair = {"masses": [1, 2], "apart_mm": 9.0, "together_mm": together}
+    (tmp_path / "e.json").write_text(json.dumps(estimate | {"touching": [pair]}))
+    (report,) = resources(bundle(tmp_path, tmp_path / "b.json", "e.json"), "DiagnosticReport")
+    assert "masses 1 and 2 may be one lump: together 19.0 mm long (17.0 to 21.0)" in report["conclusion"]
+
+
 def test_every_mass_of_an_estimate_has_its_observations(estimate: dict[str, Any]) -> None:
     """By the list of masses in newer estimates: places are plain numbers there."""
     keys = ("max_size_mm", "min_size_mm", "reason", "reason_code", "detected_probability", "another_exam")
