@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import socket
 import termios
 import threading
@@ -25,6 +26,10 @@ _SHOWN_BYTES: Final = 12
 _READ_S: Final = 0.01
 # What a device that vanishes ends a call with; a terminal's own error is no OSError.
 GONE: Final = (OSError, serial.SerialException, termios.error)
+# In "[Errno 111] Connection refused" and "(25, 'Inappropriate ioctl for device')".
+_ERROR_NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[\],]")
+# Of a network's URL: host and port.
+_NETWORK: Final = ("socket://", "rfc2217://")
 
 
 class Port:
@@ -113,6 +118,8 @@ class Port:
 
 
 def _open(url: str, baud: int, role: str) -> Any:
+    if url.startswith(_NETWORK) and not re.search(r":\d+(?:[/?].*)?$", url.partition("://")[2]):
+        raise DeviceError(f"{role} {url}: not a port (no port number); give {url.partition('://')[0]}://HOST:PORT")
     try:
         port = serial.serial_for_url(url, baudrate=baud, timeout=_READ_S, do_not_open=True)
         if "://" not in url:
@@ -147,9 +154,13 @@ def _relay(port: Any, sink: socket.socket) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """The system's error text without pyserial's wrapping."""
+    """The system's error text, also where pyserial wraps it in its own."""
     number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
-    return os.strerror(number) if isinstance(number, int) else str(error).split(": ")[-1].strip("[]'\" ")
+    if not isinstance(number, int):
+        wrapped = _ERROR_NUMBER.search(str(error))
+        number = int(wrapped[1]) if wrapped else 0
+    # a resolver's numbers are below 0, and its words stand behind them
+    return os.strerror(number) if number > 0 else str(error).split("] ")[-1].split(": ")[-1].strip("[]()'\" ")
 
 
 def shown(data: bytes) -> str:

@@ -329,6 +329,24 @@ def test_no_trace_is_left_when_the_devices_are_not_there(record, tmp_path):
     assert not (tmp_path / "a.mcap").exists()
 
 
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("socket://127.0.0.1:9", "cannot be opened (Connection refused); `tactile-bayes devices`"),
+        ("rfc2217://127.0.0.1:9", "cannot be opened (Connection refused); `tactile-bayes devices`"),
+        ("/dev/null", "cannot be opened (Inappropriate ioctl for device); `tactile-bayes devices`"),
+        ("socket://127.0.0.1", "not a port (no port number); give socket://HOST:PORT"),
+        ("socket://[::1]", "not a port (no port number); give socket://HOST:PORT"),
+    ],
+)
+def test_a_port_that_cannot_be_opened_is_told_in_the_systems_words(record, url, words):
+    """pyserial wraps them in text of its own; without a port number it fails over a comparison."""
+    done = record("--head", url)
+    assert done.returncode == 4
+    assert done.stderr.startswith(f"error: head {url}: {words}")
+    assert done.stderr.count("\n") == 1
+
+
 def test_a_port_in_use_is_refused(record, scan):
     with serving(EmulatedHead(scan), PtyLink()) as emulator:
         other = Port(emulator._link.url, baud=9600, role="head")
