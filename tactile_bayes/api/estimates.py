@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -344,6 +344,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     prints = [one.outcome.tactile_map.fingerprint for one in found]
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once")
+    found = of_one_mass(found)
     names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
     outcome = pool_answers([one.answer for one in found], used, names=names, inputs={})
     return PooledSize(outcome, found, used.interval, settings=used)
@@ -352,6 +353,24 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
 def estimated(given: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:
     """Estimates of maps, or of their paths; those that are estimates already keep their own settings."""
     return tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in given)
+
+
+def of_one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
+    """The estimates; one of another mass than most maps show is made again at that one's place.
+
+    Estimates of a place that somebody gave stay as they are.
+    """
+    from tactile_bayes.pipeline.one_mass import elsewhere
+
+    same = list(found)
+    for i, place in elsewhere([one.answer.document for one in found]).items():
+        outcome = same[i].outcome
+        if outcome.settings.centre_mm is None:
+            again = replace(outcome.settings, centre_mm=place)
+            at_place = estimate_one(outcome.tactile_map, again, scans=outcome.provenance.scans)
+            provenance = replace(at_place.provenance, inputs=outcome.provenance.inputs)
+            same[i] = SizeEstimate(replace(at_place, provenance=provenance), same[i].name)
+    return tuple(same)
 
 
 def listed(given: Any) -> list[Any]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.api.estimates import PooledSize, SizeEstimate, estimated, listed, settings_of
+from tactile_bayes.api.estimates import PooledSize, SizeEstimate, estimated, listed, of_one_mass, settings_of
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.pipeline.exam_report import EstimatedMap, ExamFiles, Given, make_exam, read_exam
@@ -85,5 +85,5 @@ def _estimates(given: Sequence[Any], settings: dict[str, Any]) -> tuple[tuple[Si
     used = settings_of(settings)
     if len(given) > 1:
         refuse_checkpoint(used)
-    found = estimated(given, settings)
+    found = of_one_mass(estimated(given, settings))
     return found, found[0].outcome.settings if len(found) == 1 else used

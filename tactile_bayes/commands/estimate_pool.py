@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +32,15 @@ def estimate_pool(
     A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
     """
     from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.pipeline.one_map import answer_file
+    from tactile_bayes.pipeline.one_mass import of_one_mass
     from tactile_bayes.pipeline.pooled import pool_answers
     from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
+    if settings.centre_mm is None:
+        answers = of_one_mass(
+            answers, lambda i, place: answer_file(maps[i], settings=replace(settings, centre_mm=place))
+        )
     failed = [answer for answer in answers if answer.document is None]
     for answer in failed:
         click.echo(answer.text, err=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.file_names import given_twice
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.one_map import Answer, answer_of, estimate_one
+from tactile_bayes.pipeline.one_mass import elsewhere
 from tactile_bayes.pipeline.pooled import pool_answers
 from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 from tactile_bayes.records import dataclass
@@ -131,6 +133,9 @@ def read_exam(files: ExamFiles, settings: Settings, given: Given, *, notice: Not
     if len(maps) > 1:
         refuse_checkpoint(settings)
     found = [_estimated(path, settings, notice) for path in maps]
+    if settings.centre_mm is None:
+        for i, place in elsewhere([one.answer.document for one in found]).items():
+            found[i] = _estimated(maps[i], replace(settings, centre_mm=place), notice)
     inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
     return make_exam(found, settings, given, inputs=inputs)
 

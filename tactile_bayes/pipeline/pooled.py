@@ -52,6 +52,7 @@ def pool_answers(
     import numpy as np
 
     from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
+    from tactile_bayes.pipeline.one_mass import apart_from_others, one_place
     from tactile_bayes.report.pooled import pooled_document
     from tactile_bayes.size.pooling import pool_maps
 
@@ -77,6 +78,8 @@ def pool_answers(
         probability=settings.interval,
         provenance=provenance,
         repeatability=settings.repeatability,
+        apart=apart_from_others(documents),
+        one_place=one_place(documents),
     )
     return PooledOutcome(pooled, document, provenance)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.pipeline.one_map import answer_of, estimate_file, estimate_inputs
+from tactile_bayes.pipeline.one_map import Answer, answer_of, estimate_file, estimate_inputs
 from tactile_bayes.pipeline.settings import Settings
 
 if TYPE_CHECKING:
@@ -53,8 +53,12 @@ def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> t
     UsageError
         When the calibration cannot pool maps.
     """
+    from tactile_bayes.pipeline.one_mass import of_one_mass
     from tactile_bayes.pipeline.pooled import pool_answers
     from tactile_bayes.studies.cost_ladder import PooledRow
+
+    def at_place(i: int, place: tuple[float, float]) -> Answer:
+        return answer_of(estimate_file(paths[i], replace(settings, centre_mm=place)))
 
     rows, answers, spent = [], [], 0.0
     for number, path in enumerate(paths, start=1):
@@ -62,6 +66,8 @@ def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> t
         answers.append(answer_of(estimate_file(path, settings)))
         spent += clock() - begun
         begun = clock()
+        if settings.centre_mm is None:
+            answers = of_one_mass(answers, at_place)
         pooled = pool_answers(answers, settings, names=[one.stem for one in paths[:number]], inputs={}).pooled
         pooling = clock() - begun
         rows.append(PooledRow(number, spent + pooling, *_pooled_answer(pooled, settings)))

@@ -169,7 +169,7 @@ def caution_sentences(exam: Exam) -> list[str]:
         if exam.pooled["fat_apart_mm"]:
             depths = " and ".join(f"{depth:.1f}" for depth in exam.pooled["fat_apart_mm"])
             found.insert(0, f"Caution: the fat under the head is {depths} mm deep on two maps: are they of one mass?")
-        if any(len(one.masses) > 1 for one in exam.maps):
+        if any(len(one.masses) > 1 for one in exam.maps) and not exam.pooled.get("one_place"):
             found.insert(0, "To check: a map shows several masses; was every map sized at the same one?")
         told_of_maps = [
             f"Caution: {text}." for one in exam.pooled["maps"] for text in one.get("broken_assumptions", [])

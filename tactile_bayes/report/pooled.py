@@ -46,6 +46,8 @@ def pooled_document(
     probability: float,
     provenance: Provenance,
     repeatability: Repeatability | None = None,
+    apart: Mapping[int, str] | None = None,
+    one_place: bool | None = None,
 ) -> dict[str, Any]:
     """JSON object of a mass, see data_schema/pooled.schema.json.
 
@@ -55,6 +57,10 @@ def pooled_document(
         Of the maps, with what `estimate` says of each.
     repeatability
         The site's, where the size is by it.
+    apart
+        What is to be said of maps whose mass lies elsewhere than the others', by their place in the list.
+    one_place
+        Whether the masses of all maps lie at one place in the patient; None where that cannot be told.
     """
     size, used = pooled.size, pooled.calibration or calibration
     sizes: dict[str, Any] = dict.fromkeys(EXTREMES)
@@ -68,7 +74,8 @@ def pooled_document(
         **sizes,
         ANOTHER_EXAM: _another_exam(size, probability),
         "supposing": supposed_document(size, largest),
-        "maps": _with_repeated([_map(i, name, documents[i], pooled) for i, name in enumerate(names)], documents),
+        "maps": _maps(names, documents, pooled, apart or {}),
+        "one_place": one_place,
         "variance_share": None if size is None else {k: nine_digits(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: nine_digits(value) for name, value in size.figures.items()},
         "left_out": _omitted(used, documents),
@@ -104,6 +111,7 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
         "map": name,
         "other_rises": list(document["other_rises"]),
         "touching": list(document.get("touching", [])),
+        "mass": _reported(document),
         "status": document["status"],
         "reason": document["reason"],
         "detected_probability": document["detected_probability"],
@@ -116,8 +124,20 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
     }
 
 
-def _with_repeated(maps: list[dict[str, Any]], documents: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The maps; one of a scan that an earlier map is of says so among its broken assumptions."""
+def _reported(document: Mapping[str, Any]) -> list[int]:
+    """Number of the mass that was sized and how many its map has; empty where it is the only one."""
+    masses = document.get("masses", [])
+    numbers = [one["number"] for one in masses if one["reported"]]
+    return [*numbers, len(masses)] if len(masses) > 1 and numbers else []
+
+
+def _maps(
+    names: Sequence[str], documents: Sequence[Mapping[str, Any]], pooled: PooledEstimate, apart: Mapping[int, str]
+) -> list[dict[str, Any]]:
+    """The maps; one of another mass, or of a scan that an earlier map is of, says so among its broken assumptions."""
+    maps = [_map(i, name, documents[i], pooled) for i, name in enumerate(names)]
+    for index, words in apart.items():
+        maps[index]["broken_assumptions"].append(words)
     for index, earlier in repeated_scans([scans_of(one["provenance"]) for one in documents]).items():
         words = f"a map of the same scan as {maps[earlier]['map']} is no repeat: the interval is too narrow"
         maps[index]["broken_assumptions"].append(words)
@@ -129,6 +149,7 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
     outside = document["outside_calibration"]
     lines = [*_bodies(document), *joined(outside, most=2, lead="CAUTION: outside the calibration's range: ")]
     lines += joined(_broken(document["maps"]), most=1, lead="CAUTION: ") + _maps_lines(document["maps"])
+    lines += joined([line.rstrip(".") for line in _rises(document)], most=1, lead="")
     if document["status"] == "no_estimate":
         lines.append(f"No estimate: {document['reason']}.")
     else:
@@ -153,8 +174,7 @@ def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = [f"A lump was found on {len(found)} of {len(maps)} maps, alone sized at {sizes}{more} mm."] if found else []
     apart = [one["map"] for one in maps if one["outlying"]]
     lines += joined(apart, most=2, lead="Apart from the others, look at these maps: ")
-    rises = [_rise_line(one["map"], rise).rstrip(".") for one in maps for rise in one["other_rises"]]
-    return lines + joined(_touching(maps), most=1, lead="To check: ") + joined(rises, most=1, lead="")
+    return lines + joined(_touching(maps), most=1, lead="To check: ")
 
 
 def _touching(maps: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -174,7 +194,7 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines += [f"CAUTION: {text}." for text in _broken(document["maps"])]
     lines += [_map_line(one) for one in document["maps"]]
     lines += [f"To check: {text}." for text in _touching(document["maps"])]
-    lines += [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
+    lines += _rises(document)
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
     worst, figures = _worst(document), document["figures"]
@@ -234,7 +254,15 @@ def _map_line(one: Mapping[str, Any]) -> str:
     if one["log_size"] is None:
         return f"{one['map']}: no estimate ({one['reason']})"
     apart = "  lies apart from the others: look at this map" if one["outlying"] else ""
-    return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{apart}"
+    mass = "  (mass {} of {} on this map)".format(*one["mass"]) if one.get("mass") else ""
+    return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{mass}{apart}"
+
+
+def _rises(document: Mapping[str, Any]) -> list[str]:
+    """Other rises of the maps, where places do not tell that all were sized at one mass."""
+    if document.get("one_place"):
+        return []
+    return [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
 
 
 def _rise_line(name: str, rise: Mapping[str, float]) -> str:
