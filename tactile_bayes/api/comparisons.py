@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.draws import Draws
-from tactile_bayes.api.estimates import SizeEstimate, estimated, settings_of
+from tactile_bayes.api.estimates import SizeEstimate, estimated, of_one_mass, settings_of
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError
@@ -168,6 +168,8 @@ def compare(
     prints = [one.outcome.tactile_map.fingerprint for visit in visits for one in visit]
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once, at its own visit")
+    same = iter(of_one_mass([one for visit in visits for one in visit]))
+    visits = tuple(tuple(next(same) for _ in visit) for visit in visits)
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
     answers = [[one.answer for one in visit] for visit in visits]
     outcome = compare_answers(answers, used, comparing=comparing, names=names, inputs={})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -178,6 +179,7 @@ def _compare(
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.pipeline.compared import compare_answers, drawn_maps
     from tactile_bayes.pipeline.one_map import answer_of, estimate_file
+    from tactile_bayes.pipeline.one_mass import elsewhere
 
     total, outcomes = sum(len(maps) for maps in visits), []
     with progress_bar("maps") as progress:
@@ -185,6 +187,12 @@ def _compare(
             outcomes.append([estimate_file(path, settings) for path in maps])
             progress(sum(len(one) for one in outcomes), total)
     answers = [[answer_of(outcome) for outcome in maps] for maps in outcomes]
+    if settings.centre_mm is None:
+        places = [(v, i) for v, maps in enumerate(visits) for i in range(len(maps))]
+        for number, place in elsewhere([answers[v][i].document for v, i in places]).items():
+            v, i = places[number]
+            outcomes[v][i] = estimate_file(visits[v][i], replace(settings, centre_mm=place))
+            answers[v][i] = answer_of(outcomes[v][i])
     names = [[str(path) for path in maps] for maps in visits]
     inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
     compared = compare_answers(answers, settings, comparing=comparing, names=names, inputs=inputs)

@@ -143,3 +143,14 @@ def test_python_and_the_page_size_the_same_mass(exams: Path, tmp_path: Path) -> 
     tb.exam_report(paths, page, method="laplace")
     text = page.read_text()
     assert "was every map sized at the same one" not in text
+
+
+def test_visits_are_compared_at_one_mass(exams: Path) -> None:
+    """The later visit's report is about another mass; the control says which, and is refused."""
+    compared = json.loads(run_here("compare", "m1.nc", "--with", "m3.nc", "--json", *FAST, cwd=exams).stdout)
+    assert compared["status"] == "compared"
+    assert tb.compare(exams / "m1.nc", exams / "m3.nc", method="laplace").document["status"] == "compared"
+    given = tb.estimate(exams / "m3.nc", method="laplace", centre_mm=(-17.0, 2.0))
+    refused = tb.compare(exams / "m1.nc", given, method="laplace").document
+    assert refused["status"] == "not_one_mass"
+    assert "33 mm apart" in refused["reason"]
