@@ -37,7 +37,8 @@ def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, floa
     Below `AGREEMENT` a convention cannot be the right one.
 
     The motion's normal is that of the places of the head's apex at the used frames, which need the rotation for the
-    lever arm; the sensor's normal is the mean of the face's, so that rotations that contradict each other count
+    lever arm; over soft tissue a head sinks as far as it slides from line to line, so it may also be that of the
+    places less what is linear in the pressure. The sensor's normal is the mean of the face's, so that rotations that contradict each other count
     against. Empty where the motion has no normal: too few poses, or all along a line.
     """
     poses = [(part, _near_used(part)) for part in selections]
@@ -114,15 +115,36 @@ def _near_used(part: SelectedFrames) -> TrackerPoses:
 
 def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], order: tuple[int, ...], sign: float) -> float:
     """Absolute inner product of both normals; NaN where the apex hardly moves across its longest direction."""
-    normals, places = [], []
+    normals, places, levels = [], [], []
     for part, poses in parts:
         quaternion = poses.quaternion_wxyz[:, list(order)] * [1.0, sign, sign, sign]
         rotation = rotation_from_quaternion(quaternion)
         lever = inverse(part.scan.head.scanhead_from_tracker)
         normals.append(rotation @ lever[:3, 2])
         places.append(poses.position_mm + rotation @ lever[:3, 3])
+        levels.append(_level_at(part, poses))
     normal: FloatArray = np.concatenate(normals).mean(axis=0)
-    variances, axes = np.linalg.eigh(np.cov(np.concatenate(places).T))
+    raw = np.concatenate(places)
+    found = [_along(normal, one) for one in (raw, _without_sinking(raw, np.concatenate(levels)))]
+    return float("nan") if np.isnan(found[0]) else float(np.nanmax(found))
+
+
+def _along(normal: FloatArray, places_mm: FloatArray) -> float:
+    """Absolute inner product with the normal of (n, 3) places; NaN where they lie along a line."""
+    variances, axes = np.linalg.eigh(np.cov(places_mm.T))
     if not variances[1] > LEAST_SPREAD_MM**2:
         return float("nan")
     return float(abs(normal @ axes[:, 0]))
+
+
+def _level_at(part: SelectedFrames, poses: TrackerPoses) -> FloatArray:
+    """(n,) mean pressure when the poses were taken, kPa."""
+    known = np.isfinite(part.level_kpa)
+    return np.asarray(np.interp(poses.time_s, part.scan.frames.time_s[known], part.level_kpa[known]))
+
+
+def _without_sinking(places_mm: FloatArray, level_kpa: FloatArray) -> FloatArray:
+    """(n, 3) places less what is linear in the pressure."""
+    level = level_kpa - level_kpa.mean()
+    slope = level @ (places_mm - places_mm.mean(axis=0)) / max(float(level @ level), 1e-9)
+    return places_mm - level[:, None] * slope

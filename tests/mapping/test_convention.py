@@ -11,7 +11,7 @@ import pytest
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
-from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping import build_map, convention
 from tactile_bayes.mapping.convention import CONVENTIONS, check_convention
 from tactile_bayes.mapping.frames import SelectedFrames, select_frames
 from tactile_bayes.report.map_text import map_text
@@ -76,6 +76,27 @@ def test_the_right_one_passes():
 def test_a_face_that_leans_on_its_motion_is_not_refused():
     verdicts = [verdict(scan_of(seed, lean_deg=15.0)) for seed in range(SCANS)]
     assert "refused" not in verdicts
+
+
+def sinking(scan: Scan, *, mm_per_kpa: float) -> Scan:
+    """The scan with a pressure that rises from 6 to 12 kPa and falls to 9, over tissue that yields so much."""
+    level = 9.0 + 3.0 * np.sin(np.pi * np.linspace(-0.5, 1.0, len(scan.frames.time_s)))
+    counts = scan.frames.counts * (level / scans.LEVEL_KPA)[:, None, None]
+    tracker = rotation_from_quaternion(scan.poses.quaternion_wxyz)
+    normal = tracker @ inverse(scan.head.scanhead_from_tracker)[:3, 2]
+    place = scan.poses.position_mm + mm_per_kpa * (level - 9.0)[:, None] * normal
+    poses = TrackerPoses(scan.poses.time_s, place, scan.poses.quaternion_wxyz)
+    return replace(scans.with_counts(scan, np.rint(counts).astype(np.uint16)), poses=poses)
+
+
+def test_a_head_that_sinks_into_soft_tissue_is_not_refused(monkeypatch):
+    """It sinks as far as it slides from line to line. The control: with the sinking left in, most are refused."""
+    soft = [sinking(scan_of(seed), mm_per_kpa=3.0) for seed in range(SCANS)]
+    assert "refused" not in [verdict(scan) for scan in soft]
+    refused = [verdict(told(scan, WRONG[0])) for scan in soft].count("refused")
+    assert refused > 0.6 * SCANS
+    monkeypatch.setattr(convention, "_without_sinking", lambda places, _: places)
+    assert [verdict(scan) for scan in soft].count("refused") > 0.5 * SCANS
 
 
 def test_a_doubt_is_told_with_the_convention_that_fits():
