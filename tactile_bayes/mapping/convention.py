@@ -38,8 +38,8 @@ def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, floa
 
     The motion's normal is that of the places of the head's apex at the used frames, which need the rotation for the
     lever arm; over soft tissue a head sinks as far as it slides from line to line, so it may also be that of the
-    places less what is linear in the pressure. The sensor's normal is the mean of the face's, so that rotations that contradict each other count
-    against. Empty where the motion has no normal: too few poses, or all along a line.
+    places less what is linear in the pressure. The sensor's normal is the mean of the face's, so that rotations that
+    contradict each other count against. Empty where the motion has no normal: too few poses, or all along a line.
     """
     poses = [(part, _near_used(part)) for part in selections]
     if sum(len(one) for _, one in poses) < 3:
