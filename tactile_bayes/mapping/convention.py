@@ -147,4 +147,4 @@ def _without_sinking(places_mm: FloatArray, level_kpa: FloatArray) -> FloatArray
     """(n, 3) places less what is linear in the pressure."""
     level = level_kpa - level_kpa.mean()
     slope = level @ (places_mm - places_mm.mean(axis=0)) / max(float(level @ level), 1e-9)
-    return places_mm - level[:, None] * slope
+    return np.asarray(places_mm - level[:, None] * slope)

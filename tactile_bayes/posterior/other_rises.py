@@ -27,6 +27,9 @@ LEAST_RISE_AT_RIM = 0.5
 MOST_NAMED, MOST_LOOKS = 4, 3
 """Rises that are named, and places that turn out to be none before the search ends: each look costs some 50 ms."""
 LEAST_PROBABILITY = 0.95
+LEAST_STANDING, STANDING_MM = 0.35, 2.5
+"""Share of a rise's amplitude by which the map at its centre, so far about it, must stand above its level: a level that
+falls towards the rim on two sides is like a bump's flanks, and no lump."""
 
 
 def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOptions) -> tuple[Rise, ...]:
@@ -47,7 +50,7 @@ def other_rises(tactile_map: TactileMap, estimate: Estimate, options: EstimateOp
             found = _at_rim(rest, candidates, given, estimate)
         else:
             found = _rise(seen, estimate) if seen.detection.probability >= LEAST_PROBABILITY else None
-        if found is None or _is_known(found, rises, rest, estimate):
+        if found is None or _is_known(found, rises, rest, estimate) or not _stands_out(found, rest):
             misses += 1
         else:
             rises.append(found)
@@ -152,6 +155,19 @@ def _at_rim(
     if chance is None or chance[1].probability < LEAST_PROBABILITY:
         return None
     return Rise(bump.x_mm, bump.y_mm, None, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, chance[1].probability)
+
+
+def _stands_out(rise: Rise, rest: TactileMap) -> bool:
+    """Whether the map, or the map with wide rises taken off, is higher at a rise's centre than elsewhere.
+
+    A centre beyond the covered cells is not judged.
+    """
+    y, x = np.meshgrid(rest.y_mm, rest.x_mm, indexing="ij")
+    near = rest.covered & (np.hypot(x - rise.x_mm, y - rise.y_mm) < STANDING_MM)
+    if not near.any():
+        return True
+    levels = (one.mean[near].mean() - np.median(one.mean[rest.covered]) for one in (rest, levelled(rest)))
+    return bool(max(levels) >= LEAST_STANDING * rise.amplitude)
 
 
 def _is_known(rise: Rise, rises: list[Rise], rest: TactileMap, estimate: Estimate) -> bool:

@@ -15,7 +15,7 @@ from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.other_rises import other_rises
+from tactile_bayes.posterior.other_rises import _stands_out, other_rises
 from tactile_bayes.posterior.result import Estimate, Rise
 
 HALF_MM = 35.0
@@ -107,3 +107,25 @@ def test_text_json_and_pool_name_it(folder: Path) -> None:
     pooled = run_here("estimate", "one.nc", "two.nc", "--pool", cwd=folder).stdout
     assert "two.nc: another rise stands at (1" in pooled
     assert "one.nc: another rise" not in pooled
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "sigma", "fall", "stands"),
+    [
+        (0.2, 8.0, 0.0, True),
+        (0.2, 2.0, 0.0, True),
+        (0.1, 6.0, 0.3, True),
+        (0.0, 8.0, 0.25, False),
+        (0.05, 8.0, 0.25, False),
+    ],
+)
+def test_a_level_that_falls_towards_the_rim_is_no_lumps_flank(
+    amplitude: float, sigma: float, fall: float, stands: bool
+) -> None:
+    """A fit there has the height of the fall; the map itself rises by `amplitude` only."""
+    axis = np.arange(-HALF_MM, HALF_MM + 1.0)
+    x, y = np.meshgrid(axis, axis)
+    mean = bump_values(half_mm=HALF_MM, x=-20.0, y=16.0, sigma_x=sigma, sigma_y=sigma, amplitude=amplitude)
+    mean -= fall * (np.exp(-0.5 * ((x + HALF_MM) / 7.0) ** 2) + np.exp(-0.5 * ((y - HALF_MM) / 7.0) ** 2))
+    fitted = Rise(-20.0, 16.0, None, max(amplitude, 0.2 if fall and not stands else 0.0), 8.0, 8.0, 1.0)
+    assert _stands_out(fitted, grid_map(mean)) == stands
