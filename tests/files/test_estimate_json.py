@@ -45,7 +45,7 @@ def exchanged(document: Document) -> None:
 
 
 EDITS: dict[str, tuple[Edit, str]] = {
-    "ends exchanged": (swapped, r"^exam.json: max_size_mm has low 17\.\d+ and high 12\.\d+; ends of an interval rise"),
+    "ends exchanged": (swapped, r"^exam.json: max_size_mm has low 16\.\d+ and high 12\.\d+; ends of an interval rise"),
     "a median outside": (largest(median=40.0), "max_size_mm has median 40 outside its interval of 12"),
     "sizes exchanged": (exchanged, "min_size_mm is 17 mm and max_size_mm 14"),
     "below zero": (largest(low=-3.0), "max_size_mm has low -3"),
