@@ -70,7 +70,9 @@ def shape_text(figures: Mapping[str, float]) -> str:
     lead = "Irregular outline. " if figures.get("irregular_outline") else ""
     probability = figures["oval_probability"]
     longer = 100 * math.expm1(figures["oval_half_log_ratio"])
-    if probability < 0.5:
+    if probability < 0.005:
+        text = "Sized as round; an oval lump is improbable (below 0.005)."
+    elif probability < 0.5:
         text = f"Sized as round; an oval lump (probability {probability:.2f}) would be {longer:.0f} % longer."
     else:
         text = f"Oval (probability {probability:.2f}): {longer:.0f} % longer than a round lump of the same mean size."
