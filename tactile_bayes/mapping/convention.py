@@ -140,6 +140,8 @@ def _along(normal: FloatArray, places_mm: FloatArray) -> float:
 def _level_at(part: SelectedFrames, poses: TrackerPoses) -> FloatArray:
     """(n,) mean pressure when the poses were taken, kPa."""
     known = np.isfinite(part.level_kpa)
+    if not len(poses) or not known.any():
+        return np.zeros(len(poses))
     return np.asarray(np.interp(poses.time_s, part.scan.frames.time_s[known], part.level_kpa[known]))
 
 

@@ -28,6 +28,7 @@ _OF_ESTIMATE: Final = (
 )  # fmt: skip
 _OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
 _OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
+_OF_MAPS: Final = ("map", "outlying", "broken_assumptions")
 """What tables and pages show of a document: the rest of it is a hundred times as much."""
 
 
@@ -109,7 +110,9 @@ def exam_rows(campaign: Campaign) -> list[Row]:
     """Every exam of the table, in its order."""
     pooled = pooled_documents(campaign)
     outlying = {one["map"] for document in pooled.values() for one in document["maps"] if one["outlying"]}
+    doubts = {one["map"]: one["broken_assumptions"] for document in pooled.values() for one in document["maps"]}
     rows = [_row(campaign, exam, exam.name in outlying) for exam in campaign.exams]
+    rows = [with_doubts(row, doubts.get(row.exam.name, [])) for row in rows]
     of_scan: dict[Path, list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         if row.document is not None:
@@ -117,6 +120,11 @@ def exam_rows(campaign: Campaign) -> list[Row]:
     return [
         row if row.document is None else replace(row, unnamed=tuple(unnamed(of_scan[row.exam.path]))) for row in rows
     ]
+
+
+def with_doubts(row: Row, texts: Sequence[str]) -> Row:
+    """The row with what the pooled size of its mass says of this exam, such as that its lump lies elsewhere."""
+    return replace(row, notes=(*row.notes, *(text for text in texts if text not in row.cautions)))
 
 
 def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
@@ -145,7 +153,10 @@ def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
         document = load_json(campaign.folder / MASSES / name / POOLED)
         if isinstance(document, dict):
             found[name] = {key: document[key] for key in _OF_POOLED}
-            found[name]["maps"] = [{key: one[key] for key in ("map", "outlying")} for one in document["maps"]]
+            found[name]["maps"] = [
+                {"broken_assumptions": [], **{key: one[key] for key in _OF_MAPS if key in one}}
+                for one in document["maps"]
+            ]
     return found
 
 

@@ -100,6 +100,19 @@ def test_a_mass_that_is_not_within_the_distance_is_not_taken(folder: Path) -> No
     assert trial["2", "2"]["reason"] == "no lump found within 6 mm of mass 2's place, (16.0, 2.0) mm"
 
 
+def test_exams_of_a_mass_that_lie_apart_are_told(folder: Path) -> None:
+    """The second row's place is the other mass's; the control has both rows at one."""
+    campaign(folder, "a.nc,P1,1,1,1,left,-17,2", "b.nc,P1,1,1,2,left,21,-6")
+    rows = {row["replicate"]: row["cautions"] for row in rows_of(folder / "out" / "exams_done.csv")}
+    assert "its mass lies 33 mm from that of the other maps" in rows["2"]
+    assert "its mass lies" not in rows["1"]
+    (folder / "c").mkdir()
+    for name in ("a.nc", "b.nc"):
+        (folder / "c" / name).write_bytes((folder / name).read_bytes())
+    campaign(folder / "c", "a.nc,P1,1,1,1,left,-17,2", "b.nc,P1,1,1,2,left,-12,-6")
+    assert not any(row["cautions"] for row in rows_of(folder / "c" / "out" / "exams_done.csv"))
+
+
 def test_two_masses_near_one_place_are_refused_by_name(folder: Path) -> None:
     told = campaign(folder, "a.nc,P1,1,2,1,left,16,2", "b.nc,P1,1,2,2,left,,", more=("--match-mm", "50"))
     assert "P1.v1.m2.r2: estimate: shows masses at (" in told
