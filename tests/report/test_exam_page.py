@@ -378,7 +378,7 @@ def full() -> Exam:
     tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
     size = {name: document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
     pooled = {**size, "reason": "", "figures": document["diagnostics"], "fat_apart_mm": [5.0, 20.0]}
-    pooled["maps"] = [{"map": f"map {n}", "outlying": True} for n in range(12)]
+    pooled |= {"provenance": document["provenance"], "maps": [{"map": f"map {n}", "outlying": True} for n in range(12)]}
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
     scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
     maps = (exam_map(tall, told, side="left"),) * 12
