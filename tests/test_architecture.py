@@ -16,7 +16,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # Everything but the shell returns data instead of printing it.
 SHELL = {"cli.py", "__main__.py", "commands", "report"}
 CORE = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] not in SHELL]
-MOST_LINES = 450
+MOST_LINES = 600
 
 
 def name_of(path: Path) -> str:

@@ -1,0 +1,31 @@
+"""Findings: their weight, their sentence for each audience, and the verdict that they lead to."""
+
+from __future__ import annotations
+
+import pytest
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding, by_weight, verdict
+
+CAUTION = Finding("late_poses", "poses came late", remedy="--latency-ms auto", on_paper="map the scan again")
+CHECK = Finding("few_strokes", "the scan has 2 strokes only")
+
+
+def test_a_caution_makes_a_result_doubtful_and_a_check_does_not():
+    assert verdict([CHECK], answered=True) == "sound"
+    assert verdict([CHECK, CAUTION], answered=True) == "doubtful"
+    assert verdict([], answered=False) == "no_answer"
+
+
+def test_cautions_come_first_and_each_finding_once():
+    assert by_weight([CHECK, CAUTION, CHECK]) == (CAUTION, CHECK)
+
+
+def test_paper_never_reads_an_option():
+    assert CAUTION.sentence() == "poses came late; --latency-ms auto"
+    assert CAUTION.at("map 2").sentence(paper=True) == "map 2: poses came late; map the scan again"
+
+
+def test_an_unknown_kind_is_refused_with_the_kinds():
+    with pytest.raises(BadDataError, match="finding of unknown kind 'nothing'"):
+        Finding("nothing", "text")
