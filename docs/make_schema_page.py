@@ -13,6 +13,7 @@ SECTIONS = {
     "Exams (CSV)": "exams.table.json",
     "Exams done (CSV)": "exams_done.table.json",
     "Failures (CSV)": "failures.table.json",
+    "Growth (CSV)": "growth.table.json",
     "Excision (CSV)": "excision.table.json",
     "Size table (CSV)": "size_table.table.json",
     "Phantom maps (CSV)": "phantom_maps.table.json",

@@ -172,7 +172,8 @@ def run(
     """Map, estimate and pool the exams of a table, and report the trial.
 
     DIR gets a folder for each exam and each pooled mass, exams_done.csv, failures.csv, trial.csv (which `validate`
-    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. Where 5 masses have
+    takes), index.html (all exams, worst first) and, with --excision, report.html and report.json. Masses with several
+    visits are compared (growth.csv), and the report is of the last visit before excision. Where 5 masses have
     several exams at one visit, the spread between exams is learned from them and every size is by it. An exam's fault
     is its row in failures.csv; the others go on. The same call again goes on where it was interrupted, and does again
     what depends on a file or setting that changed, and what failed.
@@ -303,6 +304,8 @@ def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence
         click.echo(f"no mass pooled: {campaign.not_pooled}")
     if line := repeatability_words(campaign):
         click.echo(line)
+    if written.growth:
+        click.echo(written.growth)
     click.echo(f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs")
     if any(found.kept.values()):
         for step, todo in found.todo.items():

@@ -156,6 +156,8 @@ def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, floa
 
     inputs = load_trial(pilot, excision, None)
     also_read(*inputs.files.values())
+    for line in inputs.other_visits.lines():
+        click.echo(f"{pilot}: {line}", err=True)
     sizes = gather(inputs.readings, inputs.ex_vivo_mm)
     for doubt in unit_doubts(sizes, np.array(list(inputs.ex_vivo_mm.values()))):
         click.echo(f"{pilot}: doubtful: {doubt}", err=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 JOURNAL: Final = "campaign.journal"
-EXAMS, MASSES = "exams", "masses"
-"""Folders that hold one of each exam and one of each pooled mass."""
-DONE, FAILURES, TRIAL = "exams_done.csv", "failures.csv", "trial.csv"
+EXAMS, MASSES, GROWTH = "exams", "masses", "growth"
+"""Folders that hold one of each exam, of each mass pooled at a visit, and of each mass compared between visits."""
+DONE, FAILURES, TRIAL, GROWN = "exams_done.csv", "failures.csv", "trial.csv", "growth.csv"
 """Tables beside them."""
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
@@ -15,7 +15,9 @@ SHAPE, THUMBNAIL, MAP_FIGURE, SIZE_FIGURE = "shape.npz", "thumbnail.png", "map.p
 SIZED, SIZED_FIGURE = "sized.json", "sized.png"
 """Files of an exam."""
 POOLED, POOLED_DRAWS = "pooled.json", "pooled.nc"
-"""Files of a mass."""
+"""Files of a mass at a visit."""
+COMPARED, COMPARED_FIGURE = "compare.json", "compare.png"
+"""Files of a mass over its visits."""
 REPEATABILITY: Final = "repeatability.json"
 """Beside the folders, as the tables are."""
 

@@ -7,15 +7,16 @@ word that the table writes for a mass that was looked for and not found.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document
-from tactile_bayes.files.tables import RawTable, Table, read_raw
+from tactile_bayes.files.tables import RawTable, Table, parse_date, read_raw
 
-_EXCISION = ("patient", "mass", "ex_vivo_mm", "ex_vivo_second_mm", "sd_mm")
+_EXCISION = ("patient", "mass", "ex_vivo_mm", "ex_vivo_second_mm", "sd_mm", "date")
 _FACTOR = {"mm": 1.0, "cm": 10.0, "in": 25.4}
 
 
@@ -71,7 +72,8 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
         patient, mass = _key(raw, line, row, mapping)
         size = factor * _positive(raw, line, excision["size"], row[excision["size"]])
         second, sd = (_number(raw, line, row, excision, key, factor) for key in ("second", "sd"))
-        for name, value in zip(_EXCISION, (patient, mass, size, second, sd), strict=True):
+        day = _date(raw, line, row, excision)
+        for name, value in zip(_EXCISION, (patient, mass, size, second, sd, day), strict=True):
             columns[name].append(value)
     if not kept:
         what = f"column {excision['size']}: holds no size"
@@ -83,7 +85,7 @@ def read_wide_excision(path: Path, mapping_path: Path) -> Table:
 
 def excision_columns(excision: Mapping[str, Any]) -> list[str]:
     """Columns of the wide table that the mapping's ``[excision]`` names."""
-    return [excision[key] for key in ("size", "second", "sd") if key in excision]
+    return [excision[key] for key in ("size", "second", "sd", "date") if key in excision]
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -98,7 +100,7 @@ def _key_columns(mapping: Mapping[str, Any]) -> list[str]:
 
 
 def _reading_columns(mapping: Mapping[str, Any]) -> list[str]:
-    keys = ("size", "sd", "low", "high", "reader")
+    keys = ("size", "sd", "low", "high", "reader", "date")
     return [reading[key] for reading in mapping["reading"] for key in keys if key in reading]
 
 
@@ -151,6 +153,8 @@ def _reading(
         "high_mm": values["high"],
         "probability": probability,
         "reader": (row[reading["reader"]] or None) if "reader" in reading else None,
+        "visit": reading.get("visit"),
+        "date": _date(table, line, row, reading),
         "posterior": None,
         "synthetic": mapping.get("synthetic"),
     }
@@ -162,6 +166,14 @@ def _number(
     if key not in reading or not row[reading[key]]:
         return None
     return factor * table.number(line, reading[key], row[reading[key]])
+
+
+def _date(table: RawTable, line: int, row: Mapping[str, str], columns: Mapping[str, Any]) -> date | None:
+    text = row[columns["date"]] if "date" in columns else ""
+    try:
+        return parse_date(text) if text else None
+    except ValueError:
+        raise _fault(table.path, line, columns["date"], f"{text!r} is no date", "write it as 2026-03-01") from None
 
 
 def _positive(table: RawTable, line: int, column: str, text: str) -> float:

@@ -7,6 +7,7 @@ import io
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field
+from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +20,8 @@ from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.shipped import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
 from tactile_bayes.records import dataclass
+from tactile_bayes.trial.readings import Reading
+from tactile_bayes.trial.visits import at_excision
 
 SCHEMA: Final = "exams.table.json"
 KNOWN: Final = ("seat", "depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
@@ -36,7 +39,7 @@ class Exam:
         As the table has it, and where it is, absolute; of a file in an object store the path is no more than a name.
     patient, visit, mass, replicate
         Codes that name the exam.
-    side, reader
+    day, side, reader
         None where the table leaves them blank.
     centre_mm
         Place of the mass on the map; None takes the highest bump that can be a lump.
@@ -54,6 +57,7 @@ class Exam:
     visit: str
     mass: str
     replicate: int
+    day: date | None = None
     side: str | None = None
     reader: str | None = None
     centre_mm: tuple[float, float] | None = None
@@ -70,6 +74,17 @@ class Exam:
     def of_mass(self) -> str:
         """Name of the mass at this visit, which is also its folder's."""
         return mass_name(patient=self.patient, visit=self.visit, mass=self.mass)
+
+    @property
+    def of_visits(self) -> str:
+        """Name of the mass over all its visits, which is also its folder's."""
+        return f"{self.patient}.m{self.mass}"
+
+    @property
+    def as_reading(self) -> Reading:
+        """The exam as a reading that is yet to be done, for the order of visits."""
+        key = (self.patient, self.mass)
+        return Reading(key, "tactile", self.replicate, "not_done", visit=self.visit, day=self.day)
 
     @property
     def name(self) -> str:
@@ -95,12 +110,13 @@ def read_manifest(path: Path) -> list[Exam]:
     BadDataError
         Naming the line, the column, the value and the way out: a cell that is not as ``exams.table.json`` has it, a
         path that leaves the table's folder or has backslashes, half a place, codes that differ by capitals alone, rows
-        of one mass that contradict each other.
+        of one mass that contradict each other, visits of one mass whose order is not known.
     """
     table = read_table(path, SCHEMA)
     exams = [_exam(table, row) for row in range(len(table))]
     _check_spelling(table, exams)
     _check_masses(table, exams)
+    at_excision([exam.as_reading for exam in exams], {}, fault=table.error)
     return sorted(exams, key=lambda exam: exam.order)
 
 
@@ -118,6 +134,7 @@ def _exam(table: Table, row: int) -> Exam:
         centre_mm=None if x is None else (x, y),
         known=tuple((name, cells[f"known_{name}"]) for name in KNOWN if cells[f"known_{name}"] is not None),
         calibration=calibration,
+        day=cells["date"],
         line=table.line_numbers[row],
         **{name: cells[name] for name in _WRITTEN},
     )

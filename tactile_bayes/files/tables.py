@@ -14,6 +14,7 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from tactile_bayes.files.csv_cells import DECIMAL_COMMA, cells_of, may_be_thousa
 from tactile_bayes.files.schema import load_schema
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_DATE = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _NOT_FINITE = {"nan", "inf", "infinity"}
 _TO_MM = {"cm": "10", "m": "1000", "in": "25.4", "inch": "25.4", "um": "0.001"}
@@ -44,8 +46,8 @@ class Table:
     path
         Where it was read.
     columns
-        A list for each column of the schema, in the schema's order and of the schema's type: str, float, int or
-        bool. A blank cell is None, and so is each cell of an optional column that the file leaves out.
+        A list for each column of the schema, in the schema's order and of the schema's type: str, float, int,
+        bool or date. A blank cell is None, and so is each cell of an optional column that the file leaves out.
     line_numbers
         The line of the file at which each row begins; the header is line 1.
     """
@@ -297,6 +299,26 @@ def _parse_integer(text: str, field: Mapping[str, Any]) -> int:
     return int(text)
 
 
+def _parse_date(text: str, field: Mapping[str, Any]) -> date:
+    try:
+        return parse_date(text)
+    except ValueError:
+        raise _CellError(f"{_shown(text)} is no date", f"write it as 2026-03-01; {_blank_advice(field)}") from None
+
+
+def parse_date(text: str) -> date:
+    """Date of a cell, year-month-day.
+
+    Raises
+    ------
+    ValueError
+        When it is none.
+    """
+    if not _DATE.fullmatch(text):
+        raise ValueError(text)
+    return date.fromisoformat(text)
+
+
 def _parse_boolean(text: str, field: Mapping[str, Any]) -> bool:
     for value, words in ((True, field["trueValues"]), (False, field["falseValues"])):
         if text in words:
@@ -304,7 +326,13 @@ def _parse_boolean(text: str, field: Mapping[str, Any]) -> bool:
     raise _CellError(f"{_shown(text)} is neither true nor false", "write true or false")
 
 
-_PARSERS = {"string": _parse_string, "number": _parse_number, "integer": _parse_integer, "boolean": _parse_boolean}
+_PARSERS = {
+    "string": _parse_string,
+    "number": _parse_number,
+    "integer": _parse_integer,
+    "boolean": _parse_boolean,
+    "date": _parse_date,
+}
 _LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
     "minimum": (operator.ge, "at least"),
     "exclusiveMinimum": (operator.gt, "above"),

@@ -1,11 +1,11 @@
-"""A campaign: from a table of exams to maps, estimates and pooled sizes, step by step, resumable.
+"""A campaign: from a table of exams to maps, estimates, pooled sizes and growth, step by step, resumable.
 
-Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...) and
-``masses/MASS/`` (pooled.json, pooled.nc), the tables and pages beside them (`campaign_report`), repeatability.json
-where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the journal, which holds for each step its
-key, the digests of its files and how long it took. The key is the step, the exam or mass, and a digest of the program's
-version, the settings and the content of the inputs. A step whose key is in the journal and whose files are what it made
-is not run again.
+Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...),
+``masses/MASS/`` (pooled.json, pooled.nc) and ``growth/MASS/`` (compare.json), the tables and pages beside them
+(`campaign_report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the
+journal, which holds for each step its key, the digests of its files and how long it took. The key is the step, the exam
+or mass, and a digest of the program's version, the settings and the content of the inputs. A step whose
+key is in the journal and whose files are what it made is not run again.
 
 Exams go through the steps in blocks, in the order of the table, and the results stay in the journal: memory holds the
 table of exams, a few hundred bytes for each step, and one block.
@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from tactile_bayes.batch_store import BatchStore
-from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, MAP, MASSES, REPEATABILITY, SHAPE
+from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.repeatability_json import read_repeatability
 from tactile_bayes.pipeline.campaign_copies import copy_tasks
+from tactile_bayes.pipeline.campaign_growth import Visits, days_of, grown_masses
 from tactile_bayes.pipeline.campaign_inputs import READ, Alike, read_sources
 from tactile_bayes.pipeline.campaign_keys import digest_of
 from tactile_bayes.pipeline.campaign_match import Breasts, NamedPlace
@@ -80,8 +81,8 @@ class Campaign:
     ----------
     found
         Results, faults and counts, filled by `run`.
-    not_pooled
-        Why no mass is pooled; empty where masses are.
+    not_pooled, not_compared
+        Why no mass is pooled, or compared between visits; empty where masses are, or none has several visits.
     repeatability
         Learned from the repeats; None where it was not.
     not_learned
@@ -104,7 +105,7 @@ class Campaign:
         self.exams, self.folder, self.settings = exams, folder, settings
         self._stages = Stages(store=store, executor=executor, dry=dry)
         self.found: CampaignState = self._stages.found
-        self.not_pooled = ""
+        self.not_pooled, self.not_compared = "", ""
         self.unread: set[str] = set()
         self.repeatability: Repeatability | None = None
         self.not_learned = ""
@@ -119,7 +120,7 @@ class Campaign:
         self._calibrations: dict[str, str] = {}
 
     def run(self) -> CampaignState:
-        """Run what is missing: maps, estimates and figures block by block, repeatability, sizes by it, pooled sizes.
+        """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pools, growth.
 
         Raises
         ------
@@ -135,7 +136,11 @@ class Campaign:
         self.not_pooled = self._why_not_pooled()
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
         learns = taught_by(sound, self.settings) >= FEWEST_MASSES
-        self._stages.needed.update(steps_needed(len(sound), masses, settings=self.settings, learns=learns))
+        self.not_compared = self._not_over_bodies()
+        grown = 0 if self.not_compared else len(grown_masses(sound))
+        self._stages.needed.update(
+            steps_needed(len(sound), masses, settings=self.settings, learns=learns, compared=grown)
+        )
         with self._bar("steps") as self._stages.tell:
             for block in _blocks_of_patients(sound, self._block):
                 self._size(block)
@@ -145,6 +150,8 @@ class Campaign:
                 spared = masses - len({exam.of_mass for exam in sound})
                 self._stages.needed.subtract(steps_needed(0, spared, settings=self.settings, learns=False))
                 self._pool(sound)
+            if grown:
+                self._compare(sound)
         return self.found
 
     def _read_sources(self) -> None:
@@ -367,12 +374,16 @@ class Campaign:
 
     def _why_not_pooled(self) -> str:
         """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
+        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
+            return "no mass has several exams at one visit"
+        return self._not_over_bodies()
+
+    def _not_over_bodies(self) -> str:
+        """Which calibration cannot size several maps together; empty for none."""
         from tactile_bayes.files.shipped import size_calibration_path
         from tactile_bayes.files.size_json import read_size_calibration
         from tactile_bayes.size.body_calibration import BodyCalibration
 
-        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
-            return "no mass has several exams at one visit"
         for name in {self.settings.of(exam).calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))
             if path is None or not isinstance(read_size_calibration(path), BodyCalibration):
@@ -380,15 +391,49 @@ class Campaign:
         return ""
 
     def _pool_task(self, name: str, exams: Sequence[Exam]) -> Task:
+        settings, key = self._of_one_mass(exams)
+        folder, members = self.folder / MASSES / name, self._members(exams)
+        return Task(step="pool", name=name, folder=folder, digest=digest_of(key), settings=settings, members=members)
+
+    def _of_one_mass(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
+        """Settings by which exams are sized together, and all that the result depends on."""
         first = self.found.of("map", exams[0].name)
         assert first is not None
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
         settings = self._by_repeatability(settings, first["normalise"])
         files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
-        key = {"exams": files, **self._settings_key(settings, first["normalise"])}
-        members = tuple((exam.name, self.folder / EXAMS / exam.name) for exam in exams)
-        folder = self.folder / MASSES / name
-        return Task(step="pool", name=name, folder=folder, digest=digest_of(key), settings=settings, members=members)
+        return settings, {"exams": files, **self._settings_key(settings, first["normalise"])}
+
+    def _members(self, exams: Sequence[Exam]) -> tuple[tuple[str, Path], ...]:
+        return tuple((exam.name, self.folder / EXAMS / exam.name) for exam in exams)
+
+    def _compare(self, sound: Sequence[Exam]) -> None:
+        """Compare the visits of every mass that has several with an estimate."""
+        estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
+        masses = {} if self._sizes_unknown else grown_masses(estimated)
+        unknown = len(grown_masses(sound)) - len(masses)
+        for names in _blocks(list(masses), self._block):
+            self._stages.run("compare", [self._compare_task(name, masses[name]) for name in names])
+            self._copy(GROWTH, names, steps=("compare",))
+        self._stages.run("compare", [], without=unknown)
+        if self.settings.copy_to:
+            self._stages.run("copy", [], without=unknown)
+
+    def _compare_task(self, name: str, visits: Visits) -> Task:
+        settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
+        days, figures = days_of(visits), self.settings.figures
+        counts = [len(exams) for exams in visits.values()]
+        members = tuple(self._members(exams) for exams in visits.values())
+        return Task(
+            "compare",
+            name,
+            self.folder / GROWTH / name,
+            digest_of({**key, "visits": counts, "days": days, "figures": figures}),
+            settings=settings,
+            visits=members,
+            days=days,
+            figures=figures,
+        )
 
     def _file(self, step: str, exam: Exam, file: str) -> str | None:
         result = self.found.of(step, exam.name)

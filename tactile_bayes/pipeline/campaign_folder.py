@@ -11,7 +11,7 @@ from typing import Final
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
-from tactile_bayes.files.campaign_names import EXAMS, JOURNAL, MASSES
+from tactile_bayes.files.campaign_names import EXAMS, GROWTH, JOURNAL, MASSES
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.campaign_keys import stamp
 from tactile_bayes.pipeline.campaign_staging import STAGED, clear_staged, put_in_place
@@ -20,6 +20,8 @@ from tactile_bayes.pipeline.campaign_steps import FILES, UNWRITTEN, Result
 _HEADER: Final = {"campaign": 1}
 _BESIDE: Final = ("repeatability",)
 """Steps whose files lie beside the exams."""
+_OTHERS: Final = ("pool", "compare", *_BESIDE)
+"""Steps that are of no single exam."""
 
 
 @contextlib.contextmanager
@@ -119,13 +121,14 @@ def tidy(
         Exams whose file could not be read: a disk that is away costs nothing that is done.
     """
     left = []
-    spared = {*unread, *(exam.of_mass for exam in exams if exam.name in unread)}
+    spared = {*unread, *(name for exam in exams if exam.name in unread for name in (exam.of_mass, exam.of_visits))}
     for step in _BESIDE:
         made = {file for result in results[step].values() for file in result["files"]}
         _clear(folder, known=FILES[step], made=made)
     for kind, names, steps in (
-        (EXAMS, {exam.name for exam in exams}, tuple(step for step in results if step not in ("pool", *_BESIDE))),
+        (EXAMS, {exam.name for exam in exams}, tuple(step for step in results if step not in _OTHERS)),
         (MASSES, {exam.of_mass for exam in exams}, ("pool",)),
+        (GROWTH, {exam.of_visits for exam in exams}, ("compare",)),
     ):
         for name in sorted(_names_in(folder / kind)):
             if name not in names:

@@ -14,6 +14,7 @@ from tactile_bayes.files.campaign_names import (
     ESTIMATE,
     EXAMS,
     FAILURES,
+    GROWN,
     JOURNAL,
     MAP,
     MAP_FIGURE,
@@ -25,8 +26,11 @@ from tactile_bayes.files.campaign_names import (
     TRIAL,
 )
 from tactile_bayes.pipeline.campaign import Campaign
+from tactile_bayes.pipeline.campaign_growth import growth_rows, growth_text
 from tactile_bayes.pipeline.campaign_tables import Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.growth import Growth, growth_line
+from tactile_bayes.trial.visits import at_excision
 
 if TYPE_CHECKING:
     from tactile_bayes.files.manifest_csv import Exam
@@ -35,7 +39,7 @@ if TYPE_CHECKING:
     from tactile_bayes.report.campaign_html import Card
 
 REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
-WRITTEN: Final = (DONE, FAILURES, TRIAL, REPORT, PAGE, INDEX, REPEATABILITY)
+WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILITY)
 """Files beside the exams."""
 _MOST_INLINE: Final = 300
 """With more exams the contact sheet names its thumbnails' files instead of holding them."""
@@ -89,6 +93,8 @@ class Written:
         Why there is none, where excision sizes were given.
     unnamed
         Exams whose map shows a mass that no row names.
+    growth
+        What became of masses with several visits, in a sentence; empty where there are none.
     """
 
     sized: int
@@ -99,6 +105,7 @@ class Written:
     report: str = ""
     no_report: str = field(default="")
     unnamed: tuple[str, ...] = ()
+    growth: str = ""
 
 
 def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
@@ -117,21 +124,27 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
     masses = None if excision is None else excision.masses()
     write_tables(campaign, rows, masses, campaign.folder)
     counts = _counts(rows)
+    growth = growth_rows(campaign)
+    if growth:
+        write_text(campaign.folder / GROWN, growth_text(growth), force=True)
     report, fault = "", ""
     if excision is not None:
-        report, fault = _write_report(campaign.folder, excision, protocol)
-    if not report:
-        for name in (REPORT, PAGE):
-            (campaign.folder / name).unlink(missing_ok=True)
-    links = {name: name for name in (DONE, FAILURES, TRIAL)} | ({"trial report": PAGE} if report else {})
+        report, fault = _write_report(campaign.folder, excision, protocol, growth)
+    for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (GROWN,))):
+        (campaign.folder / name).unlink(missing_ok=True)
+    links = {name: name for name in (DONE, FAILURES, TRIAL, *([GROWN] if growth else []))} | (
+        {"trial report": PAGE} if report else {}
+    )
     links |= {REPEATABILITY: REPEATABILITY} if campaign.repeatability else {}
-    page = _page(campaign, rows, counts, links)
+    page = _page(campaign, rows, counts, links, growth)
     write_text(campaign.folder / INDEX, page, force=True)
     known = {(row.exam.patient, row.exam.mass) for row in rows}
     left_out = sorted(known - masses) if masses is not None else []
     names = tuple(f"{patient} {mass}" for patient, mass in left_out)
     unnamed = tuple(row.exam.name for row in rows if row.unnamed)
-    return Written(*counts, len(campaign.found.results["pool"]), names, report, fault, unnamed)
+    return Written(
+        *counts, len(campaign.found.results["pool"]), names, report, fault, unnamed, growth_line(growth, GROWN)
+    )
 
 
 def copy_outputs(folder: Path, address: str) -> None:
@@ -149,7 +162,7 @@ def copy_outputs(folder: Path, address: str) -> None:
             put(folder / name, f"{address}/{name}")
 
 
-def check_inputs(exams: Iterable[Exam], excision: Excision | None, protocol: Path | None) -> None:
+def check_inputs(exams: Sequence[Exam], excision: Excision | None, protocol: Path | None) -> None:
     """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
 
     Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there.
@@ -165,6 +178,7 @@ def check_inputs(exams: Iterable[Exam], excision: Excision | None, protocol: Pat
         raise UsageError("--protocol is for the trial's report; give --excision too")
     if excision is not None:
         _check_spelling(excision, exams)
+        _check_dates(excision, exams)
     if protocol is not None:
         _trial_settings(protocol)
 
@@ -181,6 +195,18 @@ def _check_spelling(excision: Excision, exams: Iterable[Exam]) -> None:
             if code != spelled:
                 what = f"{code!r} is {spelled!r} in the table of exams (line {exam.line})"
                 raise table.error(row, column, what, way_out="write it one way in both tables")
+
+
+def _check_dates(excision: Excision, exams: Sequence[Exam]) -> None:
+    """Refuse a mass that was excised before every exam."""
+    columns = excision.table().columns
+    keys = zip(columns["patient"], columns["mass"], strict=True)
+
+    def fault(row: int, column: str, what: str, /, *, way_out: str) -> BadDataError:
+        return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {what}", way_out=way_out)
+
+    excised_on = dict(zip(keys, columns["date"], strict=True))
+    at_excision([exam.as_reading for exam in exams], excised_on, fault=fault)
 
 
 def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
@@ -202,7 +228,7 @@ def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:
     return sized, len(rows) - sized - failed, failed
 
 
-def _write_report(folder: Path, excision: Excision, protocol: Path | None) -> tuple[str, str]:
+def _write_report(folder: Path, excision: Excision, protocol: Path | None, growth: Sequence[Growth]) -> tuple[str, str]:
     """Write what `validate` writes for the trial table; returns its text, or why there is none."""
     from tactile_bayes.files.atomic import write_text
     from tactile_bayes.files.schema import check_document, dump_json
@@ -221,11 +247,17 @@ def _write_report(folder: Path, excision: Excision, protocol: Path | None) -> tu
     more = [] if outcome.next_mass is None else outcome.next_mass.lines()
     full = trial_text(outcome.report, methods=True, checks=outcome.checks, more=more)
     write_text(folder / REPORT, dump_json(outcome.document), force=True)
-    write_text(folder / PAGE, trial_html(outcome.report, outcome.document, text=full), force=True)
+    write_text(folder / PAGE, trial_html(outcome.report, outcome.document, text=full, growth=growth), force=True)
     return trial_text(outcome.report, methods=False, checks=outcome.checks, more=more), ""
 
 
-def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int], links: Mapping[str, str]) -> str:
+def _page(
+    campaign: Campaign,
+    rows: Sequence[Row],
+    counts: tuple[int, int, int],
+    links: Mapping[str, str],
+    growth: Sequence[Growth],
+) -> str:
     from tactile_bayes.report.campaign_html import campaign_html, worst
 
     cards = worst((_card(campaign, row) for row in rows), _MOST_CARDS)
@@ -237,7 +269,7 @@ def _page(campaign: Campaign, rows: Sequence[Row], counts: tuple[int, int, int],
     if len(cards) < len(rows):
         lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
     lines += [repeatability_words(campaign)] if campaign.repeatability else []
-    return campaign_html(cards, lines=lines, links=links, version=__version__)
+    return campaign_html(cards, lines=lines, links=links, version=__version__, growth=growth)
 
 
 def _self_contained(card: Card, folder: Path) -> Card:

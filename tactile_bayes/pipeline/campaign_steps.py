@@ -1,4 +1,4 @@
-"""Steps of a campaign: map, estimate, figures and size of an exam, the site's repeatability, a mass's pooled size.
+"""Steps of a campaign: map, estimate, figures and size of an exam, repeatability, pooled size and growth of a mass.
 
 A step runs in any process. It gets all that its result depends on, writes its files into one folder, and returns their
 digests, so that a later run can tell whether they are still what it made.
@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.campaign_names import (
+    COMPARED,
+    COMPARED_FIGURE,
     ESTIMATE,
     MAP,
     MAP_FIGURE,
@@ -47,6 +49,7 @@ FILES: Final = {
     "repeatability": (REPEATABILITY,),
     "size": (SIZED, SIZED_FIGURE),
     "pool": (POOLED, POOLED_DRAWS),
+    "compare": (COMPARED, COMPARED_FIGURE),
     "copy": (),
 }
 """The files that each step may write."""
@@ -81,18 +84,20 @@ class Task:
     normalise
         map: as the option of `map`.
     settings
-        estimate, figures, size, pool: of the estimate.
+        estimate, figures, size, pool, compare: of the estimate.
     mass, places, match_mm
         estimate, figures: where other exams of the breast have the mass, see `campaign_match`; no places where the
         exam is not matched.
     members
         pool: names and folders of the exams.
+    visits, days
+        compare: the same for each visit in order of time, and the visits' days from the first where they are known.
     copies
         copy: addresses in an object store, by the names of the files.
     repeats
         repeatability: the exams.
     figures
-        size: whether to draw it.
+        size, compare: whether to draw it.
     """
 
     step: str
@@ -108,6 +113,8 @@ class Task:
     places: tuple[NamedPlace, ...] = ()
     match_mm: float = 0.0
     members: tuple[tuple[str, Path], ...] = ()
+    visits: tuple[tuple[tuple[str, Path], ...], ...] = ()
+    days: tuple[float, ...] | None = None
     address: str = ""
     copies: Mapping[str, str] = field(default_factory=dict)
     repeats: tuple[ExamFolder, ...] = ()
@@ -340,6 +347,38 @@ def _pool(task: Task) -> tuple[Result, Writes]:
     return {}, writes
 
 
+def _compare(task: Task) -> tuple[Result, Writes]:
+    """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not."""
+    from tactile_bayes.files.atomic import write_text
+    from tactile_bayes.files.map_nc import read_map
+    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.pipeline.compared import compare_answers, drawn_maps
+    from tactile_bayes.pipeline.comparing import Comparing
+    from tactile_bayes.report.compare_figure import draw_comparison
+
+    assert task.settings is not None
+    answers = [[_answer(folder) for _, folder in exams] for exams in task.visits]
+    found = [one for maps in answers for one in maps if one.shape is not None]
+    placed = all(one.document is not None and one.document["centre_patient_mm"] is not None for one in found)
+    numbered = [(v, i, folder) for v, exams in enumerate(task.visits, 1) for i, (_, folder) in enumerate(exams, 1)]
+    outcome = compare_answers(
+        answers,
+        task.settings,
+        comparing=Comparing(days=task.days, same_mass=not placed),
+        names=[[name for name, _ in exams] for exams in task.visits],
+        inputs={f"visit_{v}_map_{i}": folder / MAP for v, i, folder in numbered},
+    )
+    check_document(outcome.document, "compare.schema.json", path=Path("the report"))
+    writes: Writes = {COMPARED: lambda path: write_text(path, dump_json(outcome.document), force=True)}
+    if task.figures and outcome.compared.joint is not None:
+        maps = [[read_map(folder / MAP) for _, folder in exams] for exams in task.visits]
+        drawn = drawn_maps(maps, answers)
+        writes[COMPARED_FIGURE] = lambda path: draw_comparison(
+            outcome.compared, outcome.document, drawn, path, force=True
+        )
+    return {}, writes
+
+
 def _copy(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.pipeline.campaign_copies import copy_step
 
@@ -386,6 +425,7 @@ RUN: Final[dict[str, Callable[[Task], tuple[Result, Writes]]]] = {
     "repeatability": _repeatability,
     "size": _size,
     "pool": _pool,
+    "compare": _compare,
     "copy": _copy,
 }
 """What makes each step's files: what it found, and how to write each file."""

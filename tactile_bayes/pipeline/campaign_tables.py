@@ -20,7 +20,7 @@ from tactile_bayes.report.touching import touching_sentences
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
 _TRIAL_COLUMNS: Final = (
     "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",
-    "reader", "visit", "reason", "synthetic",
+    "reader", "visit", "date", "reason", "synthetic",
 )  # fmt: skip
 _OF_ESTIMATE: Final = (
     "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "side_caution",
@@ -204,9 +204,11 @@ def _sizes(size: Mapping[str, float] | None) -> dict[str, object]:
 
 
 def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
-    """``failures.csv``: exams, and masses that could not be pooled, with the step and the reason."""
+    """``failures.csv``: exams, and masses that could not be pooled or compared, with the step and the reason."""
     failed = {row.exam.name: _names(row.exam) for row in rows}
     failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
+    blank = {"visit": None, "replicate": None, "file": None}
+    failed |= {row.exam.of_visits: {**_names(row.exam), **blank} for row in rows}
     found = campaign.found.faults
     lines = [
         failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
@@ -268,6 +270,7 @@ def _reading(
         **_sizes(None if document is None else document["max_size_mm"]),
         "reader": None if of is None else exam.reader,
         "visit": exam.visit,
+        "date": exam.day,
         "reason": (reason or None) if status != "detected" else None,
         "synthetic": None if of is None else of.synthetic,
     }

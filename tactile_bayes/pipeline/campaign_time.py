@@ -19,6 +19,7 @@ USUAL_S: Final = {
     "repeatability": 0.3,
     "size": 0.06,
     "pool": 0.15,
+    "compare": 0.15,
     "copy": 0.05,
 }
 """CPU seconds of each step, which give the others' share until one of each was run; see record 0114."""
@@ -28,19 +29,21 @@ _ODD: Final = 2
 """So many of a step's first results may be odd ones."""
 
 
-def steps_needed(exams: int, masses: int, *, settings: CampaignSettings, learns: bool) -> dict[str, int]:
+def steps_needed(
+    exams: int, masses: int, *, settings: CampaignSettings, learns: bool, compared: int = 0
+) -> dict[str, int]:
     """Steps that so many exams and masses take, done or not.
 
     Parameters
     ----------
-    masses
-        To be pooled.
+    masses, compared
+        To be pooled, and to be compared between visits.
     learns
         Whether the repeats may teach the spread between exams; then every exam gets its size by it.
     """
-    needed = {"map": exams, "estimate": exams, "figures": exams * settings.figures, "pool": masses}
+    needed = {"map": exams, "estimate": exams, "figures": exams * settings.figures, "pool": masses, "compare": compared}
     needed |= {"repeatability": 1, "size": exams} if learns else {}
-    return {**needed, "copy": (exams + masses) * bool(settings.copy_to)}
+    return {**needed, "copy": (exams + masses + compared) * bool(settings.copy_to)}
 
 
 def mean_seconds(values: Mapping[str, Result]) -> dict[str, float]:

@@ -69,6 +69,7 @@ def analyse(
         error_ratio=settings.error_ratio,
         ex_vivo_sd_mm=inputs.ex_vivo_sd_mm,
         seed=settings.seed,
+        other_visits=inputs.other_visits,
     )
     document = {"schema": SCHEMA, **({} if title is None else {"title": title}), **as_document(report)}
     checks: dict[str, IntervalCheck] = {}

@@ -10,13 +10,18 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet, Table
     from tactile_bayes.trial.readings import MassKey, Reading
+    from tactile_bayes.trial.visits import OtherVisits
 
 
 @dataclass(frozen=True, slots=True)
 class TrialInputs:
-    """Input of a trial's analysis, with every file read, by role."""
+    """Input of a trial's analysis, with every file read, by role.
+
+    The readings are those of each mass's last visit before excision; `other_visits` counts what that leaves out.
+    """
 
     readings: list[Reading]
+    other_visits: OtherVisits
     ex_vivo_mm: Mapping[MassKey, float]
     ex_vivo_sd_mm: Mapping[MassKey, float | None]
     files: dict[str, Path]
@@ -39,6 +44,7 @@ def load_trial(
     from tactile_bayes.files.size_posterior import fill_from_posteriors
     from tactile_bayes.files.tables import Sheet, check_references, read_table
     from tactile_bayes.trial.readings import readings_from_columns
+    from tactile_bayes.trial.visits import at_excision
 
     sizes = read_excision(excision, columns)
     if columns is None or tidy_trial or isinstance(trial, Sheet) or "reading" not in read_mapping(columns):
@@ -48,10 +54,14 @@ def load_trial(
     check_references(table, "trial.table.json", targets={"excision": sizes})
     filled, posteriors = fill_from_posteriors(table.columns, table.path.parent, fault=table.error)
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
+    readings = readings_from_columns(filled, fault=table.error)
+    excised_on = dict(zip(keys, sizes.columns["date"], strict=True))
+    analysed, other_visits = at_excision(readings, excised_on, fault=table.error)
     given = {"trial": trial, "excision": excision, "columns": columns}
     files = {role: path for role, path in given.items() if isinstance(path, Path)}
     return TrialInputs(
-        readings=readings_from_columns(filled, fault=table.error),
+        readings=analysed,
+        other_visits=other_visits,
         ex_vivo_mm=dict(zip(keys, sizes.columns["ex_vivo_mm"], strict=True)),
         ex_vivo_sd_mm=dict(zip(keys, sizes.columns["sd_mm"], strict=True)),
         files=files | {f"posterior_{number}": path for number, path in enumerate(posteriors, start=1)},

@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.growth import Growth, growth_section
 
 FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
 _STYLE = """
@@ -32,6 +33,9 @@ content-visibility:auto;contain-intrinsic-size:auto 20rem}
 article.failed{border-top-color:#c33}article.without{border-top-color:#c8641e}article[hidden]{display:none}
 img{display:block;margin:.35rem 0;max-width:100%;image-rendering:pixelated}ul{margin:.25rem 0;padding-left:1.1rem}
 li,.why{font-size:.86rem;overflow-wrap:anywhere}.caution{color:var(--doubt)}.size{font-size:1.12rem;font-weight:600}
+.growth{margin:.8rem 0}.wide{overflow-x:auto}table{border-collapse:collapse;font-size:.86rem;margin:.4rem 0}
+th,td{padding:.2rem .9rem .2rem 0;text-align:left;vertical-align:top;border-bottom:1px solid var(--line)}
+td small{color:var(--soft);white-space:nowrap}
 @media print{form{display:none}}
 """
 _SCRIPT = """
@@ -108,7 +112,14 @@ def worst(cards: Iterable[Card], most: int) -> list[Card]:
     return heapq.nsmallest(most, cards, key=lambda card: (card.badness, card.name))
 
 
-def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping[str, str], version: str) -> str:
+def campaign_html(
+    cards: Sequence[Card],
+    *,
+    lines: Sequence[str],
+    links: Mapping[str, str],
+    version: str,
+    growth: Sequence[Growth] = (),
+) -> str:
     """Full page; every text is escaped, nothing is loaded but thumbnails beside it, and the only script is its filter.
 
     Parameters
@@ -121,6 +132,8 @@ def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping
         Files beside the page, by the words of their links.
     version
         Of the program.
+    growth
+        Of masses with several visits.
     """
     script_hash = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
     images = "'self' file:" if any(isinstance(card.thumbnail, str) for card in cards) else "data:"
@@ -136,6 +149,7 @@ def campaign_html(cards: Sequence[Card], *, lines: Sequence[str], links: Mapping
         f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
         *(f"<p>{html.escape(line)}</p>" for line in lines),
         f"<p>{_links(links)}</p>",
+        *growth_section(growth),
         f'<p class="note">{html.escape(_LEGEND)}</p>',
         *_filters(cards),
         "<main>",

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.growth import Growth, growth_section
 from tactile_bayes.report.trial_figures import calibration_figure, differences_figure, sizes_figure
 from tactile_bayes.report.trial_methods_text import growing_line, limit_rows, shown
 from tactile_bayes.report.trial_text import ratio_line
@@ -54,7 +55,7 @@ _METHODS = {
 }
 
 
-def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -> str:
+def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str, growth: Sequence[Growth] = ()) -> str:
     """Full HTML page of a report.
 
     Parameters
@@ -63,6 +64,8 @@ def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -
         What the JSON report holds; its provenance is shown.
     text
         The text report, kept at the end for those who copy from it.
+    growth
+        Of masses with several visits, beside the trial.
     """
     title = "Sizes against excision"
     parts = [
@@ -79,6 +82,7 @@ def trial_html(report: TrialReport, document: Mapping[str, Any], *, text: str) -
         *_replicates(report),
         *_calibrations(report),
         *_comparisons(report),
+        *growth_section(growth),
         *_next_mass(document),
         *_interval_check(document),
         *_origin(document),
@@ -93,6 +97,8 @@ def _opening(report: TrialReport) -> Iterator[str]:
         f"<p>{report.masses} masses of {report.patients} patients, {report.readings} readings. "
         f"In brackets: {100 * report.confidence:g} % intervals over patients.</p>"
     )
+    for line in report.other_visits.lines():
+        yield f'<p class="mark">{html.escape(line)}.</p>'
     for doubt in report.doubts:
         yield f'<p class="mark">Doubtful: {html.escape(doubt)}</p>'
     if report.synthetic_readings:

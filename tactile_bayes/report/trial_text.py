@@ -25,6 +25,7 @@ def trial_text(
     lines = [
         f"Sizes against excision: {_plural(report.masses, 'mass')} of {_plural(report.patients, 'patient')}, "
         f"{_plural(report.readings, 'reading')}{_synthetic(report)}",
+        *report.other_visits.lines(),
         *(f"Doubtful: {doubt}" for doubt in report.doubts),
         "",
         *_aligned([_HEADINGS, *(_row(one) for one in report.modalities.values())]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import date
 from itertools import compress, groupby
 from typing import Any, Protocol
 
@@ -44,6 +45,8 @@ class Reading:
     synthetic: bool = False
     sd_mm: float | None = None
     reader: str | None = None
+    visit: str | None = None
+    day: date | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,14 +170,16 @@ def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFa
     """
     names = ("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability")
     readings = []
-    more = [columns.get(name, [None] * len(columns["patient"])) for name in ("sd_mm", "reader", "synthetic")]
+    optional = ("sd_mm", "reader", "visit", "date")
+    synthetic = columns.get("synthetic", [None] * len(columns["patient"]))
+    more = [synthetic, *(columns.get(name, [None] * len(columns["patient"])) for name in optional)]
     for row, cells in enumerate(zip(*(columns[name] for name in names), *more, strict=True)):
         patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, *others = cells
         status = _status(row, status, size_mm, fault=fault)
         interval = _interval(row, status, size_mm, (low_mm, high_mm, probability), fault=fault)
-        sd_mm, reader, synthetic = others
+        made, *said = others
         key = (patient, mass)
-        readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(synthetic), sd_mm, reader))
+        readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(made), *said))
     return readings
 
 

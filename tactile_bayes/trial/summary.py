@@ -23,6 +23,7 @@ from tactile_bayes.trial.proportion import clopper_pearson
 from tactile_bayes.trial.readings import MassKey, ModalitySizes, Reading, gather, mass_numbers, patient_numbers
 from tactile_bayes.trial.replicates import reader_components
 from tactile_bayes.trial.variance_components import Components
+from tactile_bayes.trial.visits import OtherVisits
 
 FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (accuracy.figures, origin_line.figures, spread.figures)
 
@@ -55,7 +56,7 @@ class TrialReport:
     """Reports of all modalities, ratios to the tactile one, paired comparisons, and counts.
 
     `sizes` are those that the figures were made from; `ex_vivo_sd_mm` is by the number of the mass. `doubts` says what
-    looks like another unit than mm.
+    looks like another unit than mm. `other_visits` counts the readings that are not of the last visit before excision.
     """
 
     modalities: Mapping[str, ModalityReport]
@@ -70,6 +71,7 @@ class TrialReport:
     sizes: Mapping[str, ModalitySizes] = field(default_factory=dict)
     ex_vivo_sd_mm: Mapping[int, float | None] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
+    other_visits: OtherVisits = field(default_factory=OtherVisits)
 
 
 def summarise(
@@ -80,6 +82,7 @@ def summarise(
     error_ratio: float = 1.0,
     ex_vivo_sd_mm: Mapping[MassKey, float | None] | None = None,
     seed: int = SEED,
+    other_visits: OtherVisits | None = None,
 ) -> TrialReport:
     """Summarise a trial: compare each modality's sizes with excision.
 
@@ -97,6 +100,8 @@ def summarise(
         Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature.
     seed
         Of the sign flips, where there are too many to try all.
+    other_visits
+        What was left out of the readings before, for the report.
     """
     # one order for every order of the rows: an iteration's last digits depend on it
     readings = sorted(readings, key=lambda r: (r.key, r.modality, r.replicate))
@@ -117,6 +122,7 @@ def summarise(
         paired=tuple(paired_comparisons(sizes, confidence=confidence, seed=seed)),
         sizes=sizes,
         doubts=tuple(unit_doubts(sizes, np.array(list(ex_vivo_mm.values()), dtype=np.float64))),
+        other_visits=other_visits or OtherVisits(),
         ex_vivo_sd_mm={number: (ex_vivo_sd_mm or {}).get(key) for key, number in mass_numbers(ex_vivo_mm).items()},
     )
 
