@@ -136,6 +136,13 @@ def _run() -> int:
     return status if isinstance(status, int) else 0
 
 
+_CLICK_WORDS = {
+    "is not a valid integer range": "is not a whole number",
+    "is not a valid integer": "is not a whole number",
+    "is not a valid float": "is not a number",
+}
+
+
 def _show(error: click.ClickException) -> None:
     """Print an error of the words on the command line, in one line as all others; without any words, the help."""
     context = error.ctx if isinstance(error, click.UsageError) else None
@@ -143,6 +150,8 @@ def _show(error: click.ClickException) -> None:
         error.show()
         return
     message = " ".join(error.format_message().split()).rstrip(".")
+    for theirs, ours in _CLICK_WORDS.items():
+        message = message.replace(theirs, ours)
     advice = f"; see `{context.command_path} --help`" if context is not None else ""
     click.echo(f"error: {message}{advice}", err=True)
 

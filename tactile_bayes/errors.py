@@ -6,6 +6,8 @@ reader of the output has gone.
 
 from __future__ import annotations
 
+import math
+import numbers
 from collections.abc import Collection
 
 EXIT_DONE = 0
@@ -35,6 +37,54 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Refuse a value that is none of the choices, with a `UsageError` that lists them."""
     if value not in choices:
         raise UsageError(f"{name} is {value!r}; give one of {', '.join(choices)}")
+
+
+def check_number(
+    name: str,
+    value: object,
+    least: float | None = None,
+    most: float | None = None,
+    *,
+    whole: bool = False,
+    open_ends: bool = False,
+) -> None:
+    """Refuse what is no finite number, or lies outside a range, with a `UsageError` that says what can be given.
+
+    Parameters
+    ----------
+    least, most
+        Ends of the range; None for no end.
+    whole
+        Whether only whole numbers are taken.
+    open_ends
+        Whether the ends themselves are refused.
+    """
+    if isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool):
+        number = float(value)
+        inside = (least is None or number >= least) and (most is None or number <= most)
+        if inside and not (open_ends and number in (least, most)) and math.isfinite(number):
+            return
+    shown = f"{value:g}" if isinstance(value, float) else _shortened(repr(value))
+    raise UsageError(f"{name} is {shown}; give {number_words(least, most, whole=whole, open_ends=open_ends)}")
+
+
+def number_words(least: float | None, most: float | None, *, whole: bool = False, open_ends: bool = False) -> str:
+    """What can be given, in words: ``a number above 0 and below 1``."""
+    told = "" if least is None else f" above {least:g}" if open_ends else f" from {least:g}"
+    if most is not None:
+        told += f"{' and' if told else ''} below {most:g}" if open_ends else f"{' to' if told else ' up to'} {most:g}"
+    elif told and not open_ends:
+        told += " on"
+    return f"a {'whole ' if whole else ''}number{told}"
+
+
+def meant(name: str, known: Collection[str]) -> str:
+    """The way out for a name that is not known: the one that was probably meant, else all of them."""
+    import difflib
+
+    lower = {one.lower(): one for one in known}
+    near = difflib.get_close_matches(name.lower(), lower, n=1)
+    return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"
 
 
 _MOST_SHOWN = 1000  # characters of what a file holds that an error repeats

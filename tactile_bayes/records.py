@@ -1,4 +1,4 @@
-"""Frozen dataclasses that are created in half the time of the standard library's.
+"""Frozen dataclasses that are created in half the time of the standard library's, and print what they hold in short.
 
 A command makes sixty classes before it does anything, a tenth of its time. The standard library writes and compiles up
 to six functions for each; here only ``__init__`` is compiled, and the others are shared.
@@ -23,7 +23,8 @@ else:
         def made(cls):
             record = dataclasses.dataclass(slots=True, eq=False, repr=False)(cls)
             for name, function in shared.items():
-                setattr(record, name, function)
+                if name not in cls.__dict__:
+                    setattr(record, name, function)
             return record
 
         return made
@@ -44,9 +45,26 @@ def _values(record: Any) -> tuple[object, ...]:
     return tuple(getattr(record, name) for name in record.__match_args__)
 
 
+MOST_SHOWN = 100
+"""Characters of a value that a record's repr shows; of a longer one it shows what it is."""
+
+
 def _repr(self: Any) -> str:
     fields = zip(self.__match_args__, _values(self), strict=True)
-    return f"{type(self).__qualname__}({', '.join(f'{name}={value!r}' for name, value in fields)})"
+    return f"{type(self).__qualname__}({', '.join(f'{name}={_short(value)}' for name, value in fields)})"
+
+
+def _short(value: Any) -> str:
+    """A value's repr; for arrays and long values their kind with shape or length: no draws are printed."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return repr(value) if value.shape == () else f"<array {'x'.join(map(str, value.shape))}>"
+    kind = type(value).__qualname__
+    if isinstance(value, (list, tuple, set, frozenset, dict)) and len(value) > MOST_SHOWN:
+        return f"<{kind} of {len(value)}>"
+    text = repr(value)
+    if len(text) <= MOST_SHOWN and "\n" not in text:
+        return text
+    return f"<{kind} of {len(value)}>" if hasattr(value, "__len__") else f"<{kind}>"
 
 
 def _equal(self: object, other: object) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
+from tactile_bayes.records import dataclass
 
 CountArray = NDArray[np.uint16]
 

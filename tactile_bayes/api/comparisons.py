@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tactile_bayes.api.arguments import door, plain, sequence_of
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.estimates import SizeEstimate, estimated, of_one_mass, settings_of
 from tactile_bayes.api.maps import Map
@@ -107,6 +108,7 @@ class Comparison:
 
         return compare_text(self.document)
 
+    @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the visits' maps, their difference and the change; with a path also write it."""
         from tactile_bayes.report.compare_figure import draw_comparison
@@ -123,6 +125,7 @@ class Comparison:
         return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
+@door
 def compare(
     first: Any,
     second: Any,
@@ -162,7 +165,14 @@ def compare(
     """
     used = settings_of(settings)
     refuse_checkpoint(used)
-    comparing = Comparing(times_of(days, dates), tuple(grown_by), same_mass, registration_mm)
+    times = times_of(
+        None
+        if days is None
+        else [plain(day) for day in sequence_of("days", days, "numbers, one for each later visit")],
+        None if dates is None else sequence_of("dates", dates, "dates, one for each visit"),
+    )
+    shares = tuple(plain(one) for one in sequence_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
+    comparing = Comparing(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
     visits = tuple(_visit(one, settings) for one in (first, second, *more))
     prints = [one.outcome.tactile_map.fingerprint for visit in visits for one in visit]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tactile_bayes.errors import check_number
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels
 from tactile_bayes.inference.summary import Quantity, summarise
@@ -54,12 +55,11 @@ class Draws:
 
         Raises
         ------
-        ValueError
+        UsageError
             When the probability is not between 0 and 1.
         """
         wanted = self.probability if probability is None else probability
-        if not 0.0 < wanted < 1.0:
-            raise ValueError(f"the probability of an interval is {wanted}; it must lie between 0 and 1")
+        check_number("the probability of an interval", wanted, 0, 1, open_ends=True)
         return summarise(
             self.values, probability=wanted, effective_draws=self.effective_draws, replicates=self.replicates
         )

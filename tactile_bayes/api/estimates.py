@@ -7,8 +7,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
+from tactile_bayes.api.arguments import check_keywords, door, in_keywords, plain, sequence_of
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.paths import PathLike, output_path, path_of
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
 
     from tactile_bayes.pipeline.pooled import PooledOutcome
     from tactile_bayes.size.posterior import SizePosterior
+    from tactile_bayes.size.repeatability import Repeatability
 
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 
@@ -63,7 +67,7 @@ class SizeEstimate(SizedExam):
     @property
     def advice(self) -> str:
         """What would help where there is no size."""
-        return self.outcome.estimate.advice
+        return in_keywords(self.outcome.estimate.advice)
 
     @property
     def detected_probability(self) -> float | None:
@@ -133,6 +137,7 @@ class SizeEstimate(SizedExam):
         """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""
         return answer_of(self.outcome)
 
+    @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the posterior of the size; without a size the map with the places looked at.
 
@@ -148,12 +153,14 @@ class SizeEstimate(SizedExam):
             return self.plot_map(path, force=force)
         return draw_size(size, path_of(path), name=self._titled, probability=self.probability, force=force)
 
+    @door
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
         from tactile_bayes.report.estimate_figures import draw_map
 
         return draw_map(self.outcome.tactile_map, self.outcome.estimate, path_of(path), name=self._titled, force=force)
 
+    @door
     def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw data, fit and residual of the fit window side by side; without an estimate the map.
 
@@ -175,6 +182,7 @@ class SizeEstimate(SizedExam):
 
         return named_exam(self.name, self.outcome.provenance.scans)
 
+    @door
     def save(self, path: PathLike, *, force: bool = False) -> None:
         """Write all draws as netCDF that arviz opens, as ``estimate -o`` does.
 
@@ -222,6 +230,7 @@ class PooledSize(SizedExam):
         """What ``estimate --pool --json`` prints."""
         return self.outcome.document
 
+    @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the posterior of the size; with a path also write it.
 
@@ -248,22 +257,41 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
         Naming a keyword that is none, and those that are.
     """
     known = _keywords()
-    for name in options:
-        if name not in known:
-            raise TypeError(f"estimate has no setting {name!r}; the settings are {', '.join(known)}")
-    given = {known[name]: value for name, value in options.items()}
-    calibration = given.get("calibration")
-    if isinstance(calibration, Path):
-        given["calibration"] = str(calibration.expanduser())
-    if isinstance(given.get("known"), Mapping):
-        given["known"] = tuple((name, float(value)) for name, value in given["known"].items())
-    if isinstance(given.get("repeatability"), str | Path):
-        from tactile_bayes.files.repeatability_json import read_repeatability
-
-        given["repeatability"] = read_repeatability(path_of(given["repeatability"]))
-    if given.get("checkpoint") is not None:
-        given["checkpoint"] = path_of(given["checkpoint"])
+    check_keywords("estimate", options, known)
+    given = {known[name]: plain(value) for name, value in options.items()}
+    if "calibration" in given:
+        given["calibration"] = _calibration(given["calibration"])
+    if "known" in given:
+        given["known"] = _properties(given["known"])
+    if "repeatability" in given:
+        given["repeatability"] = _repeatability(given["repeatability"])
+    if given.get("prior") is not None and not isinstance(given["prior"], Mapping):
+        raise UsageError(f'prior is {given["prior"]!r}; give a mapping such as {{"amplitude_sd": 2.0}}')
+    given["checkpoint"] = path_of(given.get("checkpoint"))
     return Settings(**given)
+
+
+def _calibration(given: Any) -> Any:
+    """A name, or the calibration itself."""
+    if given is None or isinstance(given, str) or hasattr(given, "recipe"):
+        return given
+    return str(path_of(given))
+
+
+def _properties(given: Any) -> tuple[tuple[str, float], ...]:
+    """Known properties of a body from a mapping, or from pairs."""
+    pairs = list(given.items()) if isinstance(given, Mapping) else given
+    if isinstance(pairs, str) or not isinstance(pairs, Sequence) or any(np.shape(one) != (2,) for one in pairs):
+        raise UsageError(f'known is {given!r}; give a mapping such as {{"seat": 1.2}}')
+    return tuple((str(name), plain(value)) for name, value in pairs)
+
+
+def _repeatability(given: Any) -> Repeatability | None:
+    from tactile_bayes.files.repeatability_json import read_repeatability
+
+    if given is None or hasattr(given, "between_maps"):
+        return cast("Repeatability | None", given)
+    return read_repeatability(path_of(given))
 
 
 def _keywords() -> dict[str, str]:
@@ -273,6 +301,7 @@ def _keywords() -> dict[str, str]:
     return {renamed.get(name, name): name for name in names}
 
 
+@door
 def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = None, **settings: Any) -> SizeEstimate:
     """Estimate a lump's size from one map.
 
@@ -297,7 +326,7 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     BadDataError
         When a file is not what it must be, or the calibration does not fit the map.
     UsageError
-        When settings contradict each other.
+        When settings contradict each other, or a value cannot be one.
     NotConvergedError
         When the method asked for does not converge.
 
@@ -317,6 +346,7 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     return SizeEstimate(outcome, "" if given.path is None else given.path.stem)
 
 
+@door
 def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     """Estimate one size from several maps of one mass, whose spread is learned.
 
@@ -375,13 +405,15 @@ def of_one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
 
 def listed(given: Any) -> list[Any]:
     """One map, estimate, pooled size or path as a list of it; a list of them as it is."""
-    return [given] if isinstance(given, str | Path | Map | SizeEstimate | PooledSize) else list(given)
+    if isinstance(given, str | Path | Map | SizeEstimate | PooledSize):
+        return [given]
+    return list(sequence_of("files", given, "maps, estimates or paths"))
 
 
-def _several(maps: Iterable[Any]) -> list[Any]:
-    if isinstance(maps, str | Path | Map):
+def _several(maps: Iterable[Any]) -> Sequence[Any]:
+    if isinstance(maps, str | Path | Map | SizeEstimate | PooledSize):
         raise UsageError("pool takes several maps; give a list")
-    return list(maps)
+    return sequence_of("maps", maps, "maps, paths or estimates")
 
 
 def _signature() -> inspect.Signature:

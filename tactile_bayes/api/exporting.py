@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from tactile_bayes.api.arguments import check_keywords, door
 from tactile_bayes.api.estimates import PooledSize, SizeEstimate, listed
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.paths import PathLike, path_of
@@ -39,6 +40,7 @@ class ExportedFiles:
     notes: tuple[str, ...] = ()
 
 
+@door
 def export(
     files: Any = (),
     path: PathLike | None = None,
@@ -86,7 +88,10 @@ def export(
     (PosixPath('records.csv'),)
     """
     check_choice("to", to, FORMATS)
-    _refuse_unknown(identity)
+    check_keywords("export", identity, TAKES["dicom"])
+    for name, value in identity.items():
+        if not isinstance(value, str):
+            raise UsageError(f"{name} is {value!r}; give a text")
     refuse_untaken(to, identity)
     several = listed(files)
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
@@ -100,12 +105,6 @@ def export(
             id_from_scan=patient_id_from_scan,
         )
     return ExportedFiles(outputs.write(exported), () if exported is None else exported.notes)
-
-
-def _refuse_unknown(identity: dict[str, str]) -> None:
-    for name in identity:
-        if name not in TAKES["dicom"]:
-            raise TypeError(f"export has no keyword {name!r}; an identity has {', '.join(TAKES['dicom'])}")
 
 
 def _read_all(given: Sequence[Any], to: Format) -> list[MapFile | Sequence[EstimateFile]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -10,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.paths import PathLike, output_path, path_of
-from tactile_bayes.errors import UsageError
+from tactile_bayes.api.arguments import check_keywords, door, plain
+from tactile_bayes.api.paths import PathLike, output_path, path_of, required_path
+from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -79,12 +81,14 @@ class Map:
             }
         )
 
+    @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map beside its coverage; with a path also write it as PNG, PDF or SVG."""
         from tactile_bayes.report.map_figure import map_figure
 
         return map_figure(self.tactile_map, path_of(path), force=force)
 
+    @door
     def save(self, path: PathLike, *, force: bool = False) -> None:
         """Write the map as `tactile-bayes map` does, for `estimate` and other programs.
 
@@ -109,6 +113,7 @@ class Map:
         return f"<p>{escape(repr(self))}</p><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
+@door
 def read_scan(path: PathLike) -> Scan:
     """Read a scan file (``.mcap``).
 
@@ -119,9 +124,10 @@ def read_scan(path: PathLike) -> Scan:
     """
     from tactile_bayes.files.scan_mcap import read_scan as read
 
-    return read(path_of(path))
+    return read(required_path(path, "path"))
 
 
+@door
 def read_map(path: PathLike) -> Map:
     """Read a map (``.nc``).
 
@@ -132,10 +138,12 @@ def read_map(path: PathLike) -> Map:
     """
     from tactile_bayes.files.map_nc import read_map_and_scans
 
-    tactile_map, scans = read_map_and_scans(path_of(path))
-    return Map(tactile_map, path_of(path), scans=scans)
+    source = required_path(path, "path")
+    tactile_map, scans = read_map_and_scans(source)
+    return Map(tactile_map, source, scans=scans)
 
 
+@door
 def build_map(scans: Any, **options: Any) -> Map:
     """Build one map from a scan, or from several scans of one examination.
 
@@ -150,11 +158,14 @@ def build_map(scans: Any, **options: Any) -> Map:
     ------
     BadDataError
         When a file is no scan, or no frame is left.
+    UsageError
+        When an option cannot be so, or a recording is given twice.
     """
-    from tactile_bayes.files.provenance import scan_facts
+    from tactile_bayes.files.provenance import repeated_scans, scan_facts
     from tactile_bayes.mapping import build_map as build
     from tactile_bayes.pipeline.scans import exam_facts, load_scans
 
+    check_keywords("build_map", options, set(inspect.signature(build).parameters) - {"scans"})
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
     loaded: list[Scan] = []
     notes: list[str] = []
@@ -169,7 +180,12 @@ def build_map(scans: Any, **options: Any) -> Map:
             scan = _scan_of(one)
             loaded.append(scan)
             facts.append(scan_facts(scan.session, frames=scan.frames.sha256))
-    return Map(build(loaded, **options), notes=tuple(notes), scans=tuple(facts))
+    for later, earlier in repeated_scans([[one] for one in facts]).items():
+        raise UsageError(
+            f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
+        )
+    made = build(loaded, **{name: plain(value) for name, value in options.items()})
+    return Map(made, notes=tuple(notes), scans=tuple(facts))
 
 
 def _scan_of(given: Any) -> Scan:
@@ -182,6 +198,7 @@ def _scan_of(given: Any) -> Scan:
     return scan
 
 
+@door
 def simulate(
     scene: PathLike, *, seed: int | None = None, fidelity: str | None = None, head: str | None = None
 ) -> SimulatedScan:
@@ -204,8 +221,9 @@ def simulate(
     from tactile_bayes.files.scene_toml import read_scene
     from tactile_bayes.forward.simulate import simulate as run
 
-    read = read_scene(path_of(scene))
+    read = read_scene(required_path(scene, "scene"))
     used = read.seed if seed is None else seed
+    check_number("seed", used, 0, whole=True)
     return run(read, rng=np.random.default_rng(used), fidelity=fidelity, head=head)
 
 

@@ -35,6 +35,19 @@ def path_of(given: PathLike | None) -> Path | None:
     return Path(given).expanduser()
 
 
+def required_path(given: PathLike, name: str) -> Path:
+    """Convert to the path of an input.
+
+    Raises
+    ------
+    UsageError
+        As `path_of`, and when it is None.
+    """
+    if given is None:
+        raise UsageError(f"{name} is None; give the path of a file")
+    return path_of(given)
+
+
 def output_path(given: PathLike, written: Format) -> Path:
     """Convert to the path of an output.
 
@@ -43,6 +56,6 @@ def output_path(given: PathLike, written: Format) -> Path:
     UsageError
         As `path_of`, and when it has the suffix of another format than the one written.
     """
-    path = path_of(given)
+    path = required_path(given, "the path")
     check_suffix(path, written)
     return path

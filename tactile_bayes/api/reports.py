@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tactile_bayes.api.arguments import door
 from tactile_bayes.api.estimates import PooledSize, SizeEstimate, estimated, listed, of_one_mass, settings_of
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError
@@ -16,6 +17,7 @@ from tactile_bayes.report.exam_files import PageFiles
 from tactile_bayes.report.exam_words import headline
 
 
+@door
 def exam_report(
     files: Any,
     path: PathLike,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tactile_bayes.api.arguments import door
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.paths import PathLike
 from tactile_bayes.errors import UsageError
@@ -78,6 +79,7 @@ class Sized:
         values = {name: draws.values.ravel() for name, draws in columns.items()}
         return pandas.DataFrame({"chain": chain, "draw": draw, **values})
 
+    @door
     def to_arviz(self) -> Any:
         """The draws as arviz has them, with the groups that `save` writes beside them for the estimate of a map.
 
@@ -113,6 +115,7 @@ class Sized:
 class SizedExam(Sized):
     """Base of the estimates of a whole exam, from one map or from several."""
 
+    @door
     def report(
         self,
         path: PathLike,

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from tactile_bayes.api.paths import PathLike, output_path, path_of
+from tactile_bayes.api.arguments import check_keywords, door, plain
+from tactile_bayes.api.paths import PathLike, output_path, path_of, required_path
+from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
     import pandas
 
     from tactile_bayes.files.tables import Sheet
-    from tactile_bayes.pipeline.size_calibration import EqSixFit
+    from tactile_bayes.pipeline.size_calibration import EqSixFit, PopulationForm
     from tactile_bayes.pipeline.trial import TrialOutcome
     from tactile_bayes.size.calibration import Calibration
     from tactile_bayes.size.repeatability import Repeatability
@@ -68,6 +70,7 @@ class TrialResult:
         return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
+@door
 def validate(
     trial: PathLike | pandas.DataFrame,
     excision: PathLike | pandas.DataFrame,
@@ -96,10 +99,13 @@ def validate(
     from tactile_bayes.pipeline.trial import TrialSettings, analyse
     from tactile_bayes.pipeline.trial_inputs import load_trial
 
+    check_keywords("validate", settings, [one.name for one in fields(TrialSettings)])
+    used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
     inputs = load_trial(_table(trial, "trial"), _table(excision, "excision"), path_of(columns))
-    return TrialResult(analyse(inputs, TrialSettings(**settings)))
+    return TrialResult(analyse(inputs, used))
 
 
+@door
 def calibrate_size(
     table: PathLike | pandas.DataFrame,
     *,
@@ -145,6 +151,8 @@ def calibrate_size(
         Naming the table, the line, the column, the value and the way out.
     TypeError
         When a keyword is none of these.
+    UsageError
+        When a keyword's value cannot be one, or goes with another form.
     """
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_body_calibration, write_size_calibration
@@ -152,22 +160,19 @@ def calibrate_size(
     from tactile_bayes.pipeline.site_correction import correct_size
     from tactile_bayes.pipeline.size_calibration import FORMS, is_population, learn_eq6, learn_population
 
-    if form not in FORMS:
-        raise TypeError(f"form is {form!r}; it is one of {', '.join(FORMS)}")
-    if fit not in ("joint", "two-stage"):
-        raise TypeError(f"fit is {fit!r}; it is 'joint' or 'two-stage'")
+    check_choice("form", form, FORMS)
+    check_choice("fit", fit, ("joint", "two-stage"))
+    check_number("seed", seed, 0, whole=True)
+    check_number("least_stiffness_ratio", least_stiffness_ratio, 0)
     target = None if path is None else output_path(path, "JSON")
     source = _table(table, "table")
     over_bodies_alone = form != "eq6" or (correct is None and is_population(source))
     names = ("normalise",) if over_bodies_alone else ("normalise", "background", "fit_radius_mm", "noise")
-    for name in declared:
-        if name not in names:
-            what = f"form {form!r} and this table"
-            raise TypeError(f"calibrate_size has no setting {name!r} for {what}; it has {', '.join(names)}")
+    check_keywords(f"calibrate_size for form {form!r} and this table", declared, names)
     given = {name: declared.get(name) for name in names}
     if correct is not None:
         if form != "eq6" or fit != "joint" or least_stiffness_ratio:
-            raise TypeError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
+            raise UsageError("form, fit and least_stiffness_ratio are for learning a calibration; leave them out")
         corrected = correct_size(source, str(correct), given, seed=seed)
         if target is not None:
             corrected.write(target, force=force)
@@ -175,9 +180,9 @@ def calibrate_size(
     inputs = hash_inputs(table=source) if isinstance(source, Path) else {}
     if over_bodies_alone:
         if fit != "joint":
-            raise TypeError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
+            raise UsageError(f"fit={fit!r} is for tables of lumps; a table of `population` has one fit")
         over_bodies, settings = learn_population(
-            read_table(source, "population.table.json"), form, declared.get("normalise")
+            read_table(source, "population.table.json"), cast("PopulationForm", form), declared.get("normalise")
         )
         if target is not None:
             provenance = Provenance("calibrate size", settings, inputs)
@@ -191,6 +196,7 @@ def calibrate_size(
     return learned.calibration
 
 
+@door
 def calibrate_repeatability(
     folder: PathLike, *, size_calibration: PathLike | None = None, path: PathLike | None = None, force: bool = False
 ) -> Repeatability:
@@ -221,7 +227,7 @@ def calibrate_repeatability(
 
     target = None if path is None else output_path(path, "JSON")
     given = None if size_calibration is None else str(size_calibration)
-    learned = learn_from_exams(exams_in(path_of(folder)), size_calibration=given)
+    learned = learn_from_exams(exams_in(required_path(folder, "folder")), size_calibration=given)
     if target is not None:
         learned.write(target, force=force)
     return learned.repeatability
@@ -233,4 +239,4 @@ def _table(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
 
     if hasattr(given, "to_csv"):
         return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
-    return path_of(given)
+    return required_path(given, name)

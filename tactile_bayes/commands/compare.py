@@ -47,7 +47,7 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
 @click.option("--dates", metavar="DATE,DATE...", help="The visits' dates, in place of --days: 2026-01-15,2026-04-20.")
 @click.option(
     "--grown-by",
-    type=FiniteRange(min=-100.0, min_open=True),
+    type=FiniteRange(min=-100.0, max=1000.0, min_open=True, max_open=True),
     multiple=True,
     default=_PERCENT,
     show_default=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.errors import number_words
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 
 if TYPE_CHECKING:
@@ -33,10 +35,21 @@ class FiniteRange(click.FloatRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert to the number."""
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number", param, ctx)
-        return number
+        with contextlib.suppress(click.BadParameter):
+            number = super().convert(value, param, ctx)
+            if math.isfinite(number):
+                return number
+        text, share = str(value), ""
+        with contextlib.suppress(ValueError):
+            part = float(text.removesuffix("%").strip()) / 100
+            if self.max == 1 and 0 < part < 1:
+                share = f"; for {text.removesuffix('%').strip()} % give {part:g}"
+        words = number_words(self.min, self.max, open_ends=self.min_open or self.max_open)
+        return self.fail(f"{text!r} is not {words}{share}", param, ctx)
+
+    def _describe_range(self) -> str:
+        """The range as help shows it; empty without ends."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
 
 
 class NumberOr(_ParamType):

@@ -50,7 +50,7 @@ class Outputs:
         if not files and self.dictionary is None:
             raise UsageError("no file was given to export; give a map, an estimate or both")
         if files and self.path is None:
-            raise UsageError("there is nowhere to write to; give -o OUT (in Python the path)")
+            raise UsageError("there is nowhere to write to; give the path (-o OUT)")
         if self.path is not None and not files:
             raise UsageError(f"no file was given to export to {self.path}; give a map, an estimate or both")
         if self.dictionary is not None and self.to != "csv":

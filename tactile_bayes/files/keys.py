@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, meant
 
 
 def refuse_unknown(table: Mapping[str, object], known: Collection[str], *, path: Path, where: str = "") -> None:
@@ -21,6 +20,4 @@ def refuse_unknown(table: Mapping[str, object], known: Collection[str], *, path:
         if key in known:
             continue
         full = f"{where}.{key}" if where else key
-        near = difflib.get_close_matches(key, known, n=1)
-        way_out = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-        raise BadDataError(f"{full} is not known", way_out=way_out, path=str(path))
+        raise BadDataError(f"{full} is not known", way_out=meant(key, known), path=str(path))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.kinds import schema_kind
 
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -37,11 +39,94 @@ def check_document(document: object, schema_name: str, *, path: Path) -> None:
     try:
         _validator(schema_name)(document)
     except fastjsonschema.JsonSchemaValueException as error:
-        where = ".".join(error.path[1:]) or "the document"
-        value = repr(error.value)
-        value = value if len(value) <= 60 else value[:57] + "..."
-        rule = error.message.split(" ", 1)[1] if " " in error.message else error.message
-        raise BadDataError(f"{where} {rule} (found {value})", way_out=f"see {schema_name}", path=str(path)) from None
+        what, way_out = _in_words(error)
+        raise BadDataError(what, way_out=f"{way_out} (see {schema_name})", path=str(path)) from None
+
+
+_CODE: Final = re.compile(r"\^\[A-Za-z0-9_-\]\{1,(\d+)\}\$")
+_KINDS: Final = {
+    "string": "a text",
+    "number": "a number",
+    "integer": "a whole number",
+    "object": "a table of keys",
+    "array": "a list",
+    "boolean": "true or false",
+    "null": "null",
+}
+
+
+def _in_words(error: Any) -> tuple[str, str]:
+    """What is wrong in a document, and what can be given instead, without the words of schemas."""
+    where = ".".join(map(str, error.path[1:])) or "the document"
+    what, wanted, definition = f"{where} is {_shown(error.value)}", error.rule_definition, error.definition
+    if error.rule == "required":
+        missing = next(name for name in wanted if name not in error.value)
+        return f"{where} has no {missing}", "add it"
+    if error.rule in ("additionalProperties", "propertyNames"):
+        return _unknown_key(error, "" if where == "the document" else f"{where}.")
+    if error.rule == "enum" and isinstance(error.value, str):
+        texts = [str(one) for one in wanted]
+        near = meant(error.value, texts)
+        return what, f"{near} Give one of {', '.join(texts)}" if near.startswith("did") else _allowed(definition)
+    if error.rule == "pattern" and not _CODE.fullmatch(wanted):
+        return what, str(definition.get("description", f"the pattern is {wanted}"))
+    if error.rule == "type" and wanted == "string":
+        return what, "give a text, in quotes"
+    if error.rule in ("type", "enum", "const", "pattern", "anyOf", "oneOf") or "imum" in error.rule:
+        return what, _allowed(definition)
+    if error.rule in ("minLength", "maxLength"):
+        return what, f"give a text of {definition.get('minLength', 0)} to {definition.get('maxLength', 2000)} letters"
+    rule = error.message.split(" ", 1)[1] if " " in error.message else error.message
+    return f"{where} {rule} (found {_shown(error.value)})", "give what it may hold"
+
+
+def _allowed(definition: Mapping[str, Any]) -> str:
+    """What a definition allows, such as "give a number above 0"."""
+    for several in ("anyOf", "oneOf"):
+        if several in definition:
+            return f"give {' or '.join(_allowed(one).removeprefix('give ') for one in definition[several])}"
+    if "const" in definition:
+        return f"give {definition['const']!r}"
+    if "enum" in definition:
+        return f"give one of {', '.join('null' if one is None else str(one) for one in definition['enum'])}"
+    if found := _CODE.fullmatch(definition.get("pattern", "")):
+        return f"give up to {found[1]} letters from A to Z and a to z, digits, _ and -"
+    kinds = definition.get("type", ())
+    return f"give {' or '.join(_kind(kind, definition) for kind in ([kinds] if isinstance(kinds, str) else kinds))}"
+
+
+def _kind(kind: str, definition: Mapping[str, Any]) -> str:
+    if kind not in ("number", "integer"):
+        return _KINDS[kind]
+    words = _KINDS[kind]
+    if "exclusiveMinimum" in definition:
+        words += f" above {definition['exclusiveMinimum']:g}"
+    if "minimum" in definition:
+        words += f" from {definition['minimum']:g}" + ("" if "maximum" in definition else " on")
+    if "maximum" in definition:
+        words += f" {'to' if 'minimum' in definition else 'up to'} {definition['maximum']:g}"
+    return words + (f" below {definition['exclusiveMaximum']:g}" if "exclusiveMaximum" in definition else "")
+
+
+def _unknown_key(error: Any, where: str) -> tuple[str, str]:
+    """The first key that a table may not have, with the one that was probably meant."""
+    known, rule = tuple(error.definition.get("properties", ())), error.rule_definition
+    if error.rule == "additionalProperties":
+        name = next(one for one in error.value if one not in known)
+        return f"{where}{name} is not known", meant(name, known) if known else "leave it out"
+    refused, pattern = rule.get("not", {}).get("enum", ()), rule.get("pattern", "")
+    name = next(one for one in error.value if one in refused or not re.search(pattern, one))
+    if name in refused:
+        return f"{where}{name} may not be given", "leave it out: nothing here may identify a person"
+    near = meant(name, known) if known else ""
+    return f"{where}{_shown(name)} is not known", near if near.startswith(
+        "did"
+    ) else "keys are of small letters, digits and _"
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _check_kind(document: object, schema_name: str, *, path: Path) -> None:

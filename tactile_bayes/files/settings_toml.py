@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.documents import load_toml
 from tactile_bayes.files.schema import check_document, load_schema
 
@@ -26,7 +26,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     known = load_schema(SCHEMA)["properties"]
     unknown = sorted(set(document) - set(known))
     if unknown:
-        raise BadDataError(f"unknown key {unknown[0]}", way_out=f"the keys are {', '.join(known)}", path=str(path))
+        raise BadDataError(f"unknown key {unknown[0]}", way_out=meant(unknown[0], known), path=str(path))
     check_document(dict(document), SCHEMA, path=path)  # it fills in defaults
     prior = {name: float(document.pop(name)) for name in PRIORS if name in document}
     found: dict[str, Any] = {name: float(value) if name in _NUMBERS else value for name, value in document.items()}

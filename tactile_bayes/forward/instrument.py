@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from tactile_bayes.geometry import (
     quaternion_from_rotation,
 )
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
+from tactile_bayes.records import dataclass
 from tactile_bayes.scan import (
     CountArray,
     ElementCalibration,

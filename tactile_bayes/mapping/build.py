@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import BadDataError, UsageError, check_choice, check_number
 from tactile_bayes.geometry import FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.accumulate import Accumulated, accumulate
@@ -98,8 +98,8 @@ def build_map(
     rest by their mean, (iii) project and average. All sums are over whole numbers: the order of frames and scans does
     not change a bit of the map.
     """
+    _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms, plane_radius_mm, max_pose_gap_ms, every)
     parts = [every_nth(scan, every) for scan in ([scans] if isinstance(scans, Scan) else scans)]
-    _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms, plane_radius_mm)
     if latency_ms == "auto" and register_strokes:
         raise UsageError(
             "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
@@ -218,19 +218,25 @@ def _check_options(
     normalise: str,
     latency_ms: float | str,
     plane_radius_mm: float | str | None,
+    max_pose_gap_ms: float,
+    every: int,
 ) -> None:
-    if not (np.isfinite(cell_mm) and cell_mm > 0):
-        raise BadDataError(f"cell_mm is {cell_mm}", way_out="it must be positive, in mm")
-    if not (np.isfinite(window).all() and 0 <= window[0] < window[1]):
-        raise BadDataError(f"pressure_window_kpa is {window}", way_out="give two rising pressures, in kPa")
-    if normalise not in NORMALISE:
-        raise BadDataError(f"normalise is {normalise!r}", way_out=f"choose one of {', '.join(NORMALISE)}")
+    check_number("cell_mm", cell_mm, 0.01, 50)
+    if isinstance(window, str) or np.shape(window) != (2,):
+        raise UsageError(f"pressure_window_kpa is {window!r}; give two rising pressures, in kPa")
+    for end in window:
+        check_number("an end of pressure_window_kpa", end, 0)
+    if not window[0] < window[1]:
+        raise UsageError(f"pressure_window_kpa is {window}; give two rising pressures, in kPa")
+    check_choice("normalise", normalise, NORMALISE)
     if normalise != "none" and not window[0] > 0:
-        raise BadDataError(f"pressure_window_kpa starts at {window[0]:g}", way_out="frames are divided by their mean")
-    if latency_ms != "auto" and (isinstance(latency_ms, str) or not np.isfinite(latency_ms)):
-        raise BadDataError(f"latency_ms is {latency_ms}", way_out="give a finite time in ms, or auto")
-    if plane_radius_mm not in (None, "auto") and (isinstance(plane_radius_mm, str) or not 0 < plane_radius_mm < np.inf):
-        raise BadDataError(f"plane_radius_mm is {plane_radius_mm}", way_out="give a distance above 0 mm, auto or all")
+        raise UsageError("pressure_window_kpa starts at 0; frames are divided by their mean, give more")
+    if latency_ms != "auto":
+        check_number("latency_ms", latency_ms, -10_000, 10_000)
+    if plane_radius_mm not in (None, "auto"):
+        check_number("plane_radius_mm", plane_radius_mm, 0, open_ends=True)
+    check_number("max_pose_gap_ms", max_pose_gap_ms, 0, open_ends=True)
+    check_number("every", every, 1, whole=True)
 
 
 def _as_map(

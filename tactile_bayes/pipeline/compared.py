@@ -71,7 +71,7 @@ def compare_answers(
     from tactile_bayes.report.compare_document import compare_document
 
     if len(visits) < 2 or not all(visits):
-        raise UsageError("a comparison needs two visits of at least one map each: compare VISIT1.nc --with VISIT2.nc")
+        raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
     comparing.check_visits(len(visits))
     if settings.calibration == "none":
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")

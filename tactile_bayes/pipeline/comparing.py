@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import date
 
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.records import dataclass
 
@@ -41,10 +41,10 @@ class Comparing:
 
     def __post_init__(self) -> None:
         for share in self.grown_by:
-            if not share > -1.0:
-                raise UsageError(f"a growth of {100 * share:g} % leaves nothing; give more than -100")
-        if not self.registration_mm > 0:
-            raise UsageError(f"the registration's SD is {self.registration_mm:g} mm; give more than 0")
+            check_number("a share of grown_by", share, -1, 10, open_ends=True)
+        for day in self.days or ():
+            check_number("a day of days", day)
+        check_number("registration_mm", self.registration_mm, 0, open_ends=True)
 
     def check_visits(self, visits: int) -> None:
         """Refuse days that are no times of so many visits.
@@ -75,7 +75,7 @@ def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple
         raise UsageError("days and dates both say when the visits were; give one of them")
     if dates is not None:
         return days_of_dates(dates)
-    return None if days is None else (0.0, *map(float, days))
+    return None if days is None else (0.0, *days)
 
 
 def days_of_dates(dates: Sequence[str]) -> tuple[float, ...]:
@@ -89,7 +89,7 @@ def days_of_dates(dates: Sequence[str]) -> tuple[float, ...]:
     found = []
     for text in dates:
         try:
-            found.append(date.fromisoformat(text.strip()))
+            found.append(date.fromisoformat(str(text).strip()))
         except ValueError:
-            raise UsageError(f"{text.strip()!r} is no date; give year-month-day, such as 2026-03-01") from None
+            raise UsageError(f"{str(text).strip()!r} is no date; give year-month-day, such as 2026-03-01") from None
     return tuple(float((one - found[0]).days) for one in found)

@@ -47,11 +47,13 @@ class Given:
     def __post_init__(self) -> None:
         for option, longest in _LONGEST.items():
             value = getattr(self, option)
+            if not isinstance(value, str):
+                raise UsageError(f"{option} is {value!r}; give a text")
             if not value.isprintable() or len(value) > longest:
                 what = f"{option} is of {len(value)} letters or not printable"
                 raise UsageError(f"{what}; give up to {longest} letters")
-        if self.day and not _is_date(self.day):
-            raise UsageError(f"date {self.day[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
+        if self.day and not _is_date(str(self.day)):
+            raise UsageError(f"date {str(self.day)[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
 
 
 def _is_date(text: str) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError, UsageError
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError
 from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import FIT_RADIUS_MM
@@ -347,11 +347,6 @@ def size_priors(settings: Settings) -> SizePriors:
     from tactile_bayes.size.between_maps import BetweenMaps
     from tactile_bayes.size.pooling import SizePriors
 
-    for name, value in settings.known:
-        if value < 0 or (value == 0 and name != "seat"):
-            raise UsageError(
-                f"--known {name} is {value:g}; it must {'not be below' if name == 'seat' else 'be above'} 0"
-            )
     fixed, learned = settings.between_map_sd, settings.repeatability
     if learned is None and fixed is None:
         return SizePriors(known=dict(settings.known))

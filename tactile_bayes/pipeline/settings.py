@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, get_args
 
-from tactile_bayes.errors import UsageError, check_choice
-from tactile_bayes.presets import INTERVAL, METHODS, NOISE, SCENES, Background, Method, Noise, Rotation, SceneAsked
+from tactile_bayes.errors import UsageError, check_choice, check_number, meant
+from tactile_bayes.presets import (
+    INTERVAL,
+    METHODS,
+    MOST_FIELD_COSINES,
+    NOISE,
+    SCENES,
+    Background,
+    Method,
+    Noise,
+    Rotation,
+    SceneAsked,
+)
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
@@ -36,6 +47,27 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "background": get_args(Background),
     "rotation": get_args(Rotation),
 }
+
+
+_RANGES: Final[Mapping[str, tuple[float, float | None, str]]] = {
+    "seed": (0, None, "whole"),
+    "interval": (0, 1, "open"),
+    "fit_radius_mm": (0, None, "open"),
+    "max_steps": (150, None, "whole"),
+    "accuracy_sd": (0.001, 0.5, ""),
+    "between_map_sd": (0, 2, ""),
+    "accuracy_mm": (0.0001, 10, ""),
+    "field_cosines": (6, MOST_FIELD_COSINES, "whole"),
+}
+"""Ranges of settings, as `settings.schema.json` and the command line have them; open: without the ends."""
+_MOST_PRIOR: Final[Mapping[str, float]] = {
+    "amplitude_sd": 1000,
+    "width_median_mm": 100,
+    "log_width_sd": 10,
+    "log_ratio_sd": 5,
+    "tilt_sd": 1000,
+}
+"""Largest value of each field of `BumpPrior`; all are above 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,19 +133,37 @@ class Settings:
             value = getattr(self, name)
             if value is not None or name not in ("background", "noise"):
                 check_choice(name, value, choices)
-        if not 0.0 < self.interval < 1.0:
-            raise UsageError(f"interval is {self.interval:g}; give a probability between 0 and 1")
+        for name, (least, most, how) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None or name in ("seed", "interval"):
+                check_number(name, value, least, most, whole=how == "whole", open_ends=how == "open")
+        for part in () if self.centre_mm is None else _pair("centre_mm", self.centre_mm):
+            check_number("a coordinate of centre_mm", part)
+        for name, value in self.known:
+            check_number(f"known {name}", value)
+        _check_prior(self.prior or {})
         if self.between_map_sd is not None and self.repeatability is not None:
             raise UsageError("between_map_sd states the spread that the repeatability has learned; give one of them")
         if self.repeatability is not None and self.calibration == "none":
             raise UsageError("a repeatability is for sizes; leave it out, or name a size calibration")
-        if self.seed < 0:
-            raise UsageError(f"seed is {self.seed}; give a whole number from 0 on")
 
     @property
     def calibration_name(self) -> str | None:
         """The calibration's name or path; None where none was named."""
         return self.calibration if self.calibration is None or isinstance(self.calibration, str) else GIVEN
+
+
+def _pair(name: str, value: object) -> tuple[object, object]:
+    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
+        raise UsageError(f"{name} is {value!r}; give two numbers")
+    return value[0], value[1]
+
+
+def _check_prior(prior: Mapping[str, float]) -> None:
+    for name, value in prior.items():
+        if name not in _MOST_PRIOR:
+            raise UsageError(f"no prior is called {name!r}; {meant(str(name), _MOST_PRIOR)}")
+        check_number(f"prior {name}", value, 0, _MOST_PRIOR[name], open_ends=True)
 
 
 def refuse_checkpoint(settings: Settings) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from tactile_bayes.errors import check_choice, check_number
+from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.pipeline.trial_inputs import TrialInputs
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from tactile_bayes.trial.next_mass import NextMass
     from tactile_bayes.trial.summary import TrialReport
 
+IntervalMethod = Literal["corrected", "jackknife", "percentile", "bca"]
 SCHEMA = "tactile-bayes/validate/1"
 
 
@@ -20,12 +23,19 @@ SCHEMA = "tactile-bayes/validate/1"
 class TrialSettings:
     """Settings of the analysis; each is part of the provenance."""
 
-    intervals: Literal["corrected", "jackknife", "percentile", "bca"] = "corrected"
+    intervals: IntervalMethod = "corrected"
     resamples: int = 2000
     seed: int = 1999
     error_ratio: float = 1.0
     check_intervals: int = 0
     bayes: bool = False
+
+    def __post_init__(self) -> None:
+        check_choice("intervals", self.intervals, get_args(IntervalMethod))
+        check_number("resamples", self.resamples, 200, 100_000, whole=True)
+        check_number("seed", self.seed, 0, whole=True)
+        check_number("error_ratio", self.error_ratio, 1e-6, 1e6)
+        check_number("check_intervals", self.check_intervals, 0, whole=True)
 
 
 @dataclass(frozen=True, slots=True)

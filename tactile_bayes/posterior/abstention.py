@@ -61,7 +61,7 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
         reach = " and ".join(
             f"{name} from {low:g} to {high:g} mm" for name, (low, high) in map_ends(tactile_map).items()
         )
-        place = f"--centre-mm {centre_mm[0]:g} {centre_mm[1]:g}"
+        place = f"centre_mm ({centre_mm[0]:g}, {centre_mm[1]:g})"
         raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
     return f"near ({centre_mm[0]:.1f}, {centre_mm[1]:.1f}) mm"
 

@@ -109,11 +109,11 @@ def check_options(options: EstimateOptions) -> None:
     """Refuse options that contradict each other or do not exist."""
     check_choice("method", options.method, METHODS)
     if not options.fit.correlated:
-        asked = {"scene": options.scene not in ("auto", "none"), "accuracy in mm": options.accuracy_mm is not None}
-        asked |= {"checkpoint": options.store is not None}
+        asked = {"a scene": options.scene not in ("auto", "none"), "an accuracy in mm": options.accuracy_mm is not None}
+        asked |= {"a checkpoint": options.store is not None}
         for name, given in asked.items():
             if given:
-                raise UsageError(f'a {name} needs correlated errors; give noise = "field" in --settings FILE.toml')
+                raise UsageError(f'{name} needs correlated errors; give noise = "field" in --settings FILE.toml')
         return
     if options.store is not None and options.method != "ensemble":
         raise UsageError("only the ensemble has checkpoints; give --method ensemble")

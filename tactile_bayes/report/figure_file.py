@@ -33,7 +33,9 @@ def check_suffix(path: Path) -> None:
     """
     if path.suffix.lower() not in FORMATS:
         known = ", ".join(FORMATS)
-        raise UsageError(f"{path} has the suffix {path.suffix or 'none'!r}; a figure is written as one of {known}")
+        if not path.suffix:
+            raise UsageError(f"{path} does not say which kind of figure it is; name it {path}.png ({known})")
+        raise UsageError(f"{path} has the suffix {path.suffix!r}; a figure is written as one of {known}")
 
 
 @contextmanager

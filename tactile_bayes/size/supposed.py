@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import UsageError, check_number, meant
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.normal import normal_score, skewed_score
 from tactile_bayes.records import dataclass
@@ -163,9 +163,10 @@ def known_body(
         skewness = none if hidden is None else hidden.skewness_left({}, none + 1.0)
         return BodyLeft(none, own_sd**2, skewness)
     names = () if hidden is None else hidden.names
-    for name in known:
+    for name, value in known.items():
         if name not in names:
-            raise UsageError(f"the calibration has no property {name}; it has {', '.join(names) or 'none'}")
+            raise UsageError(f"the calibration has no property {name}; {meant(name, names or ('none',))}")
+        check_number(f"known {name}", value, 0, open_ends=name != "seat")
     assert hidden is not None
     expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
     explained_sd = np.minimum(own_sd, hidden.most_sd)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
+from tactile_bayes.records import dataclass
 from tactile_bayes.trial import accuracy, origin_line, replicates, spread
 from tactile_bayes.trial.bootstrap import SEED
 from tactile_bayes.trial.calibration import Calibration, Prediction, calibration, log_normal, predictions

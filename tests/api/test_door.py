@@ -124,7 +124,7 @@ def test_a_result_has_its_draws_in_every_form(found: tb.SizeEstimate, tmp_path: 
         assert draw().axes
         draw(tmp_path / f"{draw.__name__}.svg")
         assert (tmp_path / f"{draw.__name__}.svg").stat().st_size > 1000
-    with pytest.raises(ValueError, match="it must lie between 0 and 1"):
+    with pytest.raises(UsageError, match="is 95; give a number above 0 and below 1"):
         size.interval(95)
 
 
@@ -172,7 +172,11 @@ BAD: dict[str, tuple[Any, type[Exception], str]] = {
     "a scan for a map": (lambda _: tb.read_map(DEMO / "scan.mcap"), BadDataError, "map"),
     "a map for a scan": (lambda f: tb.build_map(f / "map.nc"), BadDataError, "map.nc"),
     "an array": (lambda _: tb.estimate(np.zeros((3, 3))), UsageError, "a map is wanted, not ndarray"),
-    "an unknown setting": (lambda f: tb.estimate(f / "map.nc", metod="laplace"), TypeError, "no setting 'metod'"),
+    "an unknown setting": (
+        lambda f: tb.estimate(f / "map.nc", metod="laplace"),
+        TypeError,
+        "no keyword 'metod'; did you mean method",
+    ),
     "settings that contradict": (
         lambda f: tb.estimate(f / "map.nc", noise="independent", scene="round", size_calibration="none"),
         UsageError,
@@ -191,11 +195,15 @@ BAD: dict[str, tuple[Any, type[Exception], str]] = {
         BadDataError,
         r"table \(DataFrame\): line 2",
     ),
-    "a form that is none": (lambda _: tb.calibrate_size(DEMO / "phantoms.csv", form="eq7"), TypeError, "eq7"),
+    "a form that is none": (
+        lambda _: tb.calibrate_size(DEMO / "phantoms.csv", form="eq7"),
+        UsageError,
+        "give one of eq6",
+    ),
     "an option of no recording": (
         lambda f: tb.record(f / "s.mcap", head="/dev/nothing", duration_s=1, sid="left"),
         TypeError,
-        "no option 'sid'",
+        "no keyword 'sid'; did you mean side",
     ),
     **{
         f"no such {name}": (

@@ -252,7 +252,7 @@ def test_not_converged_is_exit_5_with_advice(folder: Path) -> None:
         (["a.nc", "-o", "a.nc", "--force"], 2, "is an input"),
         (["a.nc", "-o", "x", "--figure", "x"], 2, "two outputs of this command"),
         (["none.nc", "--figure", "f.jpg"], 2, "f.jpg has the suffix '.jpg'; a figure is written as one of .png, .pdf"),
-        (["none.nc", "--map-figure", "f"], 2, "has the suffix 'none'"),
+        (["none.nc", "--map-figure", "f"], 2, "does not say which kind of figure it is; name it f.png"),
         (["a.nc", "-o", "no/p.nc"], 2, "not a directory"),
         (["a.nc", "--interval", "1"], 2, "--interval"),
         (["a.nc", "--fit-radius-mm", "9"], 2, "--fit-radius-mm has moved; give fit_radius_mm in --settings FILE.toml"),
@@ -360,9 +360,9 @@ def test_options_that_do_not_go_together_are_refused(
     ("words", "message"),
     [
         (("--centre-mm", 300, 2), "off the map, which has x from"),
-        (("--centre-mm", "nan", 2), "not a finite number"),
-        (("--interval", "nan"), "not a finite number"),
-        (("--known", "depth_mm", "inf"), "not a finite number"),
+        (("--centre-mm", "nan", 2), "is not a number"),
+        (("--interval", "nan"), "is not a number"),
+        (("--known", "depth_mm", "inf"), "is not a number"),
     ],
 )
 def test_a_place_or_a_range_that_makes_no_sense_is_a_usage_error(

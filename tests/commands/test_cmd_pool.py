@@ -188,7 +188,7 @@ def test_a_known_seat_moves_the_size(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["mass1.nc", "--known", "weather", "1"], 2, "no property weather; it has depth_mm"),
+        (["mass1.nc", "--known", "weather", "1"], 2, "no property weather; known are depth_mm"),
         (["mass1.nc", "--known", "depth_mm", "0"], 2, "depth_mm is 0"),
         (["mass1.nc", "--known", "seat", "-1"], 2, "seat is -1"),
         (["mass1.nc", "mass2.nc", "--pool", "--size-calibration", "none"], 2, "--pool needs a size calibration"),

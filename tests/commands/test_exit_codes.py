@@ -69,7 +69,7 @@ def test_what_nohup_ignores_stays_ignored() -> None:
     [
         (
             ("plan", "--map-sd", "nan"),
-            "Invalid value for '--map-sd': 'nan' is not a finite number; see `tactile-bayes plan --help`",
+            "Invalid value for '--map-sd': 'nan' is not a number from 0 to 3; see `tactile-bayes plan --help`",
         ),
         (("calibrate", "size"), "Missing argument 'TABLE.csv'; see `tactile-bayes calibrate size --help`"),
         (("mapp",), "No such command 'mapp'. Did you mean 'map'?; see `tactile-bayes --help`"),

@@ -115,7 +115,10 @@ def test_the_dictionary_is_the_command_lines_alone_and_with_records(folder: Path
     [
         ({"to": "csv"}, "no file was given to export"),
         ({"files": "map.json", "to": "csv"}, "nowhere to write to"),
-        ({"files": "map.json", "path": "r.csv", "to": "fhir", "dictionary": "d.csv"}, "--dictionary is REDCap's"),
+        (
+            {"files": "map.json", "path": "r.csv", "to": "fhir", "dictionary": "d.csv"},
+            "give it with to=.csv.",
+        ),
         ({"files": "map.json", "path": "r.csv", "to": "csv", "dictionary": "./r.csv"}, "records and dictionary"),
         ({"path": "r.csv", "to": "csv", "dictionary": "d.csv"}, "no file was given to export to r.csv"),
         ({"files": "map.json", "path": "r.csv", "to": "csv", "dictionary": "old.csv"}, "old.csv exists"),

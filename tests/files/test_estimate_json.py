@@ -59,21 +59,27 @@ EDITS: dict[str, tuple[Edit, str]] = {
         both(lambda one: one["another_exam"]["max_size_mm"].update(low=99.0)),
         "another_exam.max_size_mm has low 99",
     ),
-    "a missing end": (both(lambda one: one["max_size_mm"].pop("low")), r"max_size_mm must contain \['low'\]"),
-    "words": (both(lambda one: one["max_size_mm"].update(median="15")), "max_size_mm.median must be number"),
+    "a missing end": (both(lambda one: one["max_size_mm"].pop("low")), "max_size_mm has no low; add it"),
+    "words": (both(lambda one: one["max_size_mm"].update(median="15")), "max_size_mm.median is '15'; give a number"),
     "one size alone": (both(lambda one: one.update(min_size_mm=None)), "max_size_mm and min_size_mm are not both"),
-    "no place": (lambda one: one.update(centre_mm={"x": None, "y": None}), "centre_mm.x must be object"),
+    "no place": (lambda one: one.update(centre_mm={"x": None, "y": None}), "centre_mm.x is None; give a table"),
     "no estimate": (lambda one: one.update(status="no_estimate"), "status is 'no_estimate', and there is a max_size"),
     "a mass twice": (lambda one: one["masses"].append(copy.deepcopy(one["masses"][0])), "masses are numbered 1, 1"),
     "two reported": (
         lambda one: one["masses"].append({**copy.deepcopy(one["masses"][0]), "number": 2}),
         "2 masses are the reported one",
     ),
-    "settings of nothing": (lambda one: one["provenance"].update(settings=None), "provenance.settings must be object"),
-    "inputs of nothing": (lambda one: one["provenance"].update(inputs=[None]), "provenance.inputs.0 must be object"),
+    "settings of nothing": (
+        lambda one: one["provenance"].update(settings=None),
+        "settings is None; give a table",
+    ),
+    "inputs of nothing": (
+        lambda one: one["provenance"].update(inputs=[None]),
+        "inputs.0 is None; give a table",
+    ),
     "cautions of letters": (
         lambda one: one["diagnostics"].update(broken_assumptions="abc"),
-        "broken_assumptions must be array",
+        "broken_assumptions is 'abc'; give a list",
     ),
 }
 

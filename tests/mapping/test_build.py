@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import apply, rigid
 from tactile_bayes.mapping import TactileMap, build_map
 from tactile_bayes.scan import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
@@ -311,17 +311,18 @@ def test_scans_without_a_map_are_refused_in_one_line(make, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"cell_mm": 0.0}, "cell_mm is 0.0; it must be positive"),
+        ({"cell_mm": 0.0}, "cell_mm is 0; give a number from 0.01 to 50"),
         ({"cell_mm": float("nan")}, "cell_mm is nan"),
-        ({"cell_mm": 1e-6}, "use larger cells"),
+        ({"cell_mm": "2"}, "cell_mm is '2'; give a number"),
+        ({"pressure_window_kpa": 5.0}, "two rising pressures"),
         ({"pressure_window_kpa": (14.0, 5.0)}, "two rising pressures"),
         ({"pressure_window_kpa": (0.0, 5.0)}, "divided by their mean"),
-        ({"normalise": "median"}, "choose one of mean, gain, none"),
-        ({"latency_ms": float("inf")}, "finite time in ms"),
+        ({"normalise": "median"}, "give one of mean, gain, none"),
+        ({"latency_ms": float("inf")}, "latency_ms is inf; give a number"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message):
-    with pytest.raises(BadDataError, match=message):
+    with pytest.raises(UsageError, match=message):
         build_map(stroke_scan(), **options)
 
 

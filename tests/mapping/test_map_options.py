@@ -8,7 +8,7 @@ import mapping_scans as scans
 import numpy as np
 import pytest
 
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.advice import advise_cell
 from tactile_bayes.mapping.timing import timing_figures
@@ -62,7 +62,7 @@ def test_the_plane_near_the_mass_follows_the_skin_there():
 
 @pytest.mark.parametrize("radius", [0.0, -3.0, float("nan"), float("inf"), "wide"])
 def test_a_radius_that_is_none_is_refused(radius):
-    with pytest.raises(BadDataError, match=r"plane_radius_mm is .*; give a distance above 0 mm, auto or all"):
+    with pytest.raises(UsageError, match=r"plane_radius_mm is .*; give a number above 0"):
         build_map(curved_strokes(), plane_radius_mm=radius)
 
 

@@ -1,0 +1,86 @@
+"""Arguments of the Python functions: their keywords, and errors in Python's words instead of the command line's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import wraps
+from typing import Any, Final, ParamSpec, TypeVar
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError, meant
+
+_Given = ParamSpec("_Given")
+_Returned = TypeVar("_Returned")
+_SETTINGS_FILE: Final = re.compile(r" in --settings FILE\.toml|--settings FILE\.toml ")
+_OPTION: Final = re.compile(r"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?: (-?[\d.]+|[a-z]+\d*(?:-[a-z]+)*))?")
+_CHOICES: Final = ("method", "normalise", "fidelity", "noise", "background", "scene", "form", "fit", "to")
+_FLAGS: Final = ("force", "same-mass", "register-strokes", "flat-field", "patient-id-from-scan", "invert-rotation")
+
+
+def in_keywords(text: str) -> str:
+    """A text with keywords in place of the command line's options; commands between backticks stay."""
+    parts = text.split("`")
+    for i in range(0, len(parts), 2):
+        parts[i] = _OPTION.sub(_keyword, _SETTINGS_FILE.sub("", parts[i]))
+    return "`".join(parts)
+
+
+def _keyword(found: re.Match[str]) -> str:
+    name, value = found[1].replace("-", "_"), found[2]
+    if found[1] in _FLAGS:
+        return f"{name}=True" + (f" {value}" if value else "")
+    if value is None:
+        return name
+    if value.lstrip("-")[0] in "0123456789.":
+        return f"{name}={value}"
+    return f'{name}="{value}"' if name in (*_CHOICES, "size_calibration") and value != "or" else f"{name} {value}"
+
+
+def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
+    """A public function whose errors name keywords, not options of the command line."""
+
+    @wraps(function)
+    def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
+        try:
+            return function(*args, **keywords)
+        except BadDataError as error:
+            error.what, error.way_out = in_keywords(error.what), in_keywords(error.way_out)
+            raise
+        except TactileBayesError as error:
+            error.args = (in_keywords(str(error)),)
+            raise
+
+    return called
+
+
+def check_keywords(function: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Refuse a keyword that a function does not have.
+
+    Raises
+    ------
+    TypeError
+        Naming it, and the one that was probably meant or all that there are.
+    """
+    for name in given:
+        if name not in known:
+            raise TypeError(f"{function} has no keyword {name!r}; {meant(name, known)}")
+
+
+def sequence_of(name: str, given: Any, what: str) -> Sequence[Any]:
+    """A list or other sequence as it is.
+
+    Raises
+    ------
+    UsageError
+        When it is a text, a number or anything else that is no sequence.
+    """
+    if isinstance(given, str | bytes) or not isinstance(given, Iterable):
+        raise UsageError(f"{name} is {given!r}; give a list of {what}")
+    return list(given)
+
+
+def plain(value: Any) -> Any:
+    """A number of numpy's as one of Python's, which files and reports hold; anything else as it is."""
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,203 @@
+"""Wrong arguments of every Python function are refused in one line of Python's words, and results print in short."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+
+import tactile_bayes as tb
+from tactile_bayes.api.arguments import in_keywords
+from tactile_bayes.errors import UsageError
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.files.settings_toml import SCHEMA
+from tactile_bayes.pipeline import settings
+
+DEMO = Path(tb.__file__).parent / "demo"
+FAST = {"method": "laplace"}
+
+
+@pytest.fixture(scope="module")
+def made() -> tb.Map:
+    return tb.demo_map()
+
+
+@pytest.fixture(scope="module")
+def found(made: tb.Map) -> tb.SizeEstimate:
+    return tb.estimate(made, **FAST)
+
+
+TRIAL = pandas.DataFrame(
+    {
+        "patient": list("abcde"),
+        "mass": "1",
+        "modality": "tactile",
+        "replicate": 1,
+        "size_mm": range(10, 15),
+        "status": "detected",
+    }
+)
+EXCISION = pandas.DataFrame({"patient": list("abcde"), "mass": "1", "ex_vivo_mm": [11, 12, 14, 13, 15]})
+
+SETTINGS: dict[str, tuple[Any, str]] = {
+    "known of words": ({"known": {"seat": "centred"}}, "known seat is 'centred'; give a number"),
+    "known below zero": ({"known": {"seat": -1}}, "known seat is -1; give a number from 0 on"),
+    "known nothing of": ({"known": {"sea": 1.0}}, "no property sea; did you mean seat"),
+    "known NaN": ({"known": {"seat": float("nan")}}, "known seat is nan"),
+    "known a text": ({"known": "seat 1"}, "known is 'seat 1'; give a mapping"),
+    "known a number": ({"known": 3}, "known is 3; give a mapping"),
+    "an interval in percent": ({"interval": 95}, "interval is 95; give a number above 0 and below 1"),
+    "an interval as text": ({"interval": "0.95"}, "interval is '0.95'"),
+    "a seed as text": ({"seed": "1"}, "seed is '1'; give a whole number from 0 on"),
+    "a broken seed": ({"seed": 1.5}, "seed is 1.5"),
+    "no seed": ({"seed": None}, "seed is None"),
+    "true as a seed": ({"seed": True}, "seed is True"),
+    "half a place": ({"centre_mm": (1,)}, "centre_mm is .1,.; give two numbers"),
+    "a place as text": ({"centre_mm": "0,0"}, "centre_mm is '0,0'"),
+    "a place of NaN": ({"centre_mm": (float("nan"), 0)}, "centre_mm is nan"),
+    "a place off the map": ({"centre_mm": (900.0, 0.0)}, "^centre_mm .900, 0. lies off the map"),
+    "a radius of nothing": ({"fit_radius_mm": 0}, "fit_radius_mm is 0; give a number above 0"),
+    "an accuracy below 0": ({"accuracy_sd": -1}, "accuracy_sd is -1; give a number from 0.001 to 0.5"),
+    "a prior of another name": ({"prior": {"amplitud_sd": 1.0}}, "did you mean amplitude_sd"),
+    "a prior as text": ({"prior": {"amplitude_sd": "2"}}, "prior amplitude_sd is '2'; give a number above 0"),
+    "a prior that is none": ({"prior": 2.0}, "prior is 2.0; give a mapping"),
+    "cosines as text": ({"field_cosines": "8"}, "field_cosines is '8'; give a whole number from 6 to 40"),
+    "a calibration that is none": ({"size_calibration": 3}, "a path is wanted, not int"),
+    "a repeatability that is none": ({"repeatability": 3}, "a path is wanted, not int"),
+    "a checkpoint of no chain": ({"checkpoint": "c.npz"}, 'give method="ensemble"$'),
+    "an accuracy of white noise": ({"noise": "independent", "accuracy_mm": 0.1}, 'needs .*give noise = "field"$'),
+}
+
+
+@pytest.mark.parametrize("case", SETTINGS)
+def test_a_setting_that_cannot_be_one_is_refused_with_what_can(made: tb.Map, case: str) -> None:
+    given, words = SETTINGS[case]
+    with pytest.raises(UsageError, match=words) as caught:
+        tb.estimate(made, **{**FAST, **given})
+    assert "--" not in str(caught.value)
+
+
+CALLS: dict[str, tuple[Callable[..., Any], str]] = {
+    "a scan twice": (lambda _: tb.build_map([tb.demo_scan(), tb.demo_scan()]), "scan 2 is the recording of scan 1"),
+    "a scan and its file": (lambda _: tb.build_map([DEMO / "scan.mcap", tb.demo_scan()]), "would count twice"),
+    "a cell as text": (lambda _: tb.build_map(tb.demo_scan(), cell_mm="2"), "cell_mm is '2'; give a number"),
+    "one end of a window": (lambda _: tb.build_map(tb.demo_scan(), pressure_window_kpa=5), "two rising pressures"),
+    "an estimate to pool": (lambda one: tb.pool(one), "pool takes several maps; give a list"),
+    "nothing to pool": (lambda _: tb.pool(None), "maps is None; give a list"),  # type: ignore[arg-type]
+    "days as a number": (lambda one: tb.compare(one, one, days=3), "days is 3; give a list"),  # type: ignore[arg-type]
+    "dates as a text": (lambda one: tb.compare(one, one, dates="2026-01-01"), "dates is '2026-01-01'; give a list"),
+    "growth as a number": (lambda one: tb.compare(one, one, grown_by=0.2), "grown_by is 0.2"),  # type: ignore[arg-type]
+    "growth in percent": (lambda one: tb.compare(one, one, grown_by=[20]), "grown_by is 20; give a number above -1"),
+    "a shift as text": (lambda one: tb.compare(one, one, registration_mm="5"), "registration_mm is '5'"),  # type: ignore[arg-type]
+    "a title of no text": (lambda one: one.report("x.html", title=3), "title is 3; give a text"),
+    "a day of no text": (lambda one: one.report("x.html", day=3), "'3' is no date"),
+    "nothing to report": (lambda _: tb.exam_report(None, "x.html"), "files is None; give a list"),
+    "nothing to export": (lambda _: tb.export(None, "x.json", to="fhir"), "files is None; give a list"),
+    "an ID of no text": (lambda one: tb.export(one, "x.json", to="fhir", patient_id=3), "patient_id is 3"),  # type: ignore[arg-type]
+    "an exam of no date": (lambda one: tb.export(one, "x", to="dicom"), "give study_date YYYY-MM-DD"),
+    "no trial": (lambda _: tb.validate(None, None), "trial is None; give the path"),  # type: ignore[arg-type]
+    "resamples as text": (lambda _: tb.validate(TRIAL, EXCISION, resamples="500"), "resamples is '500'"),
+    "an interval of no kind": (lambda _: tb.validate(TRIAL, EXCISION, intervals="exact"), "give one of corrected"),
+    "an error ratio below 0": (lambda _: tb.validate(TRIAL, EXCISION, error_ratio=-1), "error_ratio is -1"),
+    "no table": (lambda _: tb.calibrate_size(None), "table is None"),  # type: ignore[arg-type]
+    "a fit of no kind": (lambda _: tb.calibrate_size("t.csv", fit="x"), "fit is 'x'; give one of joint, two-stage"),
+    "no folder": (lambda _: tb.calibrate_repeatability(None), "folder is None"),  # type: ignore[arg-type]
+    "no scene": (lambda _: tb.simulate(None), "scene is None"),  # type: ignore[arg-type]
+    "a scene's seed as text": (lambda _: tb.simulate(DEMO / "scene.toml", seed="1"), "seed is '1'"),  # type: ignore[arg-type]
+    "a duration as text": (lambda _: tb.record("x", head="y", duration_s="1"), "duration_s is '1'"),  # type: ignore[arg-type]
+    "a broken step": (lambda _: tb.record("x", head="y", duration_s=1, every=1.5), "every is 1.5; give a whole number"),
+    "a protocol of no kind": (
+        lambda _: tb.record("x", head="y", duration_s=1, tracker_protocol="z"),
+        "tracker_protocol is 'z': .*is not one of",
+    ),
+    "an interval of draws": (lambda one: one.max_size_mm.interval(95), "is 95; give a number above 0 and below 1"),
+    "a file that exists": (lambda one: one.save(__file__), "give force=True"),
+}
+
+
+@pytest.mark.parametrize("case", CALLS)
+def test_an_argument_that_cannot_be_one_is_refused_with_what_can(
+    found: tb.SizeEstimate, case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    act, words = CALLS[case]
+    with pytest.raises(UsageError, match=words) as caught:
+        act(found)
+    assert "--" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: tb.build_map(tb.demo_scan(), cel_mm=2), "cell_mm"),
+        (lambda: tb.estimate(tb.demo_map(), calibration="eq6"), "size_calibration"),
+        (lambda: tb.validate(TRIAL, EXCISION, resample=500), "resamples"),
+        (lambda: tb.export(DEMO, "x", to="fhir", patientid="1"), "patient_id"),
+        (lambda: tb.calibrate_size(TRIAL, normalize="mean"), "normalise"),
+    ],
+)
+def test_a_keyword_that_is_none_is_answered_with_the_one_meant(call: Callable[[], object], name: str) -> None:
+    with pytest.raises(TypeError, match=f"did you mean {name}"):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("told", "wanted"),
+    [
+        ("map again with --cell-mm 0.5 or press lightly", "map again with cell_mm=0.5 or press lightly"),
+        ("x exists; choose another name or give --force", "x exists; choose another name or give force=True"),
+        ("leave --head out, or choose another --fidelity", "leave head out, or choose another fidelity"),
+        ("try --method ensemble", 'try method="ensemble"'),
+        ("a larger max_steps in --settings FILE.toml", "a larger max_steps"),
+        ("make it again: `tactile-bayes estimate m.nc --json`", "make it again: `tactile-bayes estimate m.nc --json`"),
+    ],
+)
+def test_options_become_keywords_and_commands_stay(told: str, wanted: str) -> None:
+    assert in_keywords(told) == wanted
+
+
+def test_numbers_of_numpy_are_taken_as_numbers(made: tb.Map) -> None:
+    of_numpy = tb.estimate(made, seed=np.int64(3), interval=np.float64(0.9), known={"seat": np.float32(1.0)}, **FAST)
+    plain = tb.estimate(made, seed=3, interval=0.9, known={"seat": 1.0}, **FAST)
+    assert of_numpy.answer.document == plain.answer.document
+
+
+def test_the_ranges_are_those_of_the_settings_file() -> None:
+    rules = load_schema(SCHEMA)["properties"]
+    for name in set(rules) & set(settings._RANGES) - {"field_cosines"}:
+        least, most, how = settings._RANGES[name]
+        assert rules[name].get("exclusiveMinimum" if how == "open" else "minimum") == least
+        assert rules[name].get("maximum") == most
+    for name, most in settings._MOST_PRIOR.items():
+        assert (rules[name]["exclusiveMinimum"], rules[name]["maximum"]) == (0, most)
+
+
+def _public(value: Any, depth: int = 5) -> Iterator[Any]:
+    """What a notebook can reach from a result."""
+    if depth and type(value).__module__.startswith("tactile_bayes"):
+        yield value
+        for name in dir(value):
+            if not name.startswith("_") and not callable(getattr(type(value), name, None)):
+                yield from _public(getattr(value, name, None), depth - 1)
+    elif isinstance(value, tuple | list) and depth and value:
+        yield from _public(value[0], depth - 1)
+
+
+def test_nothing_that_a_result_leads_to_prints_an_array(found: tb.SizeEstimate, made: tb.Map) -> None:
+    """`found.outcome` printed 589 lines, of a comparison 914."""
+    scan = tb.simulate(DEMO / "scene.toml", seed=2)
+    later = tb.build_map(scan)
+    several = tb.pool([found, later], **FAST), tb.compare(found, later, **FAST), tb.validate(TRIAL, EXCISION)
+    seen: dict[int, Any] = {}
+    for result in (found, scan, made, *several):
+        seen |= {id(one): one for one in _public(result)}
+    assert len(seen) > 60
+    for one in seen.values():
+        text = repr(one)
+        assert len(text) < 700, type(one)
+        assert "\n" not in text, type(one)
