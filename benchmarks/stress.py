@@ -24,7 +24,7 @@ from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.population import BodyPrior, draw_mass
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions, skewed
+from tactile_bayes.mapping.assumptions import broken_assumptions, skewed
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.pipeline.one_map import answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
@@ -205,13 +205,14 @@ def exam_of(kept: dict[str, Any]) -> Exam:
     document = document_of(kept["scan"])
     quality = document["quality"]
     diagnostics, true = document.get("diagnostics") or {}, kept["d_mm"]
+    kinds = {one.kind for one in broken_assumptions(quality)}
     spoken = {
-        "lag": any("opposite" in text for text in broken_assumptions(quality)),
-        "curved": any("skin of radius" in text for text in assumptions_to_check(quality)),
-        "uneven": any("profile changes" in text for text in assumptions_to_check(quality)),
-        "UNEVEN": any("profile changes" in text for text in broken_assumptions(quality)),
+        "lag": bool(kinds & {"late_poses", "lump_dragged"}),
+        "curved": "curved_skin" in kinds,
+        "uneven": "slightly_uneven_fat" in kinds,
+        "UNEVEN": "uneven_fat" in kinds,
         "skewed": bool(skewed(quality)),
-        "range": bool(diagnostics.get("outside_calibration")),
+        "range": any(one["kind"] == "outside_calibration" for one in document.get("findings") or ()),
         "no depth": diagnostics.get("fat_mm") is None,
     }
     flags = frozenset(name for name in FLAGS if spoken[name])

@@ -116,7 +116,7 @@ def main() -> None:
         names = [f"exam {i + 1}" for i in range(len(answers))]
         whole = pool_answers(answers, Settings(), names=names, inputs={}).document if answers else None
         size = Sized.of(d_mm, whole)
-        warned = any((one.document or {}).get("diagnostics", {}).get("broken_assumptions") for one in answers)
+        warned = any(finding.severity == "caution" for one in answers for finding in one.findings)
         words = "no size" if size is None else f"{size.median_mm:.1f} ({size.low_mm:.1f} to {size.high_mm:.1f})"
         print(f"{name:20} true {d_mm:5.1f}  {words}{'  CAUTION' if warned else ''}", flush=True)
         pooled += [] if size is None else [size]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Final, Literal
+from dataclasses import asdict, replace
+from typing import Final, Literal, get_args
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.records import dataclass
@@ -13,19 +13,48 @@ Severity = Literal["caution", "check"]
 Verdict = Literal["sound", "doubtful", "no_answer"]
 
 KINDS: Final[Mapping[str, Severity]] = {
-    # of a scan and its map
-    "uneven_fat": "caution",
-    "slightly_uneven_fat": "check",
+    # of a scan
+    "data_lost": "check",
+    "recorder_noted": "check",
+    "times_apart": "check",
+    # of a map
+    "wrong_rotations": "caution",
+    "rotations_unknown": "check",
+    "tilted_head": "check",
+    "turned_head": "check",
+    "saturated_readings": "check",
+    "clipped_values": "check",
+    "unsettled_gains": "check",
+    "low_coverage": "check",
     "lump_dragged": "caution",
     "late_poses": "caution",
+    "uneven_fat": "caution",
+    "slightly_uneven_fat": "check",
     "curved_skin": "check",
     "few_strokes": "check",
     # of a mass
     "side": "caution",
     "outside_calibration": "caution",
     "irregular": "check",
+    "coarse_cells": "check",
+    "uneven_level": "check",
+    "touching": "check",
+    # of several maps or visits
+    "another_mass": "caution",
+    "same_scan": "caution",
+    "fat_apart": "caution",
+    "outlying": "check",
+    "several_masses": "check",
+    "taken_as_one": "caution",
+    # of a campaign
+    "unnamed_mass": "check",
+    "own_axes": "check",
 }
 """Severity by kind. Caution: the result may be off by more than its interval. Check: look at it first."""
+SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
+LEADS: Final[Mapping[Severity, str]] = {"caution": "CAUTION: ", "check": "To check: "}
+"""How a line with a finding begins, in every output."""
+_WAY_OUT: Final = "give the file as this program wrote it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +92,17 @@ class Finding:
 
     def at(self, about: str) -> Finding:
         """The same finding, about one of several maps or visits."""
-        return replace(self, about=about)
+        return replace(self, about=f"{about}, {self.about}" if self.about else about)
 
     def sentence(self, *, paper: bool = False) -> str:
         """The finding with its remedy: for the command line, or for paper."""
         remedy = self.on_paper if paper else self.remedy
         subject = f"{self.about}: " if self.about else ""
         return f"{subject}{self.text}{f'; {remedy}' if remedy else ''}"
+
+    def as_dict(self) -> dict[str, str]:
+        """Plain data, as files have it."""
+        return {"severity": self.severity} | asdict(self)
 
 
 def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -83,3 +116,35 @@ def verdict(findings: Iterable[Finding], *, answered: bool) -> Verdict:
     if not answered:
         return "no_answer"
     return "doubtful" if any(one.severity == "caution" for one in findings) else "sound"
+
+
+def finding_lines(findings: Iterable[Finding], severity: Severity | None = None, *, paper: bool = False) -> list[str]:
+    """A line for each finding, cautions first; of one severity where it is given."""
+    shown = [one for one in by_weight(findings) if severity in (None, one.severity)]
+    return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in shown]
+
+
+def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int, paper: bool = False) -> list[str]:
+    """The first findings of one severity in one line that counts the others; empty without any."""
+    texts = [one.sentence(paper=paper) for one in by_weight(findings) if one.severity == severity]
+    more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
+    return [f"{LEADS[severity]}{'; '.join(texts[:most])}{more}."] if texts else []
+
+
+def findings_in(listed: object) -> tuple[Finding, ...]:
+    """Findings as `Finding.as_dict` wrote them into a file.
+
+    Raises
+    ------
+    BadDataError
+        When it is no list of findings, or one is of a kind that this version does not know.
+    """
+    names = ("kind", "text", "remedy", "on_paper", "about")
+    if not isinstance(listed, list):
+        raise BadDataError(f"findings are a {type(listed).__name__}", way_out=_WAY_OUT)
+    found = []
+    for one in listed:
+        if not isinstance(one, dict) or not all(isinstance(one.get(name), str) for name in names):
+            raise BadDataError(f"a finding is {str(one)[:60]!r}", way_out=_WAY_OUT)
+        found.append(Finding(*(one[name] for name in names)))
+    return tuple(found)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.records import dataclass
@@ -238,6 +239,8 @@ class Scan:
         None when they were not touched: the map then has no patient frame.
     session
         Plain text facts (device ids, side, posture...); no names.
+    findings
+        What its file had lost and what its recorder noted.
     """
 
     frames: PressureFrames
@@ -246,6 +249,7 @@ class Scan:
     element_calibration: ElementCalibration
     landmarks: Landmarks | None = None
     session: Mapping[str, str] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         taxels = self.frames.counts.shape[1:]

@@ -16,6 +16,7 @@ from tactile_bayes.api.estimates import SizeEstimate, estimated, of_one_mass, se
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.paths import PathLike, path_of
 from tactile_bayes.errors import UsageError
+from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.pipeline.compared import ComparedOutcome, compare_answers, drawn_maps
 from tactile_bayes.pipeline.comparing import GROWN_BY, Comparing, times_of
 from tactile_bayes.pipeline.settings import refuse_checkpoint
@@ -84,7 +85,17 @@ class Comparison:
         return None if change is None else change.probability_above(share)
 
     @property
-    def verdict(self) -> str | None:
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the comparison, cautions first."""
+        return self.outcome.compared.findings
+
+    @property
+    def verdict(self) -> Verdict:
+        """``"sound"``, ``"doubtful"`` where a caution stands, or ``"no_answer"`` where nothing is compared."""
+        return verdict(self.findings, answered=self._change is not None)
+
+    @property
+    def growth(self) -> str | None:
         """``"grown"``, ``"shrunk"`` or ``"no_change_shown"``; None where nothing is compared."""
         changes = self.document["changes"]
         return str(changes[-1]["verdict"]) if changes else None
@@ -118,8 +129,9 @@ class Comparison:
         return draw_comparison(self.outcome.compared, self.document, drawn, path_of(path), force=force)
 
     def __repr__(self) -> str:
-        words = f"not compared: {self.why}" if self.verdict is None else f"{self.change_percent}, {self.verdict}"
-        return f"<Comparison of {len(self.visits)} visits: {words}>"
+        cautions = finding_lines(self.findings, "caution", paper=True)
+        words = f"not compared: {self.why}" if self.growth is None else f"{self.change_percent}, {self.growth}"
+        return f"<Comparison {' '.join([*cautions, f'of {len(self.visits)} visits: {words}'])}>"
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"

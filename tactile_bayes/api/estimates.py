@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.paths import PathLike, output_path, path_of
 from tactile_bayes.api.sized import MassEstimate, SizedExam
 from tactile_bayes.errors import UsageError
+from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 
@@ -74,6 +75,16 @@ class SizeEstimate(SizedExam):
         """Posterior probability that the map shows a lump; None where nothing could be tested."""
         detection = self.outcome.estimate.detection
         return None if detection is None else detection.probability
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the answer, cautions first."""
+        return self.outcome.estimate.findings
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        yield from super()._rows()
+        if self.detected_probability is not None:
+            yield "probability of a lump", f"{self.detected_probability:.3f}"
 
     @property
     def amplitude(self) -> Draws | None:
@@ -151,7 +162,14 @@ class SizeEstimate(SizedExam):
         size = self.outcome.estimate.size
         if size is None:
             return self.plot_map(path, force=force)
-        return draw_size(size, path_of(path), name=self._titled, probability=self.probability, force=force)
+        return draw_size(
+            size,
+            path_of(path),
+            name=self._titled,
+            probability=self.probability,
+            findings=self.findings,
+            force=force,
+        )
 
     @door
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
@@ -226,6 +244,11 @@ class PooledSize(SizedExam):
         return "" if self._size is not None else self.outcome.pooled.reason
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the size, cautions first."""
+        return findings_in(self.document["findings"])
+
+    @property
     def document(self) -> dict[str, Any]:
         """What ``estimate --pool --json`` prints."""
         return self.outcome.document
@@ -245,7 +268,9 @@ class PooledSize(SizedExam):
         if size is None:
             raise UsageError(f"there is no size to draw: {self.why}")
         name = self.name or f"{len(self.maps)} maps pooled"
-        return draw_size(size, path_of(path), name=name, probability=self.probability, force=force)
+        return draw_size(
+            size, path_of(path), name=name, probability=self.probability, findings=self.findings, force=force
+        )
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:

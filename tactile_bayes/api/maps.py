@@ -14,6 +14,7 @@ import numpy as np
 from tactile_bayes.api.arguments import check_keywords, door, plain
 from tactile_bayes.api.paths import PathLike, output_path, path_of, required_path
 from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.findings import Finding
     from tactile_bayes.forward.instrument import SimulatedScan
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.mapping.tactile_map import TactileMap
@@ -39,21 +41,23 @@ class Map:
         Arrays, recipe and quality, see `tactile_bayes.mapping.TactileMap`.
     path
         The file that it was read from; None for a map that is in none.
-    notes
-        What the scans lost, or what else speaks against them.
     scans
         The scans that it was made from, as `Provenance.scans` has them.
     """
 
     tactile_map: TactileMap
     path: Path | None = None
-    notes: tuple[str, ...] = ()
     scans: tuple[dict[str, str], ...] = ()
 
     @property
     def mean(self) -> FloatArray:
         """(ny, nx) mean normalised pressure; NaN in cells without readings."""
         return np.where(self.tactile_map.covered, self.tactile_map.mean, np.nan)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against sizes from this map, cautions first."""
+        return self.tactile_map.findings
 
     @property
     def x_mm(self) -> FloatArray:
@@ -105,9 +109,8 @@ class Map:
         found = self.tactile_map
         ny, nx = found.mean.shape
         covered = int(found.covered.sum())
-        return (
-            f"<Map {nx} x {ny} cells of {found.recipe.cell_mm:g} mm, {covered} with data, {found.recipe.value_words}>"
-        )
+        cells = f"{nx} x {ny} cells of {found.recipe.cell_mm:g} mm, {covered} with data, {found.recipe.value_words}"
+        return f"<Map {' '.join([*finding_lines(found.findings, paper=True), cells])}>"
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(repr(self))}</p><p><small>{escape(RESEARCH_USE)}</small></p>"
@@ -163,19 +166,16 @@ def build_map(scans: Any, **options: Any) -> Map:
     """
     from tactile_bayes.files.provenance import repeated_scans, scan_facts
     from tactile_bayes.mapping import build_map as build
-    from tactile_bayes.pipeline.scans import exam_facts, load_scans
+    from tactile_bayes.pipeline.scans import exam_facts
 
     check_keywords("build_map", options, set(inspect.signature(build).parameters) - {"scans"})
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
     loaded: list[Scan] = []
-    notes: list[str] = []
     facts: list[dict[str, str]] = []
     for one in given:
         if isinstance(one, str | Path):
-            read, lost = load_scans([path_of(one)])
-            loaded += read
-            notes += lost
-            facts += exam_facts([path_of(one)], read)
+            loaded.append(read_scan(one))
+            facts += exam_facts([path_of(one)], loaded[-1:])
         else:
             scan = _scan_of(one)
             loaded.append(scan)
@@ -185,7 +185,7 @@ def build_map(scans: Any, **options: Any) -> Map:
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
         )
     made = build(loaded, **{name: plain(value) for name, value in options.items()})
-    return Map(made, notes=tuple(notes), scans=tuple(facts))
+    return Map(made, scans=tuple(facts))
 
 
 def _scan_of(given: Any) -> Scan:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,9 @@ from tactile_bayes.api.arguments import door
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.paths import PathLike
 from tactile_bayes.errors import UsageError
+from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.size_text import exams_label
 from tactile_bayes.size.posterior import SIZES
 
 if TYPE_CHECKING:
@@ -99,17 +102,37 @@ class Sized:
         """Arrays and notes of the groups besides ``posterior``."""
         return {}
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the size, cautions first."""
+        raise NotImplementedError
+
+    @property
+    def verdict(self) -> Verdict:
+        """``"sound"``, ``"doubtful"`` where a caution stands, or ``"no_answer"`` without a size."""
+        return verdict(self.findings, answered=self._size is not None)
+
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self._words()}>"
+        cautions = finding_lines(self.findings, "caution", paper=True)
+        return f"<{type(self).__name__} {' '.join([*cautions, self._words()])}>"
 
     def _words(self) -> str:
         return f"no size: {self.why}" if self.max_size_mm is None else f"largest size {self.max_size_mm}"
 
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        """Names and values of the notebook's table."""
+        sizes = (("largest size", self.max_size_mm), ("smallest size", self.min_size_mm))
+        yield from ((name, repr(draws)) for name, draws in sizes if draws is not None)
+        another = None if self._size is None else self._size.another_exam
+        if another is not None:
+            yield f"largest size {exams_label(another.figures['between_map_sd'])}", repr(self.max_size_another_exam_mm)
+
     def _repr_html_(self) -> str:
-        rows = [("largest size", self.max_size_mm), ("smallest size", self.min_size_mm)]
-        cells = [f"<tr><th>{name}</th><td>{escape(repr(draws))}</td></tr>" for name, draws in rows if draws is not None]
-        table = f"<table>{''.join(cells)}</table>" if cells else f"<p>No size: {escape(self.why)}</p>"
-        return f"{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
+        told = "".join(f"<p>{escape(line)}</p>" for line in finding_lines(self.findings, paper=True))
+        cells = [f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in self._rows()]
+        why = "" if self._size is not None else f"<p>No size: {escape(self.why)}</p>"
+        table = f"<table>{''.join(cells)}</table>" if cells else ""
+        return f"{told}{why}{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 class SizedExam(Sized):
@@ -164,6 +187,15 @@ class MassEstimate(Sized):
     def why(self) -> str:
         """Why there is no size; empty where there is one."""
         return self.reason
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against its size, cautions first."""
+        return self.mass.estimate.findings
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        yield from super()._rows()
+        yield "probability of a lump", f"{self.detected_probability:.3f}"
 
     @property
     def centre_mm(self) -> tuple[float, float]:

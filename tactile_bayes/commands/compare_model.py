@@ -68,10 +68,12 @@ def command(
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import hash_inputs
+    from tactile_bayes.files.scan_mcap import read_scan
     from tactile_bayes.files.scene_toml import read_scene
     from tactile_bayes.files.schema import dump_json
+    from tactile_bayes.findings import finding_lines
     from tactile_bayes.forward.plane.empirical import outside_range
-    from tactile_bayes.pipeline.scans import load_scans
+    from tactile_bayes.mapping.overlap import scan_findings
     from tactile_bayes.presets import RESEARCH_USE
     from tactile_bayes.report.model_figure import comparison_figure
     from tactile_bayes.report.model_text import comparison_document, comparison_text
@@ -80,11 +82,11 @@ def command(
     if figure is not None:
         refuse_existing(figure, force=force)
     body = read_scene(scene)
-    loaded, lost = load_scans([scan])
+    loaded = read_scan(scan)
     if at is None and not (body.solid_lumps or body.lumps):
         at = (0.0, 0.0)  # no lump to look for: the middle of the strokes
     measured = measured_frames(
-        loaded[0],
+        loaded,
         every=every,
         cell_mm=cell_mm,
         pressure_window_kpa=pressure_window_kpa,
@@ -105,7 +107,7 @@ def command(
             dump_json(comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))), nl=False
         )
         return
-    for line in lost:
+    for line in finding_lines(scan_findings(loaded)):
         click.echo(line, err=True)
     click.echo(comparison_text(measured, found))
     click.echo(RESEARCH_USE)

@@ -39,6 +39,7 @@ def command(
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.posterior_nc import read_posterior
     from tactile_bayes.files.schema import dump_json
+    from tactile_bayes.findings import finding_lines
 
     for path in (trace, rank, corner):
         if path is not None:
@@ -51,9 +52,10 @@ def command(
     _draw(found, posterior.stem, trace, rank, corner, force=force)
     if as_json:
         document = {"method": found.method, "chains": chains, "quantities": quantities, "research_use": RESEARCH_USE}
+        document["findings"] = [one.as_dict() for one in found.findings]
         click.echo(dump_json(document), nl=False)
         return
-    click.echo("\n".join([*_table(found, chains, quantities), RESEARCH_USE]))
+    click.echo("\n".join([*finding_lines(found.findings), *_table(found, chains, quantities), RESEARCH_USE]))
 
 
 def _figures(found: PosteriorDraws) -> dict[str, dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,8 +12,8 @@ from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 
 if TYPE_CHECKING:
     from tactile_bayes.pipeline.one_map import Answer
+    from tactile_bayes.pipeline.pooled import PooledOutcome
     from tactile_bayes.pipeline.settings import Settings
-    from tactile_bayes.size.pooling import PooledEstimate
 
 
 def estimate_pool(
@@ -52,31 +52,32 @@ def estimate_pool(
     text_of = dump_json if as_json else pooled_text if verbose else pooled_summary
     try:
         if found.pooled.size is not None:
-            _write(found.pooled, maps, settings, output, figure, provenance=found.provenance, force=force)
+            _write(found, maps, settings, output, figure, force=force)
     finally:  # what was computed is not lost with a file
         click.echo(text_of(found.document), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
 
 
 def _write(
-    pooled: PooledEstimate,
+    found: PooledOutcome,
     maps: tuple[Path, ...],
     settings: Settings,
     output: Path | None,
     figure: Path | None,
     *,
-    provenance: Any,
     force: bool,
 ) -> None:
-    size = pooled.size
+    size, provenance = found.pooled.size, found.provenance
     assert size is not None
     if output is not None:
         from tactile_bayes.files.posterior_nc import write_pooled
 
-        write_pooled(output, size, provenance=provenance, force=force)
+        write_pooled(output, size, provenance=provenance, document=found.document, force=force)
     if figure is not None:
+        from tactile_bayes.findings import findings_in
         from tactile_bayes.report.estimate_figures import draw_size
         from tactile_bayes.report.figure_title import named_exam
 
         name = named_exam(f"{len(maps)} maps pooled", provenance.scans)
-        draw_size(size, figure, name=name, probability=settings.interval, force=force)
+        findings = findings_in(found.document["findings"])
+        draw_size(size, figure, name=name, probability=settings.interval, findings=findings, force=force)

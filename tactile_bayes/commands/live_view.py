@@ -203,6 +203,7 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
     import numpy as np
 
     from tactile_bayes.errors import TactileBayesError
+    from tactile_bayes.findings import finding_summary
     from tactile_bayes.posterior.estimate import estimate_map
     from tactile_bayes.posterior.lump.cells import candidate_centres
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
@@ -231,9 +232,8 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
         return LiveAnswer(f"no estimate: {found.reason if found.code == 'extrapolated' else why}")
     lump = _in_base(tactile_map, found.map_posterior)
     if found.size is not None:
-        outside = found.diagnostics is not None and found.diagnostics.outside_calibration
-        caution = "CAUTION: outside the calibration's range: " if outside else ""
-        return LiveAnswer(caution + _interval("largest size", found.size.max_size_mm, INTERVAL), lump)
+        cautions = finding_summary(found.findings, "caution", most=1)
+        return LiveAnswer(" ".join([*cautions, _interval("largest size", found.size.max_size_mm, INTERVAL)]), lump)
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     return LiveAnswer(_interval("map width sigma", widths, INTERVAL), lump)
 

@@ -88,8 +88,9 @@ def command(
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import repeated_scans
+    from tactile_bayes.files.scan_mcap import read_scan
     from tactile_bayes.mapping import build_map
-    from tactile_bayes.pipeline.scans import load_scans, map_provenance
+    from tactile_bayes.pipeline.scans import map_provenance
     from tactile_bayes.report.map_text import map_text
 
     _check_paths(scans, output, figure, force=force)
@@ -104,7 +105,7 @@ def command(
         "every": every,
     }
     clock = _Clock(verbose)
-    loaded, lost = load_scans(scans)
+    loaded = [read_scan(path) for path in scans]
     provenance = map_provenance(scans, loaded, settings)
     for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():
         raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
@@ -133,7 +134,7 @@ def command(
             map_figure(tactile_map, figure, title=title, force=force)
         clock.tell("write")
     finally:  # the map is written, whatever becomes of the figure
-        click.echo(map_text(tactile_map, lost=lost), nl=False)
+        click.echo(map_text(tactile_map), nl=False)
 
 
 def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:

@@ -51,16 +51,16 @@ def command(
     from tactile_bayes.commands.tradeoff_options import forecast, show
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.pipeline.scans import load_scans
+    from tactile_bayes.files.scan_mcap import read_scan
     from tactile_bayes.pipeline.settings import Settings
     from tactile_bayes.pipeline.tradeoff import tradeoff_of_scan
     from tactile_bayes.studies.cost_ladder import Work
 
     if figure is not None:
         refuse_existing(figure, force=force)
-    load_scans([scan])  # imports and first calls cost nothing afterwards
+    read_scan(scan)  # imports and first calls cost nothing afterwards
     begun = time.process_time()
-    (loaded,), _ = load_scans([scan])
+    loaded = read_scan(scan)
     read_s = time.process_time() - begun
     with progress_bar("settings") as progress:
         work = Work(time.process_time, tolerance_mm, runs, forecast, progress)

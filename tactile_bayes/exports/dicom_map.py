@@ -12,6 +12,7 @@ from tactile_bayes.exports.exam import MapFile
 from tactile_bayes.exports.extras import required
 from tactile_bayes.exports.place import ImagePlane, image_plane, lps_from_plane
 from tactile_bayes.exports.uids import content_uid
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 
 PARAMETRIC_MAP: Final = "1.2.840.10008.5.1.4.1.1.30"
@@ -96,7 +97,8 @@ def _add_content(dataset: Any, source: MapFile) -> None:
     dataset.LossyImageCompression = "00"
     dataset.PresentationLUTShape = "IDENTITY"
     dataset.AcquisitionContextSequence = []
-    dataset.ImageComments = f"{RESEARCH_USE} SHA-256 of the map: {source.digest}"
+    told = [RESEARCH_USE, *finding_lines(source.tactile_map.findings, paper=True)]
+    dataset.ImageComments = f"{' '.join(told)} SHA-256 of the map: {source.digest}"
 
 
 def _add_dimension(dataset: Any, study: Study, source: MapFile) -> None:

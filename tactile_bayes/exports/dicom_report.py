@@ -13,7 +13,7 @@ from tactile_bayes.exports import codes
 from tactile_bayes.exports.codes import Code
 from tactile_bayes.exports.dicom_file import MANUFACTURER, MODEL, Study, add_study, coded, declare_scheme
 from tactile_bayes.exports.dicom_map import PARAMETRIC_MAP, frame_of_reference
-from tactile_bayes.exports.exam import EstimateFile, Finding, MapFile
+from tactile_bayes.exports.exam import EstimateFile, MapFile, SizedMass, verdict_words
 from tactile_bayes.exports.extras import required
 from tactile_bayes.exports.place import lps_from_plane, on_plane
 from tactile_bayes.exports.uids import content_uid
@@ -41,10 +41,10 @@ def structured_report(estimate: EstimateFile, maps: Sequence[MapFile], *, eviden
     report = sr.MeasurementReport(
         observation_context=_observer(),
         procedure_reported=coded(codes.EXAM),
-        imaging_measurements=[_group(estimate, one, maps, evidence) for one in estimate.findings],
+        imaging_measurements=[_group(estimate, one, maps, evidence) for one in estimate.masses],
         title=coded(codes.REPORT_TITLE),
     )
-    for text in (RESEARCH_USE, *(f"CAUTION: {text}" for text in estimate.cautions), *_sources(estimate)):
+    for text in (RESEARCH_USE, verdict_words(estimate), *estimate.lines, *_sources(estimate)):
         report[0].ContentSequence.append(_text(codes.COMMENT, text))
     dataset = sr.Comprehensive3DSR(
         evidence=evidence,
@@ -77,7 +77,7 @@ def _observer() -> Any:
     return sr.ObservationContext(observer_device_context=context)
 
 
-def _group(estimate: EstimateFile, finding: Finding, maps: Sequence[MapFile], evidence: Sequence[Any]) -> Any:
+def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], evidence: Sequence[Any]) -> Any:
     """Measurement group of a mass, at its place in the patient where that is known."""
     sr = required("highdicom").sr
     what = {
@@ -118,7 +118,7 @@ def _sites(estimate: EstimateFile, maps: Sequence[MapFile]) -> list[Any] | None:
     return [site(anatomic_location=coded(codes.BREAST), laterality=coded(codes.SIDES[side]))]
 
 
-def _region(finding: Finding, maps: Sequence[MapFile]) -> Any | None:
+def _region(finding: SizedMass, maps: Sequence[MapFile]) -> Any | None:
     """The lump's centre as a point in the map's frame of reference; of one map whose place is known."""
     if len(maps) != 1 or finding.centre_mm is None:
         return None
@@ -136,7 +136,7 @@ def _images(evidence: Sequence[Any]) -> list[Any]:
     return [source(one.SOPClassUID, one.SOPInstanceUID) for one in values or evidence]
 
 
-def _measurements(finding: Finding, images: Sequence[Any]) -> Iterator[Any]:
+def _measurements(finding: SizedMass, images: Sequence[Any]) -> Iterator[Any]:
     for name, size in ((codes.LONG_AXIS, finding.largest), (codes.SHORT_AXIS, finding.smallest)):
         if size is not None:
             yield _size(name, size, images)

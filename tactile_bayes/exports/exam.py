@@ -19,15 +19,14 @@ from tactile_bayes.files.kinds import HDF5_MAGIC
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import open_input
+from tactile_bayes.findings import Finding, Verdict, finding_lines, findings_in, verdict
 from tactile_bayes.records import dataclass
-from tactile_bayes.report.touching import touching_sentences
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
 
 _WAY_OUT: Final = "give a map (.nc), a posterior (.nc), or the JSON of `estimate --json`"
 _MOST_TEXT: Final = 2000
-_SIZES: Final = ("max_size_mm", "min_size_mm")
 Facts = Mapping[str, str]
 
 
@@ -50,8 +49,8 @@ class MapFile:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Finding:
-    """One mass of an estimate.
+class SizedMass:
+    """One mass of an estimate, or why it has no size.
 
     Parameters
     ----------
@@ -101,23 +100,33 @@ class EstimateFile:
         SHA-256 of the estimate's content.
     maps
         SHA-256 of the maps that it was made from; empty where the file does not tell.
-    cautions
-        What may put the size outside its interval, as the report's first lines say it.
+    findings
+        What speaks against it, cautions first.
     """
 
     path: Path
     kind: str
     digest: str
     document: Mapping[str, Any]
-    findings: tuple[Finding, ...]
+    masses: tuple[SizedMass, ...]
     maps: tuple[str, ...]
     facts: Facts
-    cautions: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def sized(self) -> bool:
         """Whether any mass has a size."""
-        return any(one.largest is not None for one in self.findings)
+        return any(one.largest is not None for one in self.masses)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Sound, doubtful or no answer."""
+        return verdict(self.findings, answered=self.document["max_size_mm"] is not None)
+
+    @property
+    def lines(self) -> list[str]:
+        """What speaks against it, in sentences for paper."""
+        return [plain_line(line) for line in finding_lines(self.findings, paper=True)]
 
     @property
     def provenance(self) -> Mapping[str, Any]:
@@ -137,6 +146,11 @@ class EstimateFile:
     def version(self) -> str:
         """Version of the program that made it; empty where the file does not tell."""
         return plain_line(str(self.provenance.get("version") or ""))
+
+
+def verdict_words(estimate: EstimateFile) -> str:
+    """The verdict, as a sentence."""
+    return f"Verdict: {estimate.verdict.replace('_', ' ')}."
 
 
 def plain_line(text: str) -> str:
@@ -213,22 +227,22 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
         kind,
         hashlib.sha256(text.encode()).hexdigest(),
         document,
-        findings_of(document),
+        masses_of(document),
         _map_digests(document["provenance"]),
         shared_facts(scans_of(document["provenance"])),
-        tuple(_cautions(document)),
+        findings_in(document["findings"]),
     )
 
 
-def findings_of(document: Mapping[str, Any]) -> tuple[Finding, ...]:
+def masses_of(document: Mapping[str, Any]) -> tuple[SizedMass, ...]:
     """The masses of an estimate's JSON object: those that it lists, or the one that it is of."""
     listed = document.get("masses") or ({"number": 1, **document},)
-    return tuple(_finding(one) for one in listed)
+    return tuple(_mass(one) for one in listed)
 
 
-def _finding(mass: Mapping[str, Any]) -> Finding:
+def _mass(mass: Mapping[str, Any]) -> SizedMass:
     code = "" if mass["max_size_mm"] else mass.get("reason_code") or "no size"
-    return Finding(
+    return SizedMass(
         int(mass["number"]),
         mass["max_size_mm"],
         mass["min_size_mm"],
@@ -262,30 +276,6 @@ def size_words(size: Mapping[str, Any]) -> str:
     return f"{size['median']:.1f} mm, {100 * size['probability']:g} % credible interval {ends}"
 
 
-def _cautions(document: Mapping[str, Any]) -> Iterable[str]:
-    """The report's cautions, which go wherever the size goes."""
-    diagnostics = document.get("diagnostics", {})
-    if told := document.get("side_caution"):
-        yield plain_line(told)
-    for text in (*_texts(document.get("outside_calibration")), *_texts(diagnostics.get("outside_calibration"))):
-        yield f"outside the calibration's range: {text}"
-    yield from _texts(diagnostics.get("broken_assumptions"))
-    yield from touching_sentences(document.get("touching", ()))
-    for i, one in enumerate(document.get("maps", ()), start=1):
-        told = [*_texts(one["broken_assumptions"]), *touching_sentences(one.get("touching", ()))]
-        yield from (f"map {i}: {text}" for text in told)
-        if one["outlying"]:
-            yield f"map {i} lies apart from the others"
-    if document.get("fat_apart_mm"):
-        yield "the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(
-            *document["fat_apart_mm"]
-        )
-
-
-def _texts(value: object) -> list[str]:
-    return [plain_line(text) for text in value if isinstance(text, str)] if isinstance(value, list) else []
-
-
 def _map_digests(provenance: object) -> tuple[str, ...]:
     inputs = provenance.get("inputs") if isinstance(provenance, dict) else None
     if not isinstance(inputs, list):
@@ -295,29 +285,13 @@ def _map_digests(provenance: object) -> tuple[str, ...]:
 
 
 def _read_posterior(path: Path, attributes: Mapping[str, str]) -> EstimateFile:
-    """The estimate that a posterior's file holds, or of an earlier or pooled one the sizes of its draws."""
-    from tactile_bayes.files.posterior_nc import read_estimate, read_posterior
-    from tactile_bayes.inference.summary import summarise
-
-    if "estimate" in attributes:
-        return replace(estimate_of(read_estimate(path), path), kind="posterior", digest=sha256(path))
-    held = read_posterior(path)
-    provenance = parse_json(attributes.get("provenance", "{}"), name="provenance")
-    if not isinstance(provenance, dict):
-        raise BadDataError("has no provenance", way_out=_WAY_OUT, path=str(path))
-    settings = provenance.get("settings")
-    probability = settings.get("interval", 0.95) if isinstance(settings, dict) else 0.95
-    if not isinstance(probability, float) or not 0 < probability < 1:
-        raise BadDataError(f"its interval is {probability!r}", way_out=_WAY_OUT, path=str(path))
-    sizes: dict[str, Any] = dict.fromkeys(_SIZES)
-    if all(name in held.draws for name in _SIZES):
-        sizes = {name: summarise(held.draws[name], probability=probability).as_dict() for name in _SIZES}
-    reason = "" if sizes["max_size_mm"] else "the draws are of widths only"
-    document = {"provenance": provenance, **sizes, "diagnostics": held.diagnostics}
-    finding = Finding(1, sizes["max_size_mm"], sizes["min_size_mm"], "no size" if reason else "", reason)
-    facts = shared_facts(scans_of(provenance))
-    maps = _map_digests(provenance)
-    return EstimateFile(path, "posterior", sha256(path), document, (finding,), maps, facts, tuple(_cautions(document)))
+    """The estimate that a posterior's file holds."""
+    if "estimate" not in attributes:
+        raise BadDataError(
+            "holds draws without their estimate", way_out="write it again with `estimate -o`", path=str(path)
+        )
+    document = parse_json(attributes["estimate"], name="estimate")
+    return replace(estimate_of(document, path), kind="posterior", digest=sha256(path))
 
 
 def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> None:

@@ -10,7 +10,7 @@ from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError, one_line
 from tactile_bayes.exports import codes
 from tactile_bayes.exports.codes import FHIR_SYSTEMS, Code
-from tactile_bayes.exports.exam import EstimateFile, Finding, size_words
+from tactile_bayes.exports.exam import EstimateFile, SizedMass, size_words, verdict_words
 from tactile_bayes.exports.extras import required
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.uids import content_uuid
@@ -50,7 +50,7 @@ def bundle_json(estimate: EstimateFile, identity: Identity) -> str:
 def bundle_of(estimate: EstimateFile, identity: Identity) -> dict[str, Any]:
     """The Bundle as plain data: patient (if any is named), device, observations, report."""
     exam = _Exam(estimate, identity)
-    observations = [one for finding in estimate.findings for one in exam.observations(finding)]
+    observations = [one for finding in estimate.masses for one in exam.observations(finding)]
     patient = [exam.patient()] if exam.patient_url else []
     resources = [*patient, exam.device(), *observations, exam.report(observations)]
     entries = [{"fullUrl": exam.url_of(one), "resource": one} for one in resources]
@@ -115,7 +115,7 @@ class _Exam:
             found["effectiveDateTime"] = self.identity.study.fhir
         return found
 
-    def observations(self, finding: Finding) -> Iterator[dict[str, Any]]:
+    def observations(self, finding: SizedMass) -> Iterator[dict[str, Any]]:
         """Largest and smallest size of a mass, and the probability of a lump."""
         n = finding.number
         sizes = (("largest", codes.LONG_AXIS, finding.largest), ("smallest", codes.SHORT_AXIS, finding.smallest))
@@ -128,12 +128,12 @@ class _Exam:
             concept = _concept(codes.CERTAINTY, text="Probability of a lump")
             yield self._observation(f"probability {n}", concept, finding) | {"valueQuantity": percent}
 
-    def _observation(self, role: str, code: dict[str, Any], finding: Finding) -> dict[str, Any]:
+    def _observation(self, role: str, code: dict[str, Any], finding: SizedMass) -> dict[str, Any]:
         site = codes.BREASTS.get(self.estimate.facts.get("side", ""))
-        notes = [RESEARCH_USE, *(f"CAUTION: {text}" for text in self.estimate.cautions)]
+        notes = [RESEARCH_USE, verdict_words(self.estimate), *self.estimate.lines]
         notes += [finding.another_exam] if finding.another_exam else []
-        if len(self.estimate.findings) > 1:
-            notes.append(f"Mass {finding.number} of {len(self.estimate.findings)}")
+        if len(self.estimate.masses) > 1:
+            notes.append(f"Mass {finding.number} of {len(self.estimate.masses)}")
         return {
             "resourceType": "Observation",
             "id": self.id(role),
@@ -161,14 +161,14 @@ class _Exam:
             "code": _concept(codes.EXAM),
             "result": [{"reference": self.url_of(one)} for one in observations],
             "conclusion": " ".join(lines),
-            "conclusionCode": [_concept(one.outcome) for one in self.estimate.findings],
+            "conclusionCode": [_concept(one.outcome) for one in self.estimate.masses],
         }
 
 
 def _lines(estimate: EstimateFile) -> Iterator[str]:
     """The report in sentences."""
-    for one in estimate.findings:
-        mass = f"Mass {one.number}: " if len(estimate.findings) > 1 else ""
+    for one in estimate.masses:
+        mass = f"Mass {one.number}: " if len(estimate.masses) > 1 else ""
         if one.largest is None or one.smallest is None:
             yield f"{mass}{one.outcome.meaning}. Reason: {one.reason or one.code}."
             continue
@@ -176,7 +176,8 @@ def _lines(estimate: EstimateFile) -> Iterator[str]:
         yield f"{mass}Smallest size {size_words(one.smallest)}."
         if one.another_exam:
             yield f"{mass}{one.another_exam}."
-    yield from (f"CAUTION: {text}." for text in estimate.cautions)
+    yield verdict_words(estimate)
+    yield from estimate.lines
     yield RESEARCH_USE
 
 
@@ -210,7 +211,7 @@ def _size(size: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _absent(finding: Finding) -> dict[str, Any]:
+def _absent(finding: SizedMass) -> dict[str, Any]:
     """Why there is no value."""
     unknown = finding.outcome is codes.NOT_SIZED
     code = ("unknown", "Unknown") if unknown else ("not-applicable", "Not Applicable")

@@ -12,6 +12,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.exports.exam import MapFile
 from tactile_bayes.exports.extras import required
 from tactile_bayes.exports.place import lps_from_plane, on_plane
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 
 
@@ -47,6 +48,7 @@ def nrrd_bytes(source: MapFile) -> bytes:
         "content": "tactile map",
         "tactile_bayes_values": one.recipe.value_words.encode("ascii", "replace").decode(),
         "tactile_bayes_map_sha256": source.digest,
+        "tactile_bayes_findings": " ".join(finding_lines(one.findings, paper=True)).encode("ascii", "replace").decode(),
         "tactile_bayes_research_use": RESEARCH_USE,
     }
     return _written(nrrd, values, header)

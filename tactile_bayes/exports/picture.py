@@ -37,6 +37,7 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
             looked_at=() if document is None else _places(document),
             title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
             note="" if estimate is None else _note(estimate),
+            findings=None if estimate is None else estimate.findings,
         )
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
@@ -47,7 +48,7 @@ def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.ui
 def _note(estimate: EstimateFile) -> str:
     from tactile_bayes.report.estimate_text import no_estimate_line
 
-    reasons = [one.reason for one in estimate.findings if one.largest is None]
+    reasons = [one.reason for one in estimate.masses if one.largest is None]
     return no_estimate_line(reasons[0][:_MOST_NOTE]) if reasons and not estimate.sized else ""
 
 

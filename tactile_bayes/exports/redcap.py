@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED
-from tactile_bayes.exports.exam import EstimateFile, Finding
+from tactile_bayes.exports.exam import EstimateFile, SizedMass
 from tactile_bayes.exports.identity import Identity
 from tactile_bayes.exports.uids import content_uuid
 from tactile_bayes.presets import RESEARCH_USE
@@ -40,10 +40,14 @@ DICTIONARY_HEADER: Final = (
 _RECORD: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", re.ASCII)
 _CHOICES: Final = {
     "tb_status": {"1": "size", "2": "no size", "3": "no lump that can be measured"},
+    "tb_verdict": {"1": "sound", "2": "doubtful", "3": "no answer"},
     "tb_side": {"1": "left", "2": "right", "3": "phantom"},
     "tb_posture": {"1": "supine", "2": "oblique", "3": "sitting", "4": "phantom"},
     "tb_source": {"1": "one map", "2": "several maps of one mass"},
 }
+
+
+_VERDICTS: Final = ("sound", "doubtful", "no_answer")
 
 
 class Field(NamedTuple):
@@ -82,7 +86,8 @@ FIELDS: Final = (
     Field("tb_lump_prob", "Probability of a lump", "", "number", "0", "1"),
     Field("tb_right_mm", "Lump from the xiphoid to the patient's right", "mm", "number", "-500", "500"),
     Field("tb_up_mm", "Lump from the xiphoid to the sternal notch", "mm", "number", "-500", "500"),
-    Field("tb_caution", "Cautions of the report"),
+    Field("tb_verdict", "Verdict"),
+    Field("tb_findings", "What speaks against the result"),
     Field("tb_method", "Method and calibration"),
     Field("tb_version", "Version of tactile-bayes"),
     Field("tb_map_sha256", "SHA-256 of the map", "the first of several"),
@@ -104,7 +109,7 @@ def _dictionary_row(one: Field) -> dict[str, str]:
     return {
         "Variable / Field Name": one.name,
         "Form Name": FORM,
-        "Field Type": "radio" if choices else "notes" if one.name in ("tb_reason", "tb_caution") else "text",
+        "Field Type": "radio" if choices else "notes" if one.name in ("tb_reason", "tb_findings") else "text",
         "Field Label": one.label,
         "Choices, Calculations, OR Slider Labels": " | ".join(f"{k}, {v}" for k, v in (choices or {}).items()),
         "Field Note": one.note,
@@ -131,7 +136,7 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
     """
     rows, seen = [], dict[str, EstimateFile]()
     for estimate in estimates:
-        for finding in estimate.findings:
+        for finding in estimate.masses:
             name = _record_id(estimate, finding, identity, id_from_scan=id_from_scan)
             if name in seen:
                 raise UsageError(
@@ -144,7 +149,7 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
     return _csv([header, *([row.get(name, "") for name in header] for row in rows)])
 
 
-def _record_id(estimate: EstimateFile, finding: Finding, identity: Identity, *, id_from_scan: bool) -> str:
+def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *, id_from_scan: bool) -> str:
     facts = estimate.facts
     patient = identity.patient_id
     if id_from_scan and not patient:
@@ -153,7 +158,7 @@ def _record_id(estimate: EstimateFile, finding: Finding, identity: Identity, *, 
                 f"{estimate.path} names no subject; give --patient-id, or leave out --patient-id-from-scan"
             )
         patient = facts["subject"]
-    several = [str(finding.number)] if len(estimate.findings) > 1 else []
+    several = [str(finding.number)] if len(estimate.masses) > 1 else []
     if not patient:
         return "-".join(["tb", content_uuid("record", estimate.digest).hex[:16], *several])
     parts = [patient, *(facts[name] for name in ("side", "visit", "mass") if name in facts), *several]
@@ -166,7 +171,7 @@ def _record_id(estimate: EstimateFile, finding: Finding, identity: Identity, *, 
     return name
 
 
-def _row(estimate: EstimateFile, finding: Finding, identity: Identity) -> dict[str, str]:
+def _row(estimate: EstimateFile, finding: SizedMass, identity: Identity) -> dict[str, str]:
     facts = estimate.facts
     status = {SIZED: "1", NOT_SIZED: "2", NOT_DETECTED: "3"}[finding.outcome]
     row = {
@@ -182,7 +187,8 @@ def _row(estimate: EstimateFile, finding: Finding, identity: Identity) -> dict[s
         "tb_source": "2" if len(estimate.maps) > 1 else "1",
         "tb_maps": str(len(estimate.maps)),
         "tb_lump_prob": _number(finding.probability),
-        "tb_caution": "; ".join(estimate.cautions),
+        "tb_verdict": str(_VERDICTS.index(estimate.verdict) + 1),
+        "tb_findings": " ".join(estimate.lines),
         "tb_method": estimate.method_words,
         "tb_version": estimate.version,
         "tb_map_sha256": next(iter(estimate.maps), ""),

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.schema import check_document
+from tactile_bayes.findings import findings_in, verdict
 
 SCHEMAS: Final = {"tactile-bayes/estimate/1": "estimate.schema.json", "tactile-bayes/pooled/1": "pooled.schema.json"}
 """Schemas of what ``estimate`` prints as JSON, by their ids."""
@@ -28,6 +29,7 @@ def check_estimate(document: Mapping[str, Any], schema_name: str, *, path: Path)
     check_document(document, schema_name, path=path)
     try:
         _check_sizes(document)
+        _check_verdict(document)
     except BadDataError as error:
         raise error.at(path) from None
 
@@ -46,6 +48,13 @@ def _check_sizes(document: Mapping[str, Any]) -> None:
             what = f"{where}min_size_mm is {smallest['median']:g} mm and max_size_mm {largest['median']:g} mm"
             raise BadDataError(what, way_out=_WAY_OUT)
     _check_masses(document)
+
+
+def _check_verdict(document: Mapping[str, Any]) -> None:
+    made = verdict(findings_in(document["findings"]), answered=document["max_size_mm"] is not None)
+    if document["verdict"] != made:
+        what = f"verdict is {document['verdict']!r}, and its findings make it {made!r}"
+        raise BadDataError(what, way_out=_WAY_OUT)
 
 
 def _holders(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -11,6 +11,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.kinds import HDF5_MAGIC, MCAP_MAGIC
 from tactile_bayes.files.reading import open_input
+from tactile_bayes.findings import finding_lines, findings_in
 
 if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
@@ -77,9 +78,17 @@ def _posterior(group: Group) -> dict[str, Any]:
         "draws": group.dimension("draw"),
         "variables": [name for name in group.variables() if name not in ("chain", "draw")],
         "units": {"_mm": "mm", "_rad": "rad", "others": "as the map: 1 is the background"},
+        **_told(parse_json(attributes.get("estimate", "{}"))),
         "diagnostics": parse_json(attributes.get("diagnostics", "{}")),
         "provenance": parse_json(attributes.get("provenance", "{}")),
     }
+
+
+def _told(document: Any) -> dict[str, Any]:
+    """Verdict of an estimate and what speaks against it, in sentences; nothing of a document without them."""
+    if not isinstance(document, dict) or "findings" not in document:
+        return {}
+    return {"verdict": document.get("verdict"), "findings": finding_lines(findings_in(document["findings"]))}
 
 
 def _value_unit(tactile_map: TactileMap) -> str:
@@ -106,6 +115,7 @@ def _map(path: Path) -> dict[str, Any]:
         "frames": tactile_map.frame_count,
         "patient_frame": tactile_map.patient_from_plane is not None,
         **({} if tactile_map.nipple_mm is None else {"nipple_mm": tactile_map.nipple_mm.tolist()}),
+        "findings": finding_lines(tactile_map.findings),
         "recipe": asdict(tactile_map.recipe),
         **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
         "quality": dict(tactile_map.quality),
@@ -128,7 +138,7 @@ def _json(path: Path) -> dict[str, Any]:
     if schema.startswith("tactile-bayes/repeatability/"):
         return _repeatability(path, document)
     kept = {name: value for name, value in document.items() if name not in ("schema", "modalities")}
-    return {"schema": schema, "kind": schema.split("/")[1], **kept}
+    return {"schema": schema, "kind": schema.split("/")[1], **kept, **_told(document)}
 
 
 def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:

@@ -1,8 +1,7 @@
 """Tactile maps as netCDF by the CF conventions; equal maps give equal bytes.
 
-Files of the schema map/2 hold the cells' centres as the coordinate variables ``x`` and ``y``. Those of map/1, which are
-read too, hold them as ``x_mm`` and ``y_mm`` on dimensions ``x`` and ``y`` that have no coordinates (record 0089). The
-group ``frames`` of a scan's map holds some of its frames (record 0106).
+The cells' centres are the coordinate variables ``x`` and ``y`` (record 0089). The group ``frames`` of a scan's map
+holds some of its frames (record 0106).
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ from tactile_bayes.files.map_frames_nc import FRAMES_GROUP, frame_contents, read
 from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
+from tactile_bayes.findings import findings_in
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.presets import NORMALISE
 
 SCHEMA = "tactile-bayes/map/2"
-_OLD_SCHEMA = "tactile-bayes/map/1"
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"
 
-# schema -> field of the map -> the variable that holds it
-_AXES = {SCHEMA: {"y_mm": "y", "x_mm": "x"}, _OLD_SCHEMA: {"y_mm": "y_mm", "x_mm": "x_mm"}}
+_VARIABLES = {"y_mm": "y", "x_mm": "x"}
+"""Variables that are called otherwise than their field of the map."""
 # field of the map -> (type, dimensions, attributes); the attributes are for other programs.
 _FIELDS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
     "y_mm": ("f8", ("y",), {"units": "mm", "axis": "Y", "long_name": "cell centres along the head"}),
@@ -95,7 +94,7 @@ def _variables(tactile_map: TactileMap) -> dict[str, Variable]:
         more = {"units": units[field]} if units.get(field) else {}
         values = np.asarray(getattr(tactile_map, field), kind)
         fill = np.nan if field in _MAY_BE_MISSING else None
-        variables[_variable_of(field, SCHEMA)] = Variable(values, dimensions, more | attributes, fill)
+        variables[_VARIABLES.get(field, field)] = Variable(values, dimensions, more | attributes, fill)
     for name, meaning in _TRANSFORMS.items():
         transform = getattr(tactile_map, name)
         if transform is not None:
@@ -120,8 +119,7 @@ def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ..
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
         check_limit(_dimension(file, "y") * _dimension(file, "x"), CELLS, what="it has {} cells")
-        names = {field: _variable_of(field, header["schema"]) for field in _FIELDS}
-        _check_one_form(file, header["schema"])
+        names = {field: _VARIABLES.get(field, field) for field in _FIELDS}
         arrays = {field: _read_variable(file, name, field=field) for field, name in names.items()}
         transforms = {name: _read_transform(file, name) for name in _TRANSFORMS}
         _check_lattice({names[field]: arrays[field] for field in ("x_mm", "y_mm")}, header["recipe"].cell_mm)
@@ -135,6 +133,7 @@ def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ..
             masked_taxels=tuple(header["masked_taxels"]),
             head=header["head"],
             nipple_mm=header["nipple_mm"],
+            findings=header["findings"],
             frames=read_frames(file, way_out=_WAY_OUT),
         )
         return tactile_map, scans_of(header["provenance"])
@@ -146,16 +145,11 @@ def read_map_header(path: Path) -> dict[str, Any]:
     Returns
     -------
     dict with ``schema``, ``recipe`` (`MapRecipe`), ``quality``, ``masked_taxels``, ``head``, ``nipple_mm``,
-    ``provenance``, ``background``, ``frame_count`` and ``shape`` (ny, nx).
+    ``findings``, ``provenance``, ``background``, ``frame_count`` and ``shape`` (ny, nx).
     """
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         shape = tuple(_dimension(file, name) for name in ("y", "x"))
         return _header(file) | {"shape": shape}
-
-
-def _variable_of(field: str, schema: str) -> str:
-    """Name of a map's field in files of a schema."""
-    return _AXES[schema].get(field, field)
 
 
 def _units(tactile_map: TactileMap) -> dict[str, str]:
@@ -179,6 +173,7 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
         "masked_taxels": _json(list(tactile_map.masked_taxels)),
         **({} if tactile_map.head is None else {"head": _json(tactile_map.head.as_dict())}),
         **({} if tactile_map.nipple_mm is None else {"nipple_mm": _json(tactile_map.nipple_mm.tolist())}),
+        "findings": _json([one.as_dict() for one in tactile_map.findings]),
         "provenance": _json(provenance.as_dict()),
     }
 
@@ -197,8 +192,8 @@ def _header(file: Group) -> dict[str, Any]:
         raise BadDataError("is a posterior, not a map", way_out="give the map that it was estimated from")
     texts = file.attributes()
     schema = _attribute(texts, "schema")
-    if schema not in _AXES:
-        raise BadDataError(f"schema is {schema!r}, not {SCHEMA!r} or {_OLD_SCHEMA!r}", way_out=_WAY_OUT)
+    if schema != SCHEMA:
+        raise BadDataError(f"schema is {schema!r}, not {SCHEMA!r}", way_out=_WAY_OUT)
     return {
         "schema": schema,
         "recipe": _recipe(_decoded(texts, "recipe", dict)),
@@ -208,6 +203,7 @@ def _header(file: Group) -> dict[str, Any]:
         "masked_taxels": [str(line) for line in _decoded(texts, "masked_taxels", list)],
         "head": _head(texts),
         "nipple_mm": _nipple(texts),
+        "findings": findings_in(_decoded(texts, "findings", list)),
         "provenance": _decoded(texts, "provenance", dict),
     }
 
@@ -306,15 +302,6 @@ def _dimension(file: Group, name: str) -> int:
     if length is None:
         raise BadDataError(f"dimension {name} is missing", way_out=_WAY_OUT)
     return length
-
-
-def _check_one_form(file: Group, schema: str) -> None:
-    """Raise `BadDataError` if the file also holds the cells' centres as files of the other schema do."""
-    other = _OLD_SCHEMA if schema == SCHEMA else SCHEMA
-    for name in _AXES[other].values():
-        if file.holds(name):
-            what = f"schema is {schema!r}, but variable {name} is how {other!r} holds the centres of cells"
-            raise BadDataError(what, way_out=_WAY_OUT)
 
 
 def _read_variable(file: Group, name: str, *, field: str) -> Any:

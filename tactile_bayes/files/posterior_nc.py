@@ -16,6 +16,7 @@ from tactile_bayes.files.documents import parse_json
 from tactile_bayes.files.estimate_json import check_estimate
 from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
+from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.inference_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
@@ -82,8 +83,10 @@ def write_posterior(
     write_bytes(path, _posterior_bytes(variables, attributes, groups or {}), force=force)
 
 
-def write_pooled(path: Path, size: SizePosterior, *, provenance: Provenance, force: bool = False) -> None:
-    """Write the draws of a mass's size from several maps atomically."""
+def write_pooled(
+    path: Path, size: SizePosterior, *, provenance: Provenance, document: Mapping[str, Any], force: bool = False
+) -> None:
+    """Write the draws of a mass's size from several maps, with its JSON object, atomically."""
     names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
     variables = {name: np.atleast_2d(getattr(size, name)) for name in names}
     attributes = {
@@ -92,6 +95,7 @@ def write_pooled(path: Path, size: SizePosterior, *, provenance: Provenance, for
         "method": "pooled",
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in size.figures.items() if _plain(v)}),
+        "estimate": json.dumps(document),
     }
     write_bytes(path, _posterior_bytes(variables, attributes, {}), force=force)
 
@@ -130,12 +134,15 @@ class PosteriorDraws:
         As the estimate's JSON has them.
     scans
         The scans at the beginning, as `Provenance.scans` has them.
+    findings
+        What speaks against the estimate.
     """
 
     method: str
     draws: dict[str, FloatArray]
     diagnostics: dict[str, Any]
     scans: tuple[dict[str, str], ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def read_posterior(path: Path) -> PosteriorDraws:
@@ -159,7 +166,9 @@ def read_posterior(path: Path) -> PosteriorDraws:
     diagnostics = parse_json(attributes.get("diagnostics", "{}"))
     figures = diagnostics if isinstance(diagnostics, dict) else {}
     scans = scans_of(parse_json(attributes.get("provenance", "{}")))
-    return PosteriorDraws(attributes.get("method", ""), draws, figures, scans)
+    document = parse_json(attributes.get("estimate", "{}"))
+    findings = findings_in(document.get("findings", []) if isinstance(document, dict) else [])
+    return PosteriorDraws(attributes.get("method", ""), draws, figures, scans, findings)
 
 
 def read_estimate(path: Path) -> dict[str, Any]:
@@ -176,7 +185,7 @@ def read_estimate(path: Path) -> dict[str, Any]:
     if attributes.get("method") == "pooled":
         raise BadDataError("holds a size pooled from several maps", way_out="give the maps", path=str(path))
     if "estimate" not in attributes:
-        what = "holds draws without their estimate, as earlier versions wrote it"
+        what = "holds draws without their estimate"
         raise BadDataError(what, way_out="give its map, or write it again with `estimate -o`", path=str(path))
     document: Any = parse_json(attributes["estimate"])
     check_estimate(document, "estimate.schema.json", path=path)

@@ -21,7 +21,7 @@ Times
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -49,6 +49,7 @@ from tactile_bayes.files.scan_parts import (
     s_from_ns,
 )
 from tactile_bayes.files.schema import check_document
+from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.scan import (
     CountArray,
@@ -82,6 +83,8 @@ class ScanWriter:
         Written before the first message.
     truth
         What a simulated scan was made from; `read_truth` returns it, `read_scan` does not.
+    findings
+        What speaks against the scan, where it is a copy of another file's.
     """
 
     def __init__(
@@ -93,6 +96,7 @@ class ScanWriter:
         session: Mapping[str, str],
         provenance: Provenance,
         truth: Mapping[str, Any] | None = None,
+        findings: Sequence[Finding] = (),
     ) -> None:
         self._shape = head.shape
         self._sequence: dict[int, int] = {}
@@ -105,6 +109,8 @@ class ScanWriter:
         )
         self._writer.start(profile="", library=f"tactile-bayes/{__version__}")
         self._describe(session, provenance, truth)
+        if findings:
+            self._writer.add_metadata("findings", {"json": _compact([one.as_dict() for one in findings])})
         self._attach("head.json", head_document(head))
         self._attach("element_calibration.json", calibration_document(element_calibration))
         self._register()
@@ -246,6 +252,7 @@ def write_scan(
             session=scan.session,
             provenance=provenance,
             truth=truth,
+            findings=scan.findings,
         )
         _write_messages(writer, scan)
         writer.finish()
@@ -337,7 +344,16 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
     frames = _frames(records, head)
     if not len(frames) and not records.finished:
         raise BadDataError("was cut off before its first complete chunk", way_out="nothing can be kept; scan again")
-    scan = Scan(frames, _poses(records), head, calibration, landmarks=_landmarks(records), session=session)
+    account = records.metadata.get("recording", {})
+    scan = Scan(
+        frames,
+        _poses(records),
+        head,
+        calibration,
+        landmarks=_landmarks(records),
+        session=session,
+        findings=file_findings(records),
+    )
     provenance = json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
     return ScanFile(
         scan=scan,
@@ -347,8 +363,16 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
         topics=records.topic_counts(),
         provenance=provenance,
         schema=SCAN_SCHEMA,
-        account=records.metadata.get("recording", {}),
+        account=account,
     )
+
+
+def file_findings(records: McapRecords) -> tuple[Finding, ...]:
+    """What a scan's file had lost, what its recorder noted, and what the file said that it is a copy of."""
+    kept = parse_json(records.metadata.get("findings", {}).get("json", "[]"), name="findings")
+    noted = records.metadata.get("recording", {}).get("cautions", "").splitlines()
+    lost = [Finding("data_lost", text) for text in records.lost]
+    return (*findings_in(kept), *lost, *(Finding("recorder_noted", text) for text in noted))
 
 
 def json_attachment(records: McapRecords, name: str) -> dict[str, Any]:

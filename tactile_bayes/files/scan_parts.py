@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.overlap import scan_cautions
 from tactile_bayes.scan import ElementCalibration, HeadGeometry, Scan
 
 _NS = 1_000_000_000
@@ -50,15 +49,6 @@ class ScanFile:
     provenance: Mapping[str, Any]
     schema: str
     account: Mapping[str, str] = field(default_factory=dict)
-
-    def cautions(self) -> list[str]:
-        """Reasons against using the scan, one line each: from its times and from the recorder's account."""
-        return all_cautions(scan_cautions(self.scan), self.account)
-
-
-def all_cautions(found: list[str], account: Mapping[str, str]) -> list[str]:
-    """Cautions found in a scan, and those that its recorder noted."""
-    return [*found, *(line for line in account.get("cautions", "").splitlines() if line not in found)]
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:

@@ -14,14 +14,16 @@ from tactile_bayes.files.scan_mcap import (
     LANDMARK_NAMES,
     NIPPLE,
     SCAN_SCHEMA,
+    file_findings,
     json_attachment,
     json_object,
     message_times,
     scan_records,
 )
-from tactile_bayes.files.scan_parts import all_cautions, head_from_document
+from tactile_bayes.files.scan_parts import head_from_document
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.overlap import Span, overlap_cautions
+from tactile_bayes.mapping.overlap import Span, with_times
 
 
 def summarise_scan(path: Path) -> dict[str, Any]:
@@ -50,8 +52,7 @@ def _summary(records: McapRecords) -> dict[str, Any]:
         "schema": SCAN_SCHEMA,
         "kind": "scan",
         "complete": records.finished and not records.lost,
-        "lost": list(records.lost),
-        "cautions": all_cautions(overlap_cautions(Span.of(time_s), Span.of(pose_s)), account),
+        "findings": finding_lines(with_times(file_findings(records), Span.of(time_s), Span.of(pose_s))),
         "frames": len(time_s),
         "taxels": list(head.shape),
         "poses": len(pose_s),

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError, check_choice, check_number
+from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.accumulate import Accumulated, accumulate
-from tactile_bayes.mapping.convention import check_convention, hint
+from tactile_bayes.mapping.assumptions import broken_assumptions, handling_findings
+from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
 from tactile_bayes.mapping.engine import Engine, choose_engine
 from tactile_bayes.mapping.evenness import evenness_figures
 from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
@@ -19,6 +21,7 @@ from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, 
 from tactile_bayes.mapping.head_profile import head_profile_figures
 from tactile_bayes.mapping.latency import estimate_latency
 from tactile_bayes.mapping.neighbourhood import local_plane
+from tactile_bayes.mapping.overlap import scan_findings
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.pose_noise import pose_noise_figures
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
@@ -99,7 +102,8 @@ def build_map(
     not change a bit of the map.
     """
     _check_options(cell_mm, pressure_window_kpa, normalise, latency_ms, plane_radius_mm, max_pose_gap_ms, every)
-    parts = [every_nth(scan, every) for scan in ([scans] if isinstance(scans, Scan) else scans)]
+    given = [scans] if isinstance(scans, Scan) else list(scans)
+    parts = [every_nth(scan, every) for scan in given]
     if latency_ms == "auto" and register_strokes:
         raise UsageError(
             "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
@@ -131,7 +135,17 @@ def build_map(
     figures |= evenness_figures(selections, plane) | stroke_lag_figures(sources)
     figures["stroke_count"] = float(stroke_count(sources))
     recipe = MapRecipe("scan", normalise, float(cell_mm), rules.window_kpa, late_ms, flat_field, register_strokes)
-    return _as_map(done, selections, plane, recipe, figures)
+    return _as_map(done, selections, plane, recipe, figures, findings=_of_scans(given))
+
+
+def _of_scans(scans: list[Scan]) -> tuple[Finding, ...]:
+    """What speaks against each scan, by its number where there are several."""
+    several = len(scans) > 1
+    return tuple(
+        one.at(f"scan {number}") if several else one
+        for number, scan in enumerate(scans, start=1)
+        for one in scan_findings(scan)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,6 +259,8 @@ def _as_map(
     plane: Plane,
     recipe: MapRecipe,
     figures: dict[str, float],
+    *,
+    findings: tuple[Finding, ...],
 ) -> TactileMap:
     sums, scans = done.sums.trimmed(), [part.scan for part in selections]
     patient, nipple, spread = _landmarks(scans, plane)
@@ -276,6 +292,9 @@ def _as_map(
         masked_taxels=_masked(selections),
         head=_head(scans),
         frames=None if recipe.normalise == "none" else sample_frames(selections, plane),
+        findings=by_weight(
+            (*convention_findings(quality), *broken_assumptions(quality), *handling_findings(quality), *findings)
+        ),
     )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
 from tactile_bayes.mapping.frames import SelectedFrames
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS, distinct_poses
@@ -83,6 +84,22 @@ def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     if agreement[best] > max(declared + BETTER_BY, NEARLY_WHOLE):
         figures |= {"other_convention": float(list(CONVENTIONS).index(best)), "other_agreement": agreement[best]}
     return figures
+
+
+def convention_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:
+    """What a map's figures say of its rotations, see `check_convention`; nothing of a map without a plane."""
+    if "other_convention" in quality:
+        other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
+        text = (
+            f"the quaternions seem to be {other}: the head's face would follow its motion to {agreement:.3f} of 1, "
+            f"against {quality['normal_agreement']:.3f} as they are told; size and place may be wrong"
+        )
+        check = "check the tracker's quaternions"
+        return (Finding("wrong_rotations", text, f"{check} and import the scan again", check),)
+    if "normal_agreement" not in quality and "plane_rms_mm" in quality:
+        text = "the motion does not tell whether the quaternions are scalar first and from sensor to base"
+        return (Finding("rotations_unknown", text, "check them", "check them"),)
+    return ()
 
 
 def hint(selections: Sequence[SelectedFrames]) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.scan import Scan
 
@@ -83,9 +85,16 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
     return found
 
 
-def scan_cautions(scan: Scan) -> list[str]:
-    """`overlap_cautions` of a scan."""
-    return overlap_cautions(Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
+def scan_findings(scan: Scan) -> tuple[Finding, ...]:
+    """What its file and recorder say against a scan, and its times."""
+    return with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
+
+
+def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[Finding, ...]:
+    """Findings of a scan's file, and of its times where its recorder did not note them."""
+    found = overlap_cautions(frames, poses)
+    told = [one for one in findings if one.text not in found]
+    return (*told, *(Finding("times_apart", text) for text in found))
 
 
 def _frame_gaps(frames: Span) -> list[str]:

@@ -9,6 +9,7 @@ from dataclasses import field
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.frame_sample import FrameSample
@@ -107,6 +108,8 @@ class TactileMap:
         earlier versions.
     nipple_mm : (3,) array or None
         The nipple in `plane`; None where it was not touched.
+    findings
+        What speaks against sizes from it.
     """
 
     mean: FloatArray
@@ -124,6 +127,7 @@ class TactileMap:
     head: HeadShape | None = None
     frames: FrameSample | None = None
     nipple_mm: FloatArray | None = None
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))

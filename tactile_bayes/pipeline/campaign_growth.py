@@ -11,6 +11,7 @@ from tactile_bayes.files.campaign_names import COMPARED, GROWTH
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.manifest_csv import Exam, table_text
 from tactile_bayes.files.schema import load_schema
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.report.growth import Growth, of_document
 from tactile_bayes.trial.visits import day_of, in_order
 
@@ -98,5 +99,5 @@ def _line(row: Growth) -> dict[str, object]:
         "high_percent": ends.get("high"),
         "probability": ends.get("probability"),
         "verdict": row.verdict or None,
-        "cautions": "; ".join(one.removeprefix("CAUTION: ") for one in row.cautions) or None,
+        "findings": " ".join(finding_lines(row.findings)) or None,
     }

@@ -17,6 +17,7 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.manifest_csv import Exam, natural
+from tactile_bayes.findings import Finding
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
@@ -27,7 +28,9 @@ if TYPE_CHECKING:
 
 SAME_MM: Final = 6.0
 """Centres on one map nearer than this are of one mass: candidates of a search are so far apart."""
-OWN_AXES: Final = "its mass was matched by place in the maps' own axes, because a scan has no landmarks"
+OWN_AXES: Final = Finding(
+    "own_axes", "its mass was matched by place in the maps' own axes, because a scan has no landmarks"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +131,14 @@ def _not_there(outcome: Outcome, mass: str, place: tuple[float, float], most_mm:
     found = outcome.estimate
     reason = f"no lump found within {most_mm:g} mm of mass {mass}'s place, ({place[0]:.1f}, {place[1]:.1f}) mm"
     masses = tuple(replace(one, reported=False) for one in found.masses)
-    none = Estimate("no_estimate", reason, candidates=found.candidates, code="undetected", masses=masses)
+    none = Estimate(
+        "no_estimate",
+        reason,
+        candidates=found.candidates,
+        code="undetected",
+        masses=masses,
+        findings=outcome.tactile_map.findings,
+    )
     return replace(outcome, estimate=none)
 
 
@@ -171,8 +181,8 @@ def _on_map(tactile_map: TactileMap, place: tuple[float, float]) -> bool:
     return all(float(axis[0]) <= at <= float(axis[-1]) for axis, at in zip(axes, place, strict=True))
 
 
-def unnamed(documents: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Masses of one scan that no row names, in words.
+def unnamed(documents: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """Masses of one scan that no row names.
 
     Parameters
     ----------
@@ -185,4 +195,5 @@ def unnamed(documents: Sequence[Mapping[str, Any]]) -> list[str]:
         at = mass["centre_mm"]
         if all(np.hypot(at["x"] - one["x"], at["y"] - one["y"]) > SAME_MM for one in [*centres, *found]):
             found.append(at)
-    return [f"a mass at ({at['x']:.1f}, {at['y']:.1f}) mm on the map is named by no row" for at in found]
+    words = "a mass at ({x:.1f}, {y:.1f}) mm on the map is named by no row"
+    return [Finding("unnamed_mass", words.format(**at)) for at in found]

@@ -72,6 +72,7 @@ def size_step(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.files.atomic import write_text
     from tactile_bayes.files.documents import load_json
     from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.findings import findings_in
 
     assert task.settings is not None
     settings = task.settings
@@ -85,8 +86,9 @@ def size_step(task: Task) -> tuple[Result, Writes]:
     if task.figures:
         from tactile_bayes.report.estimate_figures import draw_size
 
+        findings = findings_in(sized["findings"])
         writes[SIZED_FIGURE] = lambda path: draw_size(
-            size, path, name=task.name, probability=settings.interval, force=True
+            size, path, name=task.name, probability=settings.interval, findings=findings, force=True
         )
     return {}, writes
 

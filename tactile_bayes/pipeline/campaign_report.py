@@ -141,7 +141,7 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
     known = {(row.exam.patient, row.exam.mass) for row in rows}
     left_out = sorted(known - masses) if masses is not None else []
     names = tuple(f"{patient} {mass}" for patient, mass in left_out)
-    unnamed = tuple(row.exam.name for row in rows if row.unnamed)
+    unnamed = tuple(row.exam.name for row in rows if any(one.kind == "unnamed_mass" for one in row.findings))
     return Written(
         *counts, len(campaign.found.results["pool"]), names, report, fault, unnamed, growth_line(growth, GROWN)
     )
@@ -313,8 +313,7 @@ def _card(campaign: Campaign, row: Row) -> Card:
         facts=tuple(facts),
         reason=row.reason,
         size=row.size,
-        cautions=tuple(row.cautions),
-        checks=tuple(row.checks),
+        findings=row.findings,
         thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
         links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},
     )

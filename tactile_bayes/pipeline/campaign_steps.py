@@ -30,6 +30,7 @@ from tactile_bayes.files.campaign_names import (
     SIZED_FIGURE,
     THUMBNAIL,
 )
+from tactile_bayes.findings import by_weight
 from tactile_bayes.pipeline.campaign_match import OWN_AXES, NamedPlace, in_own_axes, matched_outcome
 from tactile_bayes.pipeline.campaign_staging import Writes, write_staged
 from tactile_bayes.pipeline.settings import Settings
@@ -178,14 +179,15 @@ def _fetched_map(task: Task) -> tuple[Result, Writes]:
 
 def _scanned_map(task: Task) -> tuple[Result, Writes]:
     from tactile_bayes.files.provenance import Provenance, scan_facts
-    from tactile_bayes.pipeline.scans import load_scans, map_provenance
+    from tactile_bayes.files.scan_mcap import read_scan
+    from tactile_bayes.pipeline.scans import map_provenance
 
-    (scan,), notes = load_scans([task.source])
+    scan = read_scan(task.source)
     check_facts(task.expected, scan.session)
     settings = map_settings(task.normalise)
     provenance: Provenance = map_provenance([task.source], [scan], settings)
     facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
-    return _built(task, scan, provenance, notes, facts)
+    return _built(task, scan, provenance, facts)
 
 
 def _imported_map(task: Task) -> tuple[Result, Writes]:
@@ -199,20 +201,17 @@ def _imported_map(task: Task) -> tuple[Result, Writes]:
     facts = scan_facts(scan.session, frames=scan.frames.sha256, file=task.source_sha256)
     inputs = {"scan_1": task.source_sha256}
     provenance = Provenance("map", map_settings(task.normalise), inputs, scans=[facts])
-    found, writes = _built(task, scan, provenance, [], facts)
+    found, writes = _built(task, scan, provenance, facts)
     return found, {SCAN: lambda path: write_scan(path, scan, provenance=made, force=True), **writes}
 
 
-def _built(
-    task: Task, scan: Scan, provenance: Any, notes: list[str], facts: Mapping[str, str]
-) -> tuple[Result, Writes]:
+def _built(task: Task, scan: Scan, provenance: Any, facts: Mapping[str, str]) -> tuple[Result, Writes]:
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.mapping import build_map
 
     tactile_map = build_map(scan, normalise=task.normalise)
     found = {
         "scans": [dict(facts)],
-        "notes": [note.removeprefix("scan 1: ") for note in notes],
         "synthetic": scan.session.get("source") == "simulated",
         "normalise": task.normalise,
     }
@@ -229,7 +228,7 @@ def _given_map(task: Task) -> tuple[Result, Writes]:
     for facts in scans:
         check_facts(task.expected, facts)
     data = read_bytes(task.source, most=NETCDF_BYTES)
-    found = {"scans": list(scans), "notes": [], "synthetic": None, "normalise": tactile_map.recipe.normalise}
+    found = {"scans": list(scans), "synthetic": None, "normalise": tactile_map.recipe.normalise}
     return found, {MAP: lambda path: write_bytes(path, data, force=True)}
 
 
@@ -295,8 +294,7 @@ def _estimate(task: Task) -> tuple[Result, Writes]:
     picture = thumbnail_png(outcome.tactile_map, document)
     if picture is not None:
         writes[THUMBNAIL] = lambda path: write_bytes(path, picture, force=True)
-    own_axes = bool(task.places) and in_own_axes(outcome.tactile_map, task.places)
-    return {"exit_code": answer.exit_code, "notes": [OWN_AXES] if own_axes else []}, writes
+    return {"exit_code": answer.exit_code}, writes
 
 
 def _outcome(task: Task) -> Outcome:
@@ -307,7 +305,11 @@ def _outcome(task: Task) -> Outcome:
     path = task.folder / MAP
     if not task.places:
         return estimate_file(path, task.settings)
-    return matched_outcome(path, task.settings, mass=task.mass, places=task.places, most_mm=task.match_mm)
+    found = matched_outcome(path, task.settings, mass=task.mass, places=task.places, most_mm=task.match_mm)
+    if not in_own_axes(found.tactile_map, task.places):
+        return found
+    findings = by_weight((*found.estimate.findings, OWN_AXES))
+    return replace(found, estimate=replace(found.estimate, findings=findings))
 
 
 def _figures(task: Task) -> tuple[Result, Writes]:
@@ -321,8 +323,9 @@ def _figures(task: Task) -> tuple[Result, Writes]:
     if tactile_map.covered.any():
         writes[MAP_FIGURE] = lambda path: draw_map(tactile_map, estimate, path, name=task.name, force=True)
     if size is not None:
+        probability, findings = settings.interval, estimate.findings
         writes[SIZE_FIGURE] = lambda path: draw_size(
-            size, path, name=task.name, probability=settings.interval, force=True
+            size, path, name=task.name, probability=probability, findings=findings, force=True
         )
     return {}, writes
 
@@ -343,7 +346,9 @@ def _pool(task: Task) -> tuple[Result, Writes]:
     writes: Writes = {POOLED: lambda path: write_text(path, dump_json(outcome.document), force=True)}
     size = outcome.pooled.size
     if size is not None:
-        writes[POOLED_DRAWS] = lambda path: write_pooled(path, size, provenance=outcome.provenance, force=True)
+        writes[POOLED_DRAWS] = lambda path: write_pooled(
+            path, size, provenance=outcome.provenance, document=outcome.document, force=True
+        )
     return {}, writes
 
 

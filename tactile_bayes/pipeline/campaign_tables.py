@@ -12,10 +12,10 @@ from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, 
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.manifest_csv import Exam, table_text
 from tactile_bayes.files.schema import load_schema
+from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, findings_in, verdict
 from tactile_bayes.pipeline.campaign import Campaign
 from tactile_bayes.pipeline.campaign_match import unnamed
 from tactile_bayes.records import dataclass
-from tactile_bayes.report.touching import touching_sentences
 
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
 _TRIAL_COLUMNS: Final = (
@@ -23,12 +23,9 @@ _TRIAL_COLUMNS: Final = (
     "reader", "visit", "date", "reason", "synthetic",
 )  # fmt: skip
 _OF_ESTIMATE: Final = (
-    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "side_caution",
-    "touching",
+    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "findings",
 )  # fmt: skip
-_OF_DIAGNOSTICS: Final = ("broken_assumptions", "outside_calibration", "assumptions_to_check")
-_OF_POOLED: Final = ("status", "reason", "max_size_mm", "maps")
-_OF_MAPS: Final = ("map", "outlying", "broken_assumptions")
+_OF_POOLED: Final = ("status", "reason", "max_size_mm", "findings")
 """What tables and pages show of a document: the rest of it is a hundred times as much."""
 
 
@@ -44,12 +41,10 @@ class Row:
         The estimate's JSON object, by the campaign's repeatability where it has one; None where a step failed.
     step, fault
         Which step failed and why; empty where none did.
-    scans, notes, synthetic
-        Of the file: digests and facts, what it lost, whether it is simulated (None: unknown).
-    outlying
-        Whether the exam lies apart from the others of its mass.
-    unnamed
-        Masses of the scan that no row names, in words.
+    scans, synthetic
+        Of the file: digests and facts, whether it is simulated (None: unknown).
+    findings
+        What speaks against the exam: of its estimate, of the pooled size of its mass, of the table.
     """
 
     exam: Exam
@@ -57,10 +52,8 @@ class Row:
     step: str = ""
     fault: str = ""
     scans: tuple[Mapping[str, str], ...] = ()
-    notes: tuple[str, ...] = ()
     synthetic: bool | None = None
-    outlying: bool = False
-    unnamed: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def size(self) -> Mapping[str, float] | None:
@@ -80,22 +73,9 @@ class Row:
         return _status(self.document)
 
     @property
-    def cautions(self) -> list[str]:
-        """What may put the size outside its interval, or the exam in doubt."""
-        if self.document is None:
-            return list(self.notes)
-        found = self.document["diagnostics"]
-        apart = ["lies apart from the other exams of its mass"] if self.outlying else []
-        side = [told] if (told := self.document.get("side_caution")) else []
-        return [*side, *found.get("broken_assumptions", []), *found.get("outside_calibration", []), *apart, *self.notes]
-
-    @property
-    def checks(self) -> list[str]:
-        """What is to be looked at besides."""
-        if self.document is None:
-            return []
-        touching = touching_sentences(self.document.get("touching") or [])
-        return [*self.document["diagnostics"].get("assumptions_to_check", []), *touching, *self.unnamed]
+    def verdict(self) -> Verdict:
+        """Sound, doubtful or no answer."""
+        return verdict(self.findings, answered=self.size is not None)
 
 
 def _status(document: Mapping[str, Any] | None) -> str:
@@ -108,42 +88,48 @@ def _status(document: Mapping[str, Any] | None) -> str:
 
 def exam_rows(campaign: Campaign) -> list[Row]:
     """Every exam of the table, in its order."""
-    pooled = pooled_documents(campaign)
-    outlying = {one["map"] for document in pooled.values() for one in document["maps"] if one["outlying"]}
-    doubts = {one["map"]: one["broken_assumptions"] for document in pooled.values() for one in document["maps"]}
-    rows = [_row(campaign, exam, exam.name in outlying) for exam in campaign.exams]
-    rows = [with_doubts(row, doubts.get(row.exam.name, [])) for row in rows]
+    together = _of_pooled(campaign)
+    rows = [_row(campaign, exam, together.get(exam.name, ())) for exam in campaign.exams]
     of_scan: dict[Path, list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         if row.document is not None:
             of_scan[row.exam.path].append(row.document)
     return [
-        row if row.document is None else replace(row, unnamed=tuple(unnamed(of_scan[row.exam.path]))) for row in rows
+        row
+        if row.document is None
+        else replace(row, findings=by_weight((*row.findings, *unnamed(of_scan[row.exam.path]))))
+        for row in rows
     ]
 
 
-def with_doubts(row: Row, texts: Sequence[str]) -> Row:
-    """The row with what the pooled size of its mass says of this exam, such as that its lump lies elsewhere."""
-    return replace(row, notes=(*row.notes, *(text for text in texts if text not in row.cautions)))
+def _of_pooled(campaign: Campaign) -> dict[str, tuple[Finding, ...]]:
+    """What the pooled size of its mass says against each exam, such as that its lump lies elsewhere."""
+    return {
+        name: tuple(
+            replace(one, about="")
+            for one in findings_in(document["findings"])
+            if one.about == f"map {number}" and one.kind != "several_masses"  # its row says which mass it is of
+        )
+        for document in pooled_documents(campaign).values()
+        for number, name in enumerate(document["maps"], start=1)
+    }
 
 
-def _row(campaign: Campaign, exam: Exam, outlying: bool) -> Row:
+def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
     fault = campaign.found.faults.get(exam.name)
     mapped = campaign.found.of("map", exam.name) or {}
-    matched = (campaign.found.of("estimate", exam.name) or {}).get("notes", ())
-    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "notes": (*mapped.get("notes", ()), *matched)}
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
     if fault is not None and fault.step != "figures":
-        return Row(exam, None, fault.step, fault.reason, synthetic=mapped.get("synthetic"), **facts)
+        return Row(exam, None, fault.step, fault.reason, **facts)
     by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
     document = estimate_facts(load_json(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE)))
-    return Row(exam, document, synthetic=mapped.get("synthetic"), outlying=outlying, **facts)
+    return Row(exam, document, findings=(*findings_in(document["findings"]), *together), **facts)
 
 
 def estimate_facts(document: Any) -> dict[str, Any]:
     """What tables and pages need of an estimate's JSON object."""
-    diagnostics = {name: document["diagnostics"].get(name, []) for name in _OF_DIAGNOSTICS}
     masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document.get("masses", [])]
-    return {name: document.get(name) for name in _OF_ESTIMATE} | {"diagnostics": diagnostics, "masses": masses}
+    return {name: document.get(name) for name in _OF_ESTIMATE} | {"masses": masses}
 
 
 def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
@@ -153,10 +139,7 @@ def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
         document = load_json(campaign.folder / MASSES / name / POOLED)
         if isinstance(document, dict):
             found[name] = {key: document[key] for key in _OF_POOLED}
-            found[name]["maps"] = [
-                {"broken_assumptions": [], **{key: one[key] for key in _OF_MAPS if key in one}}
-                for one in document["maps"]
-            ]
+            found[name]["maps"] = [one["map"] for one in document["maps"]]
     return found
 
 
@@ -186,8 +169,8 @@ def _done(row: Row) -> dict[str, object]:
         "smallest_mm": None if smallest is None else smallest["median"],
         "detected_probability": document["detected_probability"],
         **{f"centre_{axis}_mm": value["median"] for axis, value in centre.items()},
-        "cautions": "; ".join(row.cautions) or None,
-        "checks": "; ".join(row.checks) or None,
+        "verdict": row.verdict,
+        "findings": " ".join(finding_lines(row.findings)) or None,
         "synthetic": row.synthetic,
     }
 

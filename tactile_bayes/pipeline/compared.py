@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.pipeline.comparing import Comparing
 from tactile_bayes.pipeline.one_map import Answer, size_priors
 from tactile_bayes.pipeline.pooled import common_calibration
@@ -81,6 +83,7 @@ def compare_answers(
     digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
     check_repeatability(settings, calibration, digests)
     compared = _compared(visits, calibration, settings, comparing)
+    compared = replace(compared, findings=by_weight((*compared.findings, *_of_visits(visits))))
     scans = [scan for one in visits for scan in _scans(one)]
     provenance = Provenance("compare", _recorded(settings, comparing), digests, seed=settings.seed, scans=scans)
     document = compare_document(
@@ -128,16 +131,16 @@ def _compared(
         return Compared("not_one_mass", "; ".join(contradicted), advice)
     if missing:
         return Compared("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
-    refused, apart, cautions = _by_place(found, comparing)
+    refused, apart, doubts = _by_place(found, comparing)
     if refused is not None:
         return refused
-    return _sized(found, calibration, settings, apart=apart, cautions=cautions)
+    return _sized(found, calibration, settings, apart=apart, doubts=doubts)
 
 
 def _by_place(
     visits: Sequence[Sequence[Answer]], comparing: Comparing
-) -> tuple[Compared | None, tuple[Apart | None, ...], list[str]]:
-    """Refusal where the places do not show one mass, the distances from the first visit, and cautions."""
+) -> tuple[Compared | None, tuple[Apart | None, ...], list[Finding]]:
+    """Refusal where the places do not show one mass, the distances from the first visit, and what else speaks of it."""
     from tactile_bayes.size.comparison import Compared
     from tactile_bayes.size.same_mass import Place, apart
 
@@ -158,9 +161,8 @@ def _by_place(
     if not comparing.same_mass and unknown:
         reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
         return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", found), (), []
-    cautions = [f"CAUTION: {text}; taken as one mass because you say so" for text in doubts]
-    cautions += ["CAUTION: taken as one mass because you say so: no landmarks show it"] if unknown else []
-    return None, found, cautions
+    doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
+    return None, found, [Finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
 
 
 def _sized(
@@ -169,7 +171,7 @@ def _sized(
     settings: Settings,
     *,
     apart: tuple[Apart | None, ...],
-    cautions: Sequence[str],
+    doubts: Sequence[Finding],
 ) -> Compared:
     """Sizes of visits that are of one mass, or why there are none."""
     import numpy as np
@@ -198,14 +200,13 @@ def _sized(
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
         return Compared("no_estimate", "too many draws have no positive size", "", apart)
     outside = _by_visit(shapes, fitted, lambda at, middle: at.outside(*middle))
-    cautions = [
-        *cautions,
-        *(f"CAUTION: outside the calibration's range: {text}" for text in outside),
-        *_broken(visits),
+    findings = [
+        *doubts,
+        *(Finding("outside_calibration", f"outside the calibration's range: {text}") for text in outside),
         *_fat_apart(shapes, calibration),
     ]
     another = None if priors.another_exam is None else joint(priors.another_exam)
-    return Compared("compared", "", "", apart, tuple(cautions), sizes, another)
+    return Compared("compared", "", "", apart, tuple(findings), sizes, another)
 
 
 def _by_visit(
@@ -223,23 +224,23 @@ def _by_visit(
     return list(dict.fromkeys(found))
 
 
-def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[str]:
+def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[Finding]:
     """Caution where the maps differ too much in the depth of fat to be of one breast."""
+    from tactile_bayes.report.pooled import fat_apart
+
     fat = calibration.with_fat
     depths = None if fat is None else fat.depths_apart([one.profile for maps in shapes for one in maps])
-    if depths is None:
-        return []
-    return ["CAUTION: the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another".format(*depths)]
+    return [] if depths is None else [fat_apart(depths)]
 
 
-def _broken(visits: Sequence[Sequence[Answer]]) -> list[str]:
-    """What is wrong with the maps' scans: side or landmarks, and broken assumptions."""
-    documents = [(number, one.document or {}) for number, maps in enumerate(visits, start=1) for one in maps]
+def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
+    """What speaks against the maps of each visit; a size alone outside its calibration is judged anew."""
     return [
-        f"CAUTION: visit {number}: {text}"
-        for number, document in documents
-        for text in (document.get("side_caution"), *document.get("diagnostics", {}).get("broken_assumptions", []))
-        if text
+        one.at(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
+        for number, maps in enumerate(visits, start=1)
+        for i, answer in enumerate(maps, start=1)
+        for one in answer.findings
+        if one.kind != "outside_calibration"
     ]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError
+from tactile_bayes.findings import Finding, by_weight, findings_in
 from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import FIT_RADIUS_MM
@@ -45,6 +46,11 @@ class Answer:
     fingerprint: int = 0
     full_text: str = ""
     head: HeadShape | None = None
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the answer, cautions first; nothing for an error."""
+        return () if self.document is None else findings_in(self.document["findings"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +197,7 @@ def estimate_one(
         return estimate_map(a_map, calibration=calibration, options=given, rng=rng, progress=told)
 
     estimate = with_masses(tactile_map, estimated(tactile_map, options), options, estimated)
+    estimate = _with_place(estimate, tactile_map, scans, probability=settings.interval)
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     posterior = estimate.map_posterior
@@ -210,6 +217,29 @@ def estimate_one(
     recorded = _recorded(settings, options, calibration=named)
     provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
     return Outcome(tactile_map, estimate, provenance, settings, used)
+
+
+def _with_place(
+    estimate: Estimate, tactile_map: TactileMap, scans: Sequence[Mapping[str, str]], *, probability: float
+) -> Estimate:
+    """The estimate with what speaks against the place of its masses: side and landmarks, and how near they lie."""
+    from tactile_bayes.report.lump_place import side_findings, side_of
+    from tactile_bayes.report.masses_document import patient_mm
+    from tactile_bayes.report.touching import touching_findings, touching_masses
+
+    here = [patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
+    side = side_findings(side_of(scans), here[0] if here else None)
+    sized = [
+        {
+            "number": number,
+            "centre_mm": {"x": one.x_mm, "y": one.y_mm},
+            "max_size_mm": one.estimate.size.summarise("max_size_mm", probability=probability).as_dict(),
+        }
+        for number, one in enumerate(estimate.masses, start=1)
+        if one.estimate.size is not None
+    ]
+    touching = touching_findings(touching_masses(sized)) if len(sized) > 1 else []
+    return replace(estimate, findings=by_weight((*side, *estimate.findings, *touching)))
 
 
 def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str) -> dict[str, Any]:
@@ -377,7 +407,6 @@ def answer_of(outcome: Outcome) -> Answer:
         place=place,
     )
     told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
-    told["side_caution"] = document["side_caution"]
     text = estimate_summary(estimate, quantities, **told)
     full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
     exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE

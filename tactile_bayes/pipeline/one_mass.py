@@ -68,7 +68,7 @@ def apart_from_others(documents: Sequence[Document | None]) -> dict[int, str]:
     found = [one for masses in reported.values() for one in masses]
     common = _common(reported) or max(found, key=lambda one: one.size_mm or 0.0, default=None)
     away = {i: one.away_mm(common) for i, masses in reported.items() for one in masses if common is not None}
-    words = "its mass lies {:.0f} mm from that of the other maps: is it the same one?"
+    words = "its mass lies {:.0f} mm from that of the other maps and may be another one"
     return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
 
 

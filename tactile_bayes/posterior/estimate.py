@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
+from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
-from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
 from tactile_bayes.posterior.assessment import Assessment, MapDraws, bump_of
@@ -36,12 +37,14 @@ OTHER_HEAD = (
     "calibrate size population.csv --form gaussian-process -o size.json`, and give --size-calibration size.json"
 )
 """How to make a calibration for another head."""
-IRREGULAR = (
+_IRREGULAR = Finding(
+    "irregular",
     "irregular outline: the bump is more skewed, its axis ratio changes more outwards, or it depends more on the "
     "place under the head than a ball's; two lumps that touch, an upright, tilted or rough one look so, and sizes "
-    "get a wider interval"
+    "get a wider interval",
 )
-"""Said of a lump whose map is `MapPosterior.irregular`."""
+_NEAR_LEVEL = 0.02
+"""An offset of the background of this size and more is mentioned."""
 
 
 def estimate_map(
@@ -73,6 +76,19 @@ def estimate_map(
     if calibration is not None:
         check_recipe(tactile_map, calibration, options.fit)
         calibration = calibration_for(tactile_map, calibration)
+    found = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
+    return replace(found, findings=by_weight((*tactile_map.findings, *found.findings)))
+
+
+def _answer(
+    tactile_map: TactileMap,
+    calibration: Calibration | None,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], None] | None,
+) -> Estimate:
+    """The lump's size, or why there is none."""
     if not tactile_map.covered.any():
         return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place"))
     where = searched(tactile_map, options.fit.centre_mm)
@@ -122,7 +138,7 @@ def _measured(
     detection = made.detection
     if found.fault is not None:
         return _none(found.fault, candidates, detection, bump)
-    diagnostics = _diagnostics(tactile_map, found)
+    diagnostics = _diagnostics(found)
     if found.too_far:
         return _none(extrapolated(list(found.too_far)), candidates, detection, bump, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
@@ -144,6 +160,7 @@ def _measured(
         sensitivity=_sensitivity(made.posterior, size, options),
         by_place=found.by_place,
         bump=bump,
+        findings=tuple(_findings(found, cell_mm=tactile_map.recipe.cell_mm)),
     )
 
 
@@ -219,16 +236,11 @@ def _way_to(recipe: Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-def _diagnostics(tactile_map: TactileMap, found: Drawn) -> Diagnostics:
+def _diagnostics(found: Drawn) -> Diagnostics:
     made, calibration = found.made, found.calibration
-    medians = made.posterior.medians
     return Diagnostics(
         cells=len(made.fit.cells),
         covered_share=made.fit.covered_share,
-        coarse_cells=tactile_map.recipe.cell_mm > CELL_PER_SIGMA * min(medians[1:]),
-        outside_calibration=_outside(found),
-        broken_assumptions=broken_assumptions(tactile_map.quality),
-        assumptions_to_check=(*assumptions_to_check(tactile_map.quality), *_form_to_check(made.posterior)),
         fat_mm=None if calibration is None else calibration.fat_mm,
         method=made.draws.method,
         sampler=made.draws.diagnostics,
@@ -239,17 +251,26 @@ def _diagnostics(tactile_map: TactileMap, found: Drawn) -> Diagnostics:
     )
 
 
-def _outside(found: Drawn) -> tuple[str, ...]:
-    """In what the map and its size lie outside the calibration's table, in words."""
-    if found.calibration is None:
-        return ()
-    beyond = [] if found.size is None else found.calibration.beyond_lumps(found.size.median_mm)
-    return (*found.calibration.outside(*found.made.posterior.medians), *beyond)
-
-
-def _form_to_check(posterior: MapPosterior) -> tuple[str, ...]:
-    """What the report says of a lump that is neither ball nor ellipsoid; empty where it may be one."""
-    return (IRREGULAR,) if posterior.irregular else ()
+def _findings(found: Drawn, *, cell_mm: float) -> Iterator[Finding]:
+    """What speaks against the size of a lump, besides what speaks against its map."""
+    posterior, calibration = found.made.posterior, found.calibration
+    if calibration is not None:
+        beyond = [] if found.size is None else calibration.beyond_lumps(found.size.median_mm)
+        for text in (*calibration.outside(*posterior.medians), *beyond):
+            yield Finding("outside_calibration", f"outside the calibration's range: {text}")
+    if posterior.irregular:
+        yield _IRREGULAR
+    if cell_mm > CELL_PER_SIGMA * min(posterior.medians[1:]):
+        text = f"cells of {cell_mm:g} mm are coarse for this width"
+        remedy, on_paper = "map again with a smaller --cell-mm", "map the scan again with smaller cells"
+        yield Finding("coarse_cells", text, remedy, on_paper)
+    offset = found.made.figures.level_offset
+    if offset is not None and abs(offset) >= _NEAR_LEVEL:
+        text = (
+            f"the level about the bump is {offset:+.3f} off the fixed background: something else bears on the head (a "
+            "rib, a second mass), or the lump is large for it; the size is less certain than the interval says"
+        )
+        yield Finding("uneven_level", text)
 
 
 def _convergence(made: MapDraws, size: SizePosterior | None) -> dict[str, dict[str, float]]:

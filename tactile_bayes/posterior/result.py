@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Literal
 
+from tactile_bayes.findings import Finding
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.lump.posterior import MapPosterior
@@ -93,6 +94,8 @@ class Estimate:
         The bump at the mode of the lump that the answer is about, sized or not; None where there is no lump.
     masses
         All masses of the map, see `masses.with_masses`; empty where nobody has looked.
+    findings
+        What speaks against the answer, cautions first.
     """
 
     status: Status
@@ -113,6 +116,7 @@ class Estimate:
     other_rises: tuple[Rise, ...] = ()
     bump: ModalBump | None = None
     masses: tuple[Mass, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ from dataclasses import field
 from typing import Final
 from urllib.parse import quote
 
+from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.growth import Growth, growth_section
@@ -81,8 +82,8 @@ class Card:
         Why there is no size; empty where there is one.
     size
         Median, ends, probability and SD of the largest size, mm; None without one.
-    cautions, checks
-        What puts the size in doubt, and what is to be looked at.
+    findings
+        What speaks against the exam.
     thumbnail
         PNG of the map, or the name of its file from the page's folder; None without one.
     links
@@ -94,8 +95,7 @@ class Card:
     facts: tuple[str, ...] = ()
     reason: str = ""
     size: Mapping[str, float] | None = None
-    cautions: tuple[str, ...] = ()
-    checks: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     thumbnail: bytes | str | None = None
     links: Mapping[str, str] = field(default_factory=dict)
 
@@ -104,7 +104,7 @@ class Card:
         """Sort key: failures, exams without a size, cautions, checks, and wide intervals come first."""
         wide = 0.0 if self.size is None else (self.size["high"] - self.size["low"]) / self.size["median"]
         order = (FAILED, UNSIZED, SIZED).index(self.status)
-        return order, -(10 * len(self.cautions) + len(self.checks)), -wide
+        return order, -sum(10 if one.severity == "caution" else 1 for one in self.findings), -wide
 
 
 def worst(cards: Iterable[Card], most: int) -> list[Card]:
@@ -174,16 +174,16 @@ def _filters(cards: Sequence[Card]) -> Iterator[str]:
 
 
 def _card(card: Card) -> Iterator[str]:
-    flagged = "yes" if card.cautions or card.checks else "no"
+    flagged = "yes" if card.findings else "no"
     yield f'<article class="{_CLASSES[card.status]}" data-status="{card.status}" data-flagged="{flagged}">'
     yield f"<h2>{html.escape(card.name)}</h2>"
     yield f'<p class="note">{html.escape(", ".join(card.facts))}</p>'
     if card.thumbnail is not None:
         yield f'<img loading="lazy" alt="{html.escape(_alt(card))}" src="{_source(card.thumbnail)}">'
     yield _size(card)
-    flags = [("caution", one) for one in card.cautions] + [("check", one) for one in card.checks]
-    if flags:
-        yield "<ul>" + "".join(f'<li class="{kind}">{html.escape(text)}</li>' for kind, text in flags) + "</ul>"
+    if card.findings:
+        told = [(one, text) for one in SEVERITIES for text in finding_lines(card.findings, one, paper=True)]
+        yield "<ul>" + "".join(f'<li class="{kind}">{html.escape(text)}</li>' for kind, text in told) + "</ul>"
     if card.links:
         yield f'<p class="note">{_links(card.links)}</p>'
     yield "</article>"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.summary import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
@@ -61,9 +62,10 @@ def compare_document(
     return {
         "schema": SCHEMA,
         "status": compared.status,
+        "verdict": verdict_of(compared.findings, answered=joint is not None),
+        "findings": [one.as_dict() for one in compared.findings],
         "reason": compared.reason,
         "advice": compared.advice,
-        "cautions": list(compared.cautions),
         "visits": [
             _visit(i, visits[i], names[i], joint, day=None if days is None else days[i], probability=probability)
             for i in range(len(visits))

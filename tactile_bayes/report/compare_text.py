@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from tactile_bayes.findings import finding_lines, finding_summary, findings_in
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.narrowing import joined
 
 MORE: Final = "More (maps, every visit, growth rates, omissions): compare -v."
 _MOST_VISITS: Final = 3
@@ -15,26 +15,31 @@ _MOST_VISITS: Final = 3
 
 def compare_summary(document: Mapping[str, Any]) -> str:
     """Report in at most 12 lines; `compare_text` gives the rest."""
+    findings = findings_in(document["findings"])
+    lines = finding_summary(findings, "caution", most=2)
     if document["status"] != "compared":
-        return "\n".join([*_refusal(document), RESEARCH_USE]) + "\n"
+        checks = finding_summary(findings, "check", most=2)
+        return "\n".join([*lines, *_refusal(document), *checks, RESEARCH_USE]) + "\n"
     last = document["changes"][-1]
-    lines = joined([one.removeprefix("CAUTION: ") for one in document["cautions"]], most=1, lead="CAUTION: ")
     visits = document["visits"]
     shown = visits if len(visits) <= _MOST_VISITS else [visits[0], visits[-1]]
     lines += [_visit_line(one) for one in shown]
     lines += _place_line(document["places"][-1])
     lines += [_change_line(last), _odds_line(last), _verdict_line(last)]
     lines += _rate_lines(document, last)[:1] + _site_line(document) + _another_line(last)
+    lines += finding_summary(findings, "check", most=2)
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
 def compare_text(document: Mapping[str, Any]) -> str:
     """Full report."""
-    lines = [text if text.endswith(".") else f"{text}." for text in document["cautions"]]
+    findings = findings_in(document["findings"])
+    lines = finding_lines(findings, "caution")
     for one in document["visits"]:
         lines += [_visit_line(one), *(f"  {_map_line(found)}" for found in one["maps"])]
     for place in document["places"]:
         lines += _place_line(place, name=len(document["places"]) > 1)
+    lines += finding_lines(findings, "check")
     if document["status"] != "compared":
         return "\n".join([*lines, *_refusal(document), RESEARCH_USE]) + "\n"
     for change in document["changes"]:

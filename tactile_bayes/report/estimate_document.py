@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.findings import verdict
 from tactile_bayes.inference.summary import Quantity, nine_digits
 from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.lump_place import side_caution, side_of
 from tactile_bayes.report.masses_document import masses_document
-from tactile_bayes.report.quantities import ANOTHER_EXAM, WIDTHS, another_exam, estimate_quantities, xiphoid_mm
+from tactile_bayes.report.quantities import ANOTHER_EXAM, WIDTHS, another_exam, estimate_quantities
 from tactile_bayes.report.scene_text import scene_document
 from tactile_bayes.report.supposed_text import supposed_document
 from tactile_bayes.report.touching import touching_masses
@@ -57,6 +57,8 @@ def estimate_document(
     return {
         "schema": SCHEMA,
         "status": estimate.status,
+        "verdict": verdict(estimate.findings, answered=estimate.size is not None),
+        "findings": [one.as_dict() for one in estimate.findings],
         "reason": estimate.reason,
         "reason_code": estimate.code,
         "advice": estimate.advice,
@@ -66,7 +68,6 @@ def estimate_document(
         "centre_mm": point("centre_mm"),
         "centre_patient_mm": point("centre_patient_mm"),
         "position": None if place is None else place.as_dict(probability),
-        "side_caution": side_caution(side_of(provenance.scans), xiphoid_mm(quantities)),
         "angle_deg": one("angle_deg"),
         "detected_probability": None if detection is None else nine_digits(detection.probability),
         "variance_share": None if share is None else {k: nine_digits(v) for k, v in share.items()},

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from tactile_bayes.findings import Finding
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.result import Estimate, Mass
     from tactile_bayes.report.map_figure import FitContour, NumberedMass
@@ -37,7 +39,7 @@ def draw_figures(
         Of the interval of the size.
     """
     if figure is not None and estimate.size is not None:
-        draw_size(estimate.size, figure, name=name, probability=probability, force=force)
+        draw_size(estimate.size, figure, name=name, probability=probability, findings=estimate.findings, force=force)
         figure = None
     if fit_figure is not None and estimate.draws is not None:
         draw_fit(tactile_map, estimate, fit_figure, name=name, force=force)
@@ -48,8 +50,16 @@ def draw_figures(
                 draw_map(tactile_map, estimate, path, name=name, force=force)
 
 
-def draw_size(size: SizePosterior, path: Path | None, *, name: str, probability: float, force: bool) -> Figure:
-    """Draw the posterior of the largest and smallest size with their intervals."""
+def draw_size(
+    size: SizePosterior,
+    path: Path | None,
+    *,
+    name: str,
+    probability: float,
+    findings: Sequence[Finding],
+    force: bool,
+) -> Figure:
+    """Draw the posterior of the largest and smallest size with their intervals, and what speaks against them."""
     from tactile_bayes.report.size_figure import SizeInterval, size_figure
     from tactile_bayes.report.size_text import exams_label
 
@@ -65,6 +75,7 @@ def draw_size(size: SizePosterior, path: Path | None, *, name: str, probability:
         path,
         intervals=intervals,
         title=f"Size of the lump: {name}",
+        findings=findings,
         force=force,
     )
 
@@ -76,7 +87,7 @@ def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
 
     fitted = fitted_cells(estimate)
     assert fitted is not None
-    return fit_figure(tactile_map, fitted, path, title=f"Fit: {name}", force=force)
+    return fit_figure(tactile_map, fitted, path, title=f"Fit: {name}", findings=estimate.findings, force=force)
 
 
 def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, name: str, force: bool) -> Figure:
@@ -97,6 +108,7 @@ def draw_map(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
         looked_at=places,
         title=f"Tactile map: {name}",
         note=note,
+        findings=estimate.findings,
         force=force,
     )
 

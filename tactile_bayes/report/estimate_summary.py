@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from tactile_bayes.findings import finding_summary
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.posterior.result import Estimate
@@ -17,7 +18,6 @@ from tactile_bayes.report.estimate_text import (
     size_decimals,
     size_table,
     tracker_share,
-    warnings,
 )
 from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.masses_document import MassDocument, mass_lines, numbered
@@ -29,6 +29,7 @@ from tactile_bayes.size.posterior import EXTREMES
 
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 MOST_CAUTIONS = 3
+MOST_CHECKS = 2
 MOST_MASSES = 3
 """Masses besides the reported one that have a line."""
 
@@ -40,7 +41,6 @@ def estimate_summary(
     probability: float,
     masses: Sequence[MassDocument] = (),
     place: ClockPosition | None = None,
-    side_caution: str = "",
 ) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
 
@@ -54,14 +54,13 @@ def estimate_summary(
         As `masses_document` gives them.
     place
         Of the lump about the nipple, where it is known.
-    side_caution
-        As `lump_place.side_caution` gives it.
     """
     if estimate.status == "no_estimate":
-        body = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
-        body += _masses(masses, room=MOST_MASSES)
+        body = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
+        body += [no_estimate_line(estimate.reason), *advice_lines(estimate)]
+        body += [*_masses(masses, room=MOST_MASSES), *finding_summary(estimate.findings, "check", most=MOST_CHECKS)]
     else:
-        body = _something(estimate, quantities, probability, masses, place, side_caution)
+        body = _something(estimate, quantities, probability, masses, place)
     return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
 
 
@@ -71,18 +70,16 @@ def _something(
     probability: float,
     masses: Sequence[MassDocument],
     place: ClockPosition | None,
-    side_caution: str,
 ) -> list[str]:
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
-    lines = _cautions(estimate, side_caution)
+    lines = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
     table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
     lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
     lines += _lump(estimate, quantities, numbered(masses), place)
     after = [f"No size: {estimate.reason}.", *advice_lines(estimate)] if estimate.reason else []
-    doubts = [text.rstrip(".") for text in warnings(estimate)]
     last = [*_quality(estimate, {name: quantities[name] for name in shown})]
-    last += joined(doubts, most=2, lead="Check: ")
+    last += finding_summary(estimate.findings, "check", most=MOST_CHECKS)
     room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
     beside = _masses(masses, room=min(MOST_MASSES, room))
     widths = [] if estimate.size is None else width_lines(estimate.size.variance_share)
@@ -97,15 +94,6 @@ def _supposed(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[st
         return []
     supposed = supposed_document(estimate.size, largest)
     return supposed_line(supposed, largest.median, places=size_decimals([largest]))
-
-
-def _cautions(estimate: Estimate, side_caution: str) -> list[str]:
-    """One line on a doubtful side, broken assumptions and a map outside the calibration's range; none without."""
-    found, texts = estimate.diagnostics, [side_caution] if side_caution else []
-    if found is not None:
-        outside = joined(found.outside_calibration, most=MOST_CAUTIONS, lead="outside the calibration's range: ")
-        texts += [*found.broken_assumptions, *(line.rstrip(".") for line in outside)]
-    return joined(texts, most=MOST_CAUTIONS, lead="CAUTION: ")
 
 
 def _lump(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.mapping.clock_face import ClockPosition
@@ -22,7 +23,6 @@ from tactile_bayes.report.size_text import (
     decimals,
     ends_text,
     exams_label,
-    range_cautions,
     shape_text,
     site_interval_text,
     table_head,
@@ -48,8 +48,6 @@ ROWS = (
     ("centre_patient_mm.x", "patient's right of xiphoid, x", "mm"),
     ("centre_patient_mm.y", "centre above the xiphoid, y", "mm"),
 )
-NEAR_LEVEL = 0.02
-"""An offset of the background of this size and more is mentioned."""
 MOST_PASSED_OVER = 4
 LEAST_SHARE = 0.005
 """Of the width variance, below which the tracker's share is not worth a line."""
@@ -69,12 +67,10 @@ def estimate_text(
     quantities: Mapping[str, Quantity] | None = None,
     masses: Sequence[MassDocument] | None = None,
     place: ClockPosition | None = None,
-    side_caution: str = "",
 ) -> str:
-    """Full report of one map: findings with intervals, sources of uncertainty, omissions.
+    """Full report of one map: sizes with intervals, sources of uncertainty, omissions.
 
-    `quantities`, `masses` (see `masses_document`), the lump's `place` about the nipple and `side_caution` (see
-    `lump_place.side_caution`) where they are at hand.
+    `quantities`, `masses` (see `masses_document`) and the lump's `place` about the nipple where they are at hand.
     """
     if quantities is None:
         quantities = estimate_quantities(estimate, tactile_map, probability=probability)
@@ -83,18 +79,17 @@ def estimate_text(
             estimate.masses, tactile_map, probability=probability, quantities=quantities, reason=estimate.reason
         )
     if estimate.status == "no_estimate":
-        first = [no_estimate_line(estimate.reason), *advice_lines(estimate)]
+        first = [*finding_lines(estimate.findings), no_estimate_line(estimate.reason), *advice_lines(estimate)]
         return "\n".join([*first, *mass_lines(masses), *passed_over(estimate), RESEARCH_USE]) + "\n"
     table = size_table(quantities, probability, exam_spread=exam_spread(estimate))
-    lines = [f"CAUTION: {side_caution}."] if side_caution else []
-    lines += [*_cautions(estimate), *table, ""]
+    lines = [*finding_lines(estimate.findings, "caution"), *table, ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
     lines += [] if place is None else [place_line(place, probability)]
     lines += [
         *_findings(estimate, quantities, masses),
         *_scene(estimate, masses),
-        *warnings(estimate),
+        *finding_lines(estimate.findings, "check"),
         *passed_over(estimate),
         *_left_out(estimate),
     ]
@@ -222,29 +217,6 @@ def _elsewhere(masses: Sequence[MassDocument]) -> list[str]:
     """A line on what the odds of a second lump do not speak of; empty where there is one mass."""
     numbers = " and ".join(str(one["number"]) for one in others(masses))
     return [f"These odds are of this window alone: mass {numbers} of the map is above."] if numbers else []
-
-
-def _cautions(estimate: Estimate) -> list[str]:
-    """Lines that must be read before any number: a broken assumption, a map outside the calibration's range."""
-    found = estimate.diagnostics
-    if found is None:
-        return []
-    return [*(f"CAUTION: {text}." for text in found.broken_assumptions), *range_cautions(found.outside_calibration)]
-
-
-def warnings(estimate: Estimate) -> list[str]:
-    """Reasons why the size is less certain than its interval says: coarse cells, an unexpected level, uneven fat."""
-    found, lines = estimate.diagnostics, []
-    if found is not None and found.coarse_cells:
-        lines.append("The cells are coarse for this width: map again with a smaller --cell-mm.")
-    offset = None if found is None else found.noise.level_offset
-    if offset is not None and abs(offset) >= NEAR_LEVEL:
-        lines.append(
-            f"The level about the bump is {offset:+.3f} off the fixed background: something else bears on the head "
-            "(a rib, a second mass), or the lump is large for it; the size is less certain than the interval says."
-        )
-    checks = () if found is None else found.assumptions_to_check
-    return [*lines, *(f"{text[0].upper()}{text[1:]}." for text in checks)]
 
 
 def passed_over(estimate: Estimate) -> list[str]:

@@ -14,9 +14,9 @@ from tactile_bayes.report.exam_dial import breast_dial
 from tactile_bayes.report.exam_picture import Frame, colour_bar, exam_picture, small_pictures
 from tactile_bayes.report.exam_ruler import size_ruler
 from tactile_bayes.report.exam_words import (
-    caution_sentences,
     detail_sentence,
     facts,
+    finding_sentences,
     headline,
     largest,
     mass_row,
@@ -36,7 +36,7 @@ NO_MAP: Final = (
 MOST_REPEATS: Final = 5
 MOST_MASSES: Final = 4
 _LONGEST: Final = 400
-_LONGEST_CAUTION: Final = 200
+_LONGEST_FINDING: Final = 200
 _PICTURE_MM: Final = (108.0, 96.0)
 _LOWER_MM: Final = 54.0
 """Height of the picture on a crowded page: one that has both repeats and several masses below it."""
@@ -83,7 +83,7 @@ def exam_page(exam: Exam) -> str:
         *_facts(exam),
         f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
         f'<p class="finding">{html.escape(headline(exam))}</p>',
-        *_paragraphs([_cut(text, _LONGEST_CAUTION) for text in caution_sentences(exam)], kind="caution"),
+        *_paragraphs([_cut(text, _LONGEST_FINDING) for text in finding_sentences(exam)], kind="caution"),
         '<div class="columns"><div class="figure">',
         *_picture(exam),
         *_place(exam),

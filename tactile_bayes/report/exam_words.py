@@ -8,18 +8,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.clock_face import clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
-from tactile_bayes.report.lump_place import from_xiphoid, side_caution, side_of
+from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
-from tactile_bayes.report.touching import touching_sentences
 
 UNDETECTED: Final = ("undetected", "empty")
-MOST_CAUTIONS: Final = 2
+MOST_FINDINGS: Final = 2
 _OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
@@ -155,37 +155,11 @@ def narrowing_sentences(exam: Exam) -> list[str]:
     return [] if share is None else [_OPTIONS.sub("", line) for line in width_lines(share)]
 
 
-def caution_sentences(exam: Exam) -> list[str]:
-    """What puts the size in doubt, the gravest first; long lists end with their number."""
-    found = []
-    for one in exam.maps:
-        diagnostics = one.document["diagnostics"]
-        found += [f"Caution: {text}." for text in diagnostics.get("broken_assumptions", [])]
-        outside = diagnostics.get("outside_calibration", [])
-        found += [f"Caution: outside the calibration's range: {text.rstrip('.')}." for text in outside]
-        found += [f"To check: {text}." for text in diagnostics.get("assumptions_to_check", [])]
-        found += [f"To check: {text}." for text in touching_sentences(one.document.get("touching", []))]
-    if exam.pooled is not None:
-        if exam.pooled["fat_apart_mm"]:
-            depths = " and ".join(f"{depth:.1f}" for depth in exam.pooled["fat_apart_mm"])
-            found.insert(0, f"Caution: the fat under the head is {depths} mm deep on two maps: are they of one mass?")
-        if any(len(one.masses) > 1 for one in exam.maps) and not exam.pooled.get("one_place"):
-            found.insert(0, "To check: a map shows several masses; was every map sized at the same one?")
-        told_of_maps = [
-            f"Caution: {text}." for one in exam.pooled["maps"] for text in one.get("broken_assumptions", [])
-        ]
-        found = [*(text for text in told_of_maps if text not in found), *found]
-        apart = [one["map"] for one in exam.pooled["maps"] if one["outlying"]]
-        found += [f"To check: apart from the others: {', '.join(apart)}."] if apart else []
-    told = list(dict.fromkeys([*_side_in_doubt(exam), *found]))
-    more = len(told) - MOST_CAUTIONS
-    return [*told[:MOST_CAUTIONS], f"And {more} more: see `estimate -v`."] if more > 0 else told
-
-
-def _side_in_doubt(exam: Exam) -> list[str]:
-    """Caution where side and landmarks disagree."""
-    told = side_caution(side_of(exam.scans), exam.main.masses[0].patient_mm if exam.main.masses else None)
-    return [f"Caution: {told}."] if told else []
+def finding_sentences(exam: Exam) -> list[str]:
+    """What speaks against the result, cautions first; long lists end with their number."""
+    told = finding_lines(findings_in(exam.document["findings"]), paper=True)
+    more = len(told) - MOST_FINDINGS
+    return [*told[:MOST_FINDINGS], f"And {more} more: see `estimate -v`."] if more > 0 else told
 
 
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:

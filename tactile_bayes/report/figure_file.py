@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Final
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import refuse_existing, write_bytes
+from tactile_bayes.findings import Finding, finding_lines
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +41,9 @@ def check_suffix(path: Path) -> None:
 
 
 @contextmanager
-def figure_file(path: Path | None, *, size_in: tuple[float, float], force: bool) -> Iterator[Figure]:
+def figure_file(
+    path: Path | None, *, size_in: tuple[float, float], force: bool, findings: Sequence[Finding] = ()
+) -> Iterator[Figure]:
     """Give a figure that is written when the block ends, independent of the user's matplotlib settings.
 
     Parameters
@@ -50,6 +54,8 @@ def figure_file(path: Path | None, *, size_in: tuple[float, float], force: bool)
         Width and height in inches.
     force
         Overwrite an existing file.
+    findings
+        What speaks against what is shown, told above it.
 
     Raises
     ------
@@ -65,9 +71,14 @@ def figure_file(path: Path | None, *, size_in: tuple[float, float], force: bool)
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams["svg.hashsalt"] = "tactile-bayes"  # else the names inside an SVG are random
-        figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
+        width_in, height_in = size_in
+        told = [part for line in finding_lines(findings, paper=True) for part in wrap(line, round(13 * width_in))]
+        figure = Figure(figsize=(width_in, height_in + 0.17 * len(told)), dpi=DPI, layout="constrained")
         figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))  # type: ignore[union-attr,call-arg]
         yield figure
+        if told:
+            title = figure.get_suptitle()
+            figure.suptitle("\n".join([*told, *([title] if title else [])]), x=0.01, ha="left", fontsize=9.5)
         if path is None:
             return
         suffix = path.suffix.lower()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.fitted import FittedCells
@@ -27,7 +29,13 @@ _CAPTION: Final = (
 
 
 def fit_figure(
-    tactile_map: TactileMap, fitted: FittedCells, path: Path | None, *, title: str = "", force: bool = False
+    tactile_map: TactileMap,
+    fitted: FittedCells,
+    path: Path | None,
+    *,
+    title: str = "",
+    findings: Sequence[Finding] = (),
+    force: bool = False,
 ) -> Figure:
     """Draw data, fit and residual of a fit window, data and fit in the same colours; see `figure_file` for the file.
 
@@ -39,12 +47,14 @@ def fit_figure(
         The window's cells, see `fitted_cells`.
     title
         Above the figure; nothing that identifies a person.
+    findings
+        What speaks against the fit, told above it.
     """
     window, (value, fit, residual) = _window(tactile_map, fitted)
     low, high = (float(end) for end in np.nanquantile(np.stack([value, fit]), _ENDS))
     most = max(float(np.nanquantile(np.abs(residual), _ENDS[1])), 1e-12)
     words = tactile_map.recipe.value_words
-    with figure_file(path, size_in=(12.8, 4.1), force=force) as figure:
+    with figure_file(path, size_in=(12.8, 4.1), force=force, findings=findings) as figure:
         data_axes, fit_axes, residual_axes = figure.subplots(1, 3)
         for axes, values, name in ((data_axes, value, "Data"), (fit_axes, fit, "Fit")):
             draw_panel(axes, values, window, label=words, title=name, cmap="viridis", vmin=low, vmax=high)

@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from tactile_bayes.findings import Finding, finding_lines, findings_in
 from tactile_bayes.records import dataclass
 
 HEADS: Final = ("mass", "visits", "days", "earlier mm", "later mm", "change", "")
@@ -34,7 +35,7 @@ class Growth:
         Change of the diameter, likewise; None without one.
     verdict
         ``grown``, ``shrunk`` or ``no_change_shown``; empty without one.
-    cautions
+    findings
         What speaks against the comparison.
     link
         File of the comparison from the page's folder; empty for none.
@@ -50,14 +51,14 @@ class Growth:
     sizes_mm: tuple[Mapping[str, float], ...] = ()
     percent: Mapping[str, float] | None = None
     verdict: str = ""
-    cautions: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     link: str = ""
 
     @property
     def words(self) -> str:
         """What became of the mass, or why nothing is known of it."""
         told = _VERDICTS.get(self.verdict, f"not compared: {self.reason}")
-        return "; ".join([told, *(one.removeprefix("CAUTION: ") for one in self.cautions)])
+        return ". ".join([told, *finding_lines(self.findings, paper=True)])
 
 
 def of_document(patient: str, mass: str, visits: Sequence[str], document: Mapping[str, Any], link: str) -> list[Growth]:
@@ -76,7 +77,7 @@ def of_document(patient: str, mass: str, visits: Sequence[str], document: Mappin
         Growth(
             patient, mass, visits[0], visits[change["later"] - 1], "compared", days=found[change["later"] - 1]["day"],
             sizes_mm=(found[0]["max_size_mm"], found[change["later"] - 1]["max_size_mm"]), percent=change["percent"],
-            verdict=change["verdict"], cautions=tuple(document["cautions"]), link=link,
+            verdict=change["verdict"], findings=findings_in(document["findings"]), link=link,
         )
         for change in document["changes"]
     ]  # fmt: skip

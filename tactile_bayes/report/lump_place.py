@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.clock_face import SIDES, ClockPosition, clock_position, clock_text
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def from_xiphoid(x_mm: float, y_mm: float) -> str:
     return f"{across} of the xiphoid and {abs(y_mm):.0f} mm {'above' if y_mm >= 0 else 'below'} it"
 
 
-def side_caution(side: str, patient_mm: tuple[float, float] | None) -> str:
+def side_findings(side: str, patient_mm: tuple[float, float] | None) -> tuple[Finding, ...]:
     """Caution where the landmarks put a lump on the other side of the body than the scans say; empty where they do not.
 
     Parameters
@@ -62,9 +63,9 @@ def side_caution(side: str, patient_mm: tuple[float, float] | None) -> str:
         From the xiphoid to the patient's right and up; None without landmarks or a lump.
     """
     if side not in SIDES or patient_mm is None or abs(patient_mm[0]) < MIDDLE_MM:
-        return ""
+        return ()
     other = "right" if patient_mm[0] > 0 else "left"
     if other == side:
-        return ""
+        return ()
     place = f"the landmarks put the lump {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
-    return f"the scan says {side} breast, and {place}: side or landmarks are wrong"
+    return (Finding("side", f"the scan says {side} breast, and {place}: side or landmarks are wrong"),)

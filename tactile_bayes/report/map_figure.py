@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.orientation import Orientation, orientation_of
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.presets import RESEARCH_USE
@@ -94,6 +95,7 @@ def map_figure(
     looked_at: Sequence[Place] = (),
     title: str = "",
     note: str = "",
+    findings: Sequence[Finding] | None = None,
     force: bool = False,
 ) -> Figure:
     """Draw a map in mm beside its coverage, and write it as PNG, PDF or SVG by the suffix.
@@ -113,6 +115,8 @@ def map_figure(
         Above the map; nothing that identifies a person.
     note
         A sentence above the whole figure, for example why there is no estimate.
+    findings
+        What speaks against what is shown, told above it; the map's own where none are given.
 
     Raises
     ------
@@ -125,7 +129,8 @@ def map_figure(
         raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")
     view = orientation_of(tactile_map)
     height_in = 5.4 if looked_at else 4.5
-    with figure_file(path, size_in=(10.0, height_in), force=force) as figure:
+    told = tactile_map.findings if findings is None else findings
+    with figure_file(path, size_in=(10.0, height_in), force=force, findings=told) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.55, 1.0))
         _draw_values(left, tactile_map, view, fit)
         _draw_coverage(right, tactile_map, view)

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.mapping.advice import advise_cell
-from tactile_bayes.mapping.assumptions import assumptions_to_check, broken_assumptions, skewed
-from tactile_bayes.mapping.convention import CONVENTIONS
+from tactile_bayes.mapping.assumptions import skewed
 from tactile_bayes.mapping.evenness import SPAN_MM
 from tactile_bayes.mapping.shared_frames import LEAST_SHARE
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE
 
-# A strip of the plane narrower than the head itself shows no lump's flanks.
-_LOW_COVERAGE = 0.5
-_HIGH_TILT_DEG = 10.0
-_HIGH_YAW_DEG = 15.0
 _LISTED_TAXELS = 8
 # Leaving out more frames than this share for their pressure is worth a word about the window.
 _MUCH_GATED = 0.2
@@ -33,19 +29,14 @@ _DROPPED = (
 )
 
 
-def map_text(tactile_map: TactileMap, *, lost: Sequence[str] = ()) -> str:
-    """Full report of a map, ending with the research-use line.
-
-    Parameters
-    ----------
-    lost
-        What the scan files had lost before they were read, and what else speaks against them, one line each.
-    """
+def map_text(tactile_map: TactileMap) -> str:
+    """Full report of a map: cautions, a table, what is to be checked, notes and the research-use line."""
     parts = (_what, _frames, _timing, _plane, _strokes, _cells)
     rows = [row for part in parts for row in part(tactile_map)]
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {text}" for name, text in rows]
-    return "\n".join([*lines, "", *lost, *_notes(tactile_map), RESEARCH_USE]) + "\n"
+    cautions, checks = (finding_lines(tactile_map.findings, one) for one in ("caution", "check"))
+    return "\n".join([*cautions, *lines, "", *checks, *_notes(tactile_map), RESEARCH_USE]) + "\n"
 
 
 def _what(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
@@ -200,10 +191,6 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
         shown = "; ".join(tactile_map.masked_taxels[:_LISTED_TAXELS])
         more = len(tactile_map.masked_taxels) - _LISTED_TAXELS
         yield f"taxels left out: {shown}{f'; and {more} more' if more > 0 else ''}"
-    if quality.get("saturated_readings"):
-        yield f"{quality['saturated_readings']:.0f} readings at full scale left out: the map is too low there"
-    if quality.get("clipped_values"):
-        yield f"{quality['clipped_values']:.0f} values beyond the map's range were clipped"
     if quality.get("few_cells"):
         yield f"{quality['few_cells']:.0f} cells have fewer than {FEW_READINGS} readings: noisy, mostly at the rim"
     if quality.get("negative_readings"):
@@ -212,19 +199,5 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
     if gated > _MUCH_GATED * quality.get("frames_total", np.inf):
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
         yield f"a window of {ends} would keep nine frames in ten; it lets in pressures the head was not shaped for"
-    if quality.get("gain_unsettled"):
-        yield "the gain solve stopped before it settled: use --normalise mean, or scan with overlapping strokes"
-    if quality.get("coverage", 1.0) < _LOW_COVERAGE:
-        yield "coverage is low: add strokes side by side, or use larger cells"
-    if quality.get("tilt_deg", 0.0) > _HIGH_TILT_DEG:
-        yield "the head's face was tilted against its motion: check the tracker's lever arm and quaternion order"
-    if "other_convention" in quality:
-        other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
-        yield f"check the quaternions: {other}, face and motion would agree to {agreement:.3f}; widths may be wrong"
-    elif "normal_agreement" not in quality and "plane_rms_mm" in quality:
-        yield "the motion does not tell whether the quaternions are scalar first and from sensor to base: check them"
-    yield from (*broken_assumptions(quality), *assumptions_to_check(quality))
     if text := skewed(quality):
         yield text
-    if quality.get("yaw_sd_deg", 0.0) > _HIGH_YAW_DEG:
-        yield "the head was turned while scanning: widths across and along it are mixed"

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
+from tactile_bayes.findings import (
+    Finding,
+    by_weight,
+    finding_lines,
+    finding_summary,
+    findings_in,
+    verdict,
+)
 from tactile_bayes.inference.summary import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
+from tactile_bayes.report.narrowing import MORE, MOST_LINES, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam
 from tactile_bayes.report.site_text import site_words
@@ -19,14 +27,12 @@ from tactile_bayes.report.size_text import (
     decimals,
     ends_text,
     exams_label,
-    range_cautions,
     shape_text,
     site_interval_text,
     table_head,
     table_row,
 )
 from tactile_bayes.report.supposed_text import supposed_document, supposed_line, supposed_lines
-from tactile_bayes.report.touching import touching_sentences
 from tactile_bayes.size import omissions
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.pooling import PooledEstimate
@@ -67,25 +73,25 @@ def pooled_document(
     largest = None if size is None else size.summarise("max_size_mm", probability=probability)
     if size is not None:
         sizes = {name: size.summarise(name, probability=probability).as_dict() for name in EXTREMES}
+    findings = by_weight(_findings(pooled, documents, apart or {}, one_place=one_place))
     return {
         "schema": SCHEMA,
         "status": pooled.status,
+        "verdict": verdict(findings, answered=size is not None),
+        "findings": [one.as_dict() for one in findings],
         "reason": pooled.reason,
         **sizes,
         ANOTHER_EXAM: _another_exam(size, probability),
         "supposing": supposed_document(size, largest),
-        "maps": _maps(names, documents, pooled, apart or {}),
-        "one_place": one_place,
+        "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
         "variance_share": None if size is None else {k: nine_digits(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: nine_digits(value) for name, value in size.figures.items()},
         "left_out": _omitted(used, documents),
         "by_place_used": used.knows_places,
         "fat_mm": None if used.fat_mm is None else nine_digits(used.fat_mm),
-        "fat_apart_mm": None if pooled.fat_apart_mm is None else [nine_digits(depth) for depth in pooled.fat_apart_mm],
         "unknowns": {name: nine_digits(share) for name, share in used.unknowns.items()},
         "site": None if used.site is None else site_words(used.site),
         **({} if repeatability is None else {"repeatability": repeatability.words()}),
-        "outside_calibration": list(pooled.outside),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
     }
@@ -109,18 +115,12 @@ def _another_exam(size: SizePosterior | None, probability: float) -> dict[str, A
 def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstimate) -> dict[str, Any]:
     return {
         "map": name,
-        "other_rises": list(document["other_rises"]),
-        "touching": list(document.get("touching", [])),
         "mass": _reported(document),
         "status": document["status"],
         "reason": document["reason"],
         "detected_probability": document["detected_probability"],
         "log_size": nine_digits(pooled.centres[index]) if index in pooled.centres else None,
         "outlying": index in pooled.outlying,
-        "broken_assumptions": [
-            *filter(None, [document.get("side_caution")]),
-            *document["diagnostics"].get("broken_assumptions", []),
-        ],
     }
 
 
@@ -131,25 +131,52 @@ def _reported(document: Mapping[str, Any]) -> list[int]:
     return [*numbers, len(masses)] if len(masses) > 1 and numbers else []
 
 
-def _maps(
-    names: Sequence[str], documents: Sequence[Mapping[str, Any]], pooled: PooledEstimate, apart: Mapping[int, str]
-) -> list[dict[str, Any]]:
-    """The maps; one of another mass, or of a scan that an earlier map is of, says so among its broken assumptions."""
-    maps = [_map(i, name, documents[i], pooled) for i, name in enumerate(names)]
+def _findings(
+    pooled: PooledEstimate,
+    documents: Sequence[Mapping[str, Any]],
+    apart: Mapping[int, str],
+    *,
+    one_place: bool | None,
+) -> Iterator[Finding]:
+    """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
+    for index in sorted(pooled.centres):
+        for one in findings_in(documents[index]["findings"]):
+            if one.kind != "outside_calibration":  # of the size alone
+                yield one.at(_number(index))
     for index, words in apart.items():
-        maps[index]["broken_assumptions"].append(words)
+        yield Finding("another_mass", words, about=_number(index))
     for index, earlier in repeated_scans([scans_of(one["provenance"]) for one in documents]).items():
-        words = f"a map of the same scan as {maps[earlier]['map']} is no repeat: the interval is too narrow"
-        maps[index]["broken_assumptions"].append(words)
-    return maps
+        words = f"a map of the same scan as {_number(earlier)} is no repeat: the interval is too narrow"
+        yield Finding("same_scan", words, about=_number(index))
+    if pooled.fat_apart_mm is not None:
+        yield fat_apart(pooled.fat_apart_mm)
+    for text in pooled.outside:
+        yield Finding("outside_calibration", f"outside the calibration's range: {text}")
+    for index in pooled.outlying:
+        yield Finding("outlying", "lies apart from the others: look at this map", about=_number(index))
+    for index, document in enumerate(documents):
+        for rise in () if one_place else document["other_rises"]:
+            text = f"another rise stands at ({rise['x_mm']:.1f}, {rise['y_mm']:.1f}) mm"
+            same = "check that every map was sized at the same mass"
+            yield Finding("several_masses", text, same, same, _number(index))
+
+
+def _number(index: int) -> str:
+    """A map by its number: a file's name may be a patient's."""
+    return f"map {index + 1}"
+
+
+def fat_apart(depths_mm: tuple[float, float]) -> Finding:
+    """Caution where maps differ too much in the depth of fat to be of one breast."""
+    text = "the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another: they may be of two bodies"
+    return Finding("fat_apart", text.format(*depths_mm))
 
 
 def pooled_summary(document: Mapping[str, Any]) -> str:
     """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
-    outside = document["outside_calibration"]
-    lines = [*_bodies(document), *joined(outside, most=2, lead="CAUTION: outside the calibration's range: ")]
-    lines += joined(_broken(document["maps"]), most=1, lead="CAUTION: ") + _maps_lines(document["maps"])
-    lines += joined([line.rstrip(".") for line in _rises(document)], most=1, lead="")
+    findings = findings_in(document["findings"])
+    lines = finding_summary(findings, "caution", most=2) + _maps_lines(document["maps"])
+    lines += finding_summary(findings, "check", most=2)
     if document["status"] == "no_estimate":
         lines.append(f"No estimate: {document['reason']}.")
     else:
@@ -167,34 +194,19 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
 
 
 def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sizes of the maps in one line, doubtful maps by name, other rises."""
+    """Sizes of the maps in one line."""
     found = [one for one in maps if one["log_size"] is not None]
     sizes = ", ".join(f"{np.exp(one['log_size']):.1f}" for one in found[:MOST_NAMED])
     more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
-    lines = [f"A lump was found on {len(found)} of {len(maps)} maps, alone sized at {sizes}{more} mm."] if found else []
-    apart = [one["map"] for one in maps if one["outlying"]]
-    lines += joined(apart, most=2, lead="Apart from the others, look at these maps: ")
-    return lines + joined(_touching(maps), most=1, lead="To check: ")
-
-
-def _touching(maps: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Masses that may be one lump, with the map's name; files of earlier versions name none."""
-    return [f"{one['map']}: {text}" for one in maps for text in touching_sentences(one.get("touching", []))]
-
-
-def _broken(maps: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Broken assumptions of the maps in which a lump was found, with the map's name."""
-    found = [one for one in maps if one["log_size"] is not None]
-    return [f"{one['map']}: {text}" for one in found for text in one["broken_assumptions"]]
+    return [f"A lump was found on {len(found)} of {len(maps)} maps, alone sized at {sizes}{more} mm."] if found else []
 
 
 def pooled_text(document: Mapping[str, Any]) -> str:
     """Full report of a mass."""
-    lines = [*_bodies(document), *range_cautions(document["outside_calibration"])]
-    lines += [f"CAUTION: {text}." for text in _broken(document["maps"])]
-    lines += [_map_line(one) for one in document["maps"]]
-    lines += [f"To check: {text}." for text in _touching(document["maps"])]
-    lines += _rises(document)
+    findings = findings_in(document["findings"])
+    lines = finding_lines(findings, "caution")
+    lines += [f"{number}. {_map_line(one)}" for number, one in enumerate(document["maps"], start=1)]
+    lines += finding_lines(findings, "check")
     if document["status"] == "no_estimate":
         return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
     worst, figures = _worst(document), document["figures"]
@@ -240,35 +252,11 @@ def _row(label: str, q: Mapping[str, float], places: int) -> str:
     return table_row(label, q["median"], (q["low"], q["high"]), unit="mm", places=places)
 
 
-def _bodies(document: Mapping[str, Any]) -> list[str]:
-    """Caution where the maps differ too much to be of one body; else empty."""
-    if not document["fat_apart_mm"]:
-        return []
-    least, largest = document["fat_apart_mm"]
-    depths = f"the fat under the head is {least:.1f} mm deep on one map and {largest:.1f} mm on another"
-    used = f" All are sized at {document['fat_mm']:.1f} mm." if document["fat_mm"] else ""
-    return [f"CAUTION: {depths}: are they of one mass?{used}"]
-
-
 def _map_line(one: Mapping[str, Any]) -> str:
     if one["log_size"] is None:
         return f"{one['map']}: no estimate ({one['reason']})"
-    apart = "  lies apart from the others: look at this map" if one["outlying"] else ""
     mass = "  (mass {} of {} on this map)".format(*one["mass"]) if one.get("mass") else ""
-    return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{mass}{apart}"
-
-
-def _rises(document: Mapping[str, Any]) -> list[str]:
-    """Other rises of the maps, where places do not tell that all were sized at one mass."""
-    if document.get("one_place"):
-        return []
-    return [_rise_line(one["map"], rise) for one in document["maps"] for rise in one["other_rises"]]
-
-
-def _rise_line(name: str, rise: Mapping[str, float]) -> str:
-    where = f"({rise['x_mm']:.1f}, {rise['y_mm']:.1f}) mm"
-    chance = f"probability of a lump {rise['probability']:.3f}"
-    return f"{name}: another rise stands at {where} ({chance}); check that every map was sized at the same mass."
+    return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{mass}"
 
 
 def _unknowns(document: Mapping[str, Any]) -> str:

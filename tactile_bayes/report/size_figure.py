@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
@@ -44,6 +45,7 @@ def size_figure(
     *,
     intervals: Mapping[str, SizeInterval],
     title: str = "",
+    findings: Sequence[Finding] = (),
     force: bool = False,
 ) -> Figure:
     """Draw the posterior of a lump's largest and smallest size; with a path, also write it (PNG, PDF or SVG).
@@ -57,6 +59,8 @@ def size_figure(
         largest size if another exam may differ more.
     title
         Above the figure; nothing that identifies a person.
+    findings
+        What speaks against the size, told above it.
 
     Raises
     ------
@@ -65,7 +69,8 @@ def size_figure(
     UsageError
         When `path` exists and `force` is false, or its suffix is unknown.
     """
-    with figure_file(path, size_in=(7.0, 4.0 + 0.4 * ("another" in intervals)), force=force) as figure:
+    size_in = (7.0, 4.0 + 0.4 * ("another" in intervals))
+    with figure_file(path, size_in=size_in, force=force, findings=findings) as figure:
         axes = figure.subplots()
         rows = (("max", draws_max_mm, _MAX_COLOUR, "-"), ("min", draws_min_mm, _MIN_COLOUR, "--"))
         for row, (name, draws, colour, dash) in enumerate(rows):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 SIZE_DECIMALS = 1
 """At most, whatever the Monte-Carlo error: sizes are compared with excisions, which are measured in mm."""
@@ -35,11 +35,6 @@ def two_intervals_text(this: float | None, another: float) -> str:
 def site_interval_text(repeatability: str) -> str:
     """What the interval of a size supposes where the site's repeatability is known, from `Repeatability.words`."""
     return f"The interval is for any exam of the mass: {repeatability}."
-
-
-def range_cautions(outside: Sequence[str]) -> list[str]:
-    """First lines of a report of a size outside its calibration's range."""
-    return [f"CAUTION: outside the calibration's range: {text}." for text in outside]
 
 
 def decimals(mc_error: float, *, most: int = 3) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.findings import Finding
 from tactile_bayes.inference.summary import nine_digits
 
 Touching = Mapping[str, Any]
@@ -58,6 +59,9 @@ def together_words(pair: Touching) -> str:
     return f"together {length['median']:.1f} mm long ({length['low']:.1f} to {length['high']:.1f})"
 
 
-def touching_sentences(pairs: Sequence[Touching]) -> list[str]:
-    """For a page: which masses may be one lump."""
-    return [f"masses {one['masses'][0]} and {one['masses'][1]} may be one lump: {together_words(one)}" for one in pairs]
+def touching_findings(pairs: Sequence[Touching]) -> list[Finding]:
+    """Which masses may be one lump."""
+    return [
+        Finding("touching", "masses {} and {} may be one lump: ".format(*one["masses"]) + together_words(one))
+        for one in pairs
+    ]

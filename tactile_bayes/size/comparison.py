@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from tactile_bayes.findings import Finding
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ class Compared:
         Why there is no comparison, and what would help; empty where there is one.
     apart
         How far the mass of each later visit lies from the first's; None where landmarks do not show it.
-    cautions
-        What speaks against the comparison, in words.
+    findings
+        What speaks against the comparison.
     joint, another
         Sizes with the calibration's or the site's spread between exams, and with the paper's.
     """
@@ -33,6 +34,6 @@ class Compared:
     reason: str = ""
     advice: str = ""
     apart: tuple[Apart | None, ...] = ()
-    cautions: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     joint: JointSizes | None = None
     another: JointSizes | None = None

@@ -66,7 +66,7 @@ def test_replicates_and_visits_are_matched_by_place_in_patient_axes(folder: Path
     assert "no row names" not in told
     assert centre(folder, "P1.v1.m1.r2") == (-12, -6)
     assert centre(folder, "P1.v1.m2.r2") == (21, -6)
-    assert not any(row.get("cautions") for row in rows_of(folder / "out" / "exams_done.csv"))
+    assert not any(row.get("findings") for row in rows_of(folder / "out" / "exams_done.csv"))
     (folder / "c").mkdir()
     for name in ("a.nc", "b.nc"):
         (folder / "c" / name).write_bytes((folder / name).read_bytes())
@@ -78,9 +78,9 @@ def test_without_a_place_the_largest_is_taken_and_the_other_is_told(folder: Path
     """The control: no row names a place."""
     told = campaign(folder, "b.nc,P1,1,2,2,left,,")
     assert centre(folder, "P1.v1.m2.r2") == (-12, -6)
-    assert "exams with a mass that no row names, see their checks: P1.v1.m2.r2" in told
+    assert "exams with a mass that no row names, see their findings: P1.v1.m2.r2" in told
     (row,) = rows_of(folder / "out" / "exams_done.csv")
-    assert re.search(r"a mass at \((20.9|21.0), -6.0\) mm on the map is named by no row", row["checks"])
+    assert re.search(r"a mass at \((20.9|21.0), -6.0\) mm on the map is named by no row", row["findings"])
 
 
 def test_without_landmarks_the_maps_own_axes_decide_and_it_is_said(folder: Path) -> None:
@@ -88,7 +88,7 @@ def test_without_landmarks_the_maps_own_axes_decide_and_it_is_said(folder: Path)
     campaign(folder, *TWO_PLACES, "bare.nc,P1,1,2,2,left,,")
     assert centre(folder, "P1.v1.m2.r2") == (21, -6)  # 9 mm off in these axes
     row = next(row for row in rows_of(folder / "out" / "exams_done.csv") if row["replicate"] == "2")
-    assert "matched by place in the maps' own axes, because a scan has no landmarks" in row["cautions"]
+    assert "matched by place in the maps' own axes, because a scan has no landmarks" in row["findings"]
 
 
 def test_a_mass_that_is_not_within_the_distance_is_not_taken(folder: Path) -> None:
@@ -103,14 +103,14 @@ def test_a_mass_that_is_not_within_the_distance_is_not_taken(folder: Path) -> No
 def test_exams_of_a_mass_that_lie_apart_are_told(folder: Path) -> None:
     """The second row's place is the other mass's; the control has both rows at one."""
     campaign(folder, "a.nc,P1,1,1,1,left,-17,2", "b.nc,P1,1,1,2,left,21,-6")
-    rows = {row["replicate"]: row["cautions"] for row in rows_of(folder / "out" / "exams_done.csv")}
+    rows = {row["replicate"]: row["findings"] for row in rows_of(folder / "out" / "exams_done.csv")}
     assert "its mass lies 33 mm from that of the other maps" in rows["2"]
     assert "its mass lies" not in rows["1"]
     (folder / "c").mkdir()
     for name in ("a.nc", "b.nc"):
         (folder / "c" / name).write_bytes((folder / name).read_bytes())
     campaign(folder / "c", "a.nc,P1,1,1,1,left,-17,2", "b.nc,P1,1,1,2,left,-12,-6")
-    assert not any(row["cautions"] for row in rows_of(folder / "c" / "out" / "exams_done.csv"))
+    assert not any("CAUTION" in row["findings"] for row in rows_of(folder / "c" / "out" / "exams_done.csv"))
 
 
 def test_two_masses_near_one_place_are_refused_by_name(folder: Path) -> None:

@@ -133,6 +133,6 @@ def test_one_visit_has_no_growth_and_landmarks_are_not_needed(tmp_path: Path) ->
     both = campaign(tmp_path, lines).stdout
     assert "1 grown (growth.csv)" in both
     (row,) = rows_of(tmp_path / "out" / "growth.csv")
-    assert "no landmarks show it" in row["cautions"]
+    assert "CAUTION: no landmarks show where the mass of visit" in row["findings"]
     campaign(tmp_path, lines[:1])  # files that this run would not make go
     assert not (tmp_path / "out" / "growth").exists()

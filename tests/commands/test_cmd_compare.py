@@ -206,12 +206,12 @@ def test_a_scan_is_no_second_visit_and_no_second_exam(folder: Path) -> None:
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)
         assert "again.nc and a0.nc are of one scan; give one map of each scan" in done.stderr
     pooled = run_here("estimate", "--pool", "a0.nc", "again.nc", *FAST, cwd=folder)
-    told = "CAUTION: again.nc: a map of the same scan as a0.nc is no repeat: the interval is too narrow."
+    told = "CAUTION: map 2: a map of the same scan as map 1 is no repeat: the interval is too narrow."
     assert told in pooled.stdout
     assert "no repeat" not in run_here("estimate", "--pool", "a0.nc", "a1.nc", *FAST, cwd=folder).stdout
     run_here("report", "a0.nc", "again.nc", "-o", "again.html", cwd=folder)
     page = (folder / "again.html").read_text()
-    assert "Caution: a map of the same scan as map 1 is no repeat: the interval is too narrow." in page
+    assert "CAUTION: map 2: a map of the same scan as map 1 is no repeat: the interval is too narrow." in page
 
 
 @pytest.mark.parametrize(("percent", "text"), [(-0.3, "0"), (0.4, "0"), (-1.2, "-1"), (12.6, "+13")])
@@ -250,7 +250,7 @@ def test_python_compares_as_the_command_line_does(folder: Path, grown: dict) -> 
     first = [folder / "a0.nc", tb.estimate(folder / "a1.nc", method="laplace")]
     found = tb.compare(first, [folder / f"grown{i}.nc" for i in range(2)], days=[100], method="laplace")
     assert found.document["changes"] == grown["changes"]
-    assert found.verdict == "grown"
+    assert found.growth == "grown"
     assert found.change_percent is not None
     assert found.change_percent.median == pytest.approx(grown["changes"][0]["percent"]["median"])
     assert [one.median for one in found.sizes_mm] == [
@@ -264,7 +264,7 @@ def test_python_compares_as_the_command_line_does(folder: Path, grown: dict) -> 
 
 def test_python_names_why_nothing_is_compared(folder: Path) -> None:
     found = tb.compare(folder / "a0.nc", folder / "far.nc", method="laplace")
-    assert (found.status, found.verdict, found.change_percent, found.sizes_mm) == ("not_one_mass", None, None, ())
+    assert (found.status, found.growth, found.change_percent, found.sizes_mm) == ("not_one_mass", None, None, ())
     assert "30 mm apart" in found.why
     assert found.why in repr(found)
     with pytest.raises(UsageError, match="given twice"):

@@ -68,7 +68,7 @@ def test_the_scan_is_of_a_body_that_the_calibration_has_seen(run_cli: Run, place
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["max_size_mm"]["median"] == pytest.approx(TRUE_MM, rel=0.2)
-    assert found["diagnostics"]["outside_calibration"] == []
+    assert (found["verdict"], found["findings"]) == ("sound", [])
 
 
 def test_it_leaves_every_file_behind_for_its_owner_only(shown: CompletedProcess[str], place: Path) -> None:

@@ -162,4 +162,4 @@ def test_an_unfinished_recording_is_mapped_and_its_loss_told(folder, run_cli):
     (folder / "cut.mcap").write_bytes((folder / "one.mcap").read_bytes()[:-200])
     done = run_cli("map", "cut.mcap", "-o", "map.nc", cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert "scan 1: the end of the file is missing" in done.stdout
+    assert "To check: the end of the file is missing" in done.stdout

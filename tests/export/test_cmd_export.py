@@ -90,12 +90,12 @@ def test_an_odd_provenance_is_no_fault_or_one_line(key: str, value: Any, estimat
 
 
 @pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
-def test_cautions_that_are_no_texts_are_refused_and_not_dropped(value: Any, estimate: Any, tmp_path: Path) -> None:
-    odd = estimate | {"diagnostics": estimate["diagnostics"] | {"broken_assumptions": value}}
+def test_findings_that_are_none_are_refused_and_not_dropped(value: Any, estimate: Any, tmp_path: Path) -> None:
+    odd = estimate | {"findings": value}
     (tmp_path / "e.json").write_text(json.dumps(odd))
     done = run_here("export", "e.json", "--to", "csv", "-o", "out.csv", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (3, 1)
-    assert "diagnostics.broken_assumptions" in done.stderr
+    assert "findings" in done.stderr
 
 
 def test_an_estimate_of_no_file_is_refused_beside_a_map(estimate: dict[str, Any], folder: Path, tmp_path: Path) -> None:

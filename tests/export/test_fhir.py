@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from export_files import exported
 
-from tactile_bayes.exports.exam import findings_of
+from tactile_bayes.exports.exam import masses_of
+from tactile_bayes.findings import Finding
 
 bundles = pytest.importorskip("fhir.resources.R4B.bundle")
 
@@ -118,21 +119,14 @@ def test_no_lump_is_an_absent_value_with_the_reason(exam: Path, tmp_path: Path) 
 
 def test_markup_in_words_stays_words(estimate: dict[str, Any], tmp_path: Path) -> None:
     hostile = estimate | {
-        "diagnostics": estimate["diagnostics"] | {"broken_assumptions": ["<script>alert(1)</script>"]}
+        "verdict": "doubtful",
+        "findings": [Finding("side", "<script>alert(1)</script>").as_dict()],
     }
     (tmp_path / "h.json").write_text(json.dumps(hostile))
     (report,) = resources(bundle(tmp_path, tmp_path / "b.json", "h.json"), "DiagnosticReport")
     assert "&lt;script&gt;" in report["text"]["div"]
     assert "<script" not in report["text"]["div"]
     assert "CAUTION: <script>alert(1)</script>" in report["conclusion"]
-
-
-def test_masses_that_may_be_one_lump_are_told(estimate: dict[str, Any], tmp_path: Path) -> None:
-    together = {"median": 19, "low": 17, "high": 21, "probability": 0.95}
-    pair = {"masses": [1, 2], "apart_mm": 9.0, "together_mm": together}
-    (tmp_path / "e.json").write_text(json.dumps(estimate | {"touching": [pair]}))
-    (report,) = resources(bundle(tmp_path, tmp_path / "b.json", "e.json"), "DiagnosticReport")
-    assert "masses 1 and 2 may be one lump: together 19.0 mm long (17.0 to 21.0)" in report["conclusion"]
 
 
 def test_every_mass_of_an_estimate_has_its_observations(estimate: dict[str, Any]) -> None:
@@ -145,7 +139,7 @@ def test_every_mass_of_an_estimate_has_its_observations(estimate: dict[str, Any]
         {"number": 2, **one, "max_size_mm": None, "min_size_mm": None, "reason": "too near the rim"}
         | {"reason_code": "window", "another_exam": None, "centre_mm": place, "centre_patient_mm": None},
     ]
-    found = findings_of(estimate | {"masses": masses})
+    found = masses_of(estimate | {"masses": masses})
     assert [mass.number for mass in found] == [1, 2]
     assert found[0].centre_patient_mm == (1.0, 2.0)
     assert [mass.outcome.value for mass in found] == ["sized", "not-sized"]

@@ -16,6 +16,8 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.estimate_json import MOST_MM, SCHEMAS, check_estimate
 from tactile_bayes.report.exam_ruler import size_ruler
 
+FIELDS = ("kind", "text", "remedy", "on_paper", "about")
+
 Document = dict[str, Any]
 Edit = Callable[[Document], object]
 
@@ -77,9 +79,14 @@ EDITS: dict[str, tuple[Edit, str]] = {
         lambda one: one["provenance"].update(inputs=[None]),
         "inputs.0 is None; give a table",
     ),
-    "cautions of letters": (
-        lambda one: one["diagnostics"].update(broken_assumptions="abc"),
-        "broken_assumptions is 'abc'; give a list",
+    "findings of letters": (lambda one: one.update(findings="abc"), "findings is 'abc'; give a list"),
+    "a finding of no kind": (
+        lambda one: one.update(findings=[dict.fromkeys(FIELDS, "x") | {"severity": "check"}]),
+        "finding of unknown kind 'x'",
+    ),
+    "a verdict of its own": (
+        lambda one: one.update(verdict="doubtful"),
+        "verdict is 'doubtful', and its",
     ),
 }
 

@@ -229,7 +229,7 @@ def test_a_chunk_that_makes_no_sense_is_told_and_the_others_are_kept(case: str, 
     assert file.damaged
     assert message in file.lost[0]
     assert np.array_equal(file.scan.frames.counts, read_scan(SCAN).frames.counts)
-    assert describe(path)["lost"] == list(file.lost)
+    assert describe(path)["findings"] == [f"To check: {line}." for line in file.lost]
 
 
 def test_a_chunk_of_unknown_packing_is_not_taken_for_a_plain_one(tmp_path: Path) -> None:

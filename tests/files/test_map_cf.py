@@ -1,8 +1,7 @@
-"""What other programs see in a map's file by the CF conventions, and the files of the schema before, map/1."""
+"""What other programs see in a map's file by the CF conventions,."""
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import warnings
@@ -15,17 +14,12 @@ import h5py
 import netCDF4
 import numpy as np
 import pytest
-from in_process import run_here
 from map_files import PROVENANCE, assert_same, plain_map
-from posterior_files import write_maps
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.identify import describe
-from tactile_bayes.files.map_nc import SCHEMA, read_map, read_map_header, write_map
+from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 
-OLD_SCHEMA = "tactile-bayes/map/1"
-OLD_FILE = Path(__file__).with_name("map_1.nc")  # written by the last version that wrote map/1
 ENGINES = ("netcdf4", "h5netcdf")
 
 
@@ -163,69 +157,6 @@ def test_r_sees_the_coordinates_of_a_dimension(written: Path) -> None:
     assert said.split() == [f"{value:g}" for value in gapped_map().x_mm] + ["mm"]
 
 
-def old_map() -> TactileMap:
-    """What `OLD_FILE` was written from."""
-    count = np.arange(20).reshape(4, 5)
-    mean, variance = np.where(count > 0, 1 + count / 64, np.nan), np.where(count > 1, count / 1024, np.nan)
-    return TactileMap(
-        mean, variance, count, 0.5 * np.arange(5) - 1, 0.5 * np.arange(4) + 3,
-        MapRecipe("scan", "mean", 0.5, (5.0, 14.0), 4.0, flat_field=True, registered=True),
-        plane_from_base=np.eye(4), patient_from_plane=np.eye(4)[[1, 2, 0, 3]], frame_count=30,
-        quality={"frames_used": 30.0, "clipped": 2.0}, masked_taxels=("row 3 column 7 dead",),
-    )  # fmt: skip
-
-
-def write_old(path: Path, tactile_map: TactileMap, change: Callable[[Any], None] = lambda _: None) -> None:
-    """A file of map/1 as netCDF4 writes it: axes beside the dimensions, no fill values."""
-    new = path.with_name(f"{path.stem}-new.nc")
-    write_map(new, tactile_map, provenance=PROVENANCE)
-    with netCDF4.Dataset(new) as source, netCDF4.Dataset(path, "w") as file:
-        file.setncatts(source.__dict__ | {"schema": OLD_SCHEMA})
-        for name, dimension in source.dimensions.items():
-            file.createDimension(name, len(dimension))
-        for name, variable in source.variables.items():
-            called = f"{name}_mm" if name in ("x", "y") else name
-            file.createVariable(called, variable.dtype, variable.dimensions)[:] = np.ma.getdata(variable[:])
-        change(file)
-    new.unlink()
-
-
-def test_a_kept_file_of_the_schema_before_gives_the_same_map(tmp_path: Path) -> None:
-    write_map(tmp_path / "new.nc", old_map(), provenance=PROVENANCE)
-    old, new = read_map(OLD_FILE), read_map(tmp_path / "new.nc")
-    assert_same(old, new)
-    assert_same(old, old_map())
-    assert old.fingerprint == new.fingerprint
-    assert [describe(path)["schema"] for path in (OLD_FILE, tmp_path / "new.nc")] == [OLD_SCHEMA, SCHEMA]
-    header = read_map_header(OLD_FILE)
-    assert (header["schema"], header["shape"], header["recipe"]) == (OLD_SCHEMA, (4, 5), old.recipe)
-
-
-def test_a_file_of_the_schema_before_by_netcdf4_gives_the_same_map(tmp_path: Path) -> None:
-    write_old(tmp_path / "old.nc", gapped_map())
-    assert_same(read_map(tmp_path / "old.nc"), gapped_map())
-
-
-def test_both_schemas_give_the_same_estimate(tmp_path: Path) -> None:
-    write_maps(tmp_path)
-    write_old(tmp_path / "old.nc", read_map(tmp_path / "a.nc"))
-    words = ("--method", "laplace", "--json")
-    new, old = (json.loads(run_here("estimate", name, *words, cwd=tmp_path).stdout) for name in ("a.nc", "old.nc"))
-    assert new["status"] == "estimate"
-    assert new.pop("provenance")["inputs"] != old.pop("provenance")["inputs"]
-    assert new == old
-
-
-def _with(name: str, dimension: str, start: float = 0.0) -> Callable[[Any], None]:
-    """Adds an axis; it is one of cells where `start` fits."""
-
-    def change(file: Any) -> None:
-        added = file.createVariable(name, "f8", (dimension,))
-        added[:] = start + 0.5 * np.arange(len(file.dimensions[dimension]))
-
-    return change
-
-
 def _renamed(**names: str) -> Callable[[Any], None]:
     return lambda file: [file.renameVariable(old, new) for old, new in names.items()]
 
@@ -237,38 +168,26 @@ def _longer(file: Any) -> None:
     file.createVariable("count", "i8", ("y", "z"))[:] = 1
 
 
-# schema of the file: change -> message
-FORMS: dict[str, tuple[str, Callable[[Any], None], str]] = {
-    "map/2 with an old axis": (SCHEMA, _with("x_mm", "x"), f"schema is '{SCHEMA}', but variable x_mm is how"),
-    "map/1 with a new axis": (OLD_SCHEMA, _with("x", "x"), f"schema is '{OLD_SCHEMA}', but variable x is how"),
-    "map/1 in the form of map/2": (
-        OLD_SCHEMA,
-        _renamed(x_mm="x", y_mm="y"),
-        f"schema is '{OLD_SCHEMA}', but variable y is how '{SCHEMA}' holds the centres",
+# change -> message
+FORMS: dict[str, tuple[Callable[[Any], None], str]] = {
+    "without an axis": (_renamed(x="across"), "variable x is missing"),
+    "cells on another axis": (_longer, r"variable count has dimensions \('y', 'z'\), not \('y', 'x'\)"),
+    "off its lattice": (lambda file: file["x"].__setitem__(0, -9.5), "variable x steps by 0.5 to 8.5 mm"),
+    "without findings": (lambda file: file.delncattr("findings"), "attribute findings is missing"),
+    "of another schema": (
+        lambda file: file.setncattr("schema", "tactile-bayes/map/1"),
+        "schema is 'tactile-bayes/map/1'",
     ),
-    "map/2 in the form of map/1": (SCHEMA, _renamed(x="x_mm", y="y_mm"), "but variable y_mm is how"),
-    "map/2 without an axis": (SCHEMA, _renamed(x="across"), "variable x is missing"),
-    "map/1 without an axis": (OLD_SCHEMA, _renamed(x_mm="across"), "variable x_mm is missing"),
-    "cells on another axis": (SCHEMA, _longer, r"variable count has dimensions \('y', 'z'\), not \('y', 'x'\)"),
-    "map/1 off its lattice": (
-        OLD_SCHEMA,
-        lambda file: file["x_mm"].__setitem__(0, -9.0),
-        "variable x_mm steps by 0.5 to 8 mm",
-    ),
-    "map/2 off its lattice": (SCHEMA, lambda file: file["x"].__setitem__(0, -9.5), "variable x steps by 0.5 to 8.5 mm"),
 }
 
 
 @pytest.mark.parametrize("case", FORMS)
-def test_a_file_of_both_forms_or_neither_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    schema, change, message = FORMS[case]
+def test_a_file_of_another_form_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+    change, message = FORMS[case]
     path = tmp_path / "map.nc"
-    if schema == SCHEMA:
-        write_map(path, gapped_map(), provenance=PROVENANCE)
-        with netCDF4.Dataset(path, "a") as file:
-            change(file)
-    else:
-        write_old(path, gapped_map(), change)
+    write_map(path, gapped_map(), provenance=PROVENANCE)
+    with netCDF4.Dataset(path, "a") as file:
+        change(file)
     with pytest.raises(BadDataError, match=message) as refusal:
         read_map(path)
     assert str(refusal.value).startswith(f"{path}: ")

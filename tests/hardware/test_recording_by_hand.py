@@ -19,8 +19,9 @@ from emulated_devices import short_scan
 
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, write_scan
+from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.overlap import scan_findings
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.scan import Scan, TrackerPoses
 
@@ -133,4 +134,4 @@ def test_poses_of_other_times_are_told_by_map_and_show(folder, scan, run_cli):
     for words in (["show", "late.mcap"], ["map", "late.mcap", "-o", "late.nc"]):
         done = run_cli(*words, cwd=folder)
         assert "poses end 1.5 s before the frames" in done.stdout, done.stderr
-    assert read_scan_report(folder / "scan.mcap").cautions() == []
+    assert scan_findings(read_scan(folder / "scan.mcap")) == ()

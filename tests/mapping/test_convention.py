@@ -110,7 +110,7 @@ def test_a_doubt_is_told_with_the_convention_that_fits():
             texts.append((name, map_text(build_map(scan))))
         except BadDataError:  # the plane of the taxels is another one yet
             continue
-    assert any(f"check the quaternions: {name}, face and motion would agree to" in text for name, text in texts)
+    assert any(f"CAUTION: the quaternions seem to be {name}: the head's face" in text for name, text in texts)
 
 
 def test_a_motion_along_a_line_tells_nothing_and_the_report_says_so():

@@ -136,12 +136,11 @@ def test_a_calibration_by_another_recipe_is_refused(recipe: Recipe, words: str) 
 
 def test_outside_the_calibration_is_flagged() -> None:
     flagged = run(use=calibration(), amplitude=1.2)
-    assert flagged.diagnostics.outside_calibration == tuple(
-        f"{axis}: amplitude 1.2 (table: 0.05 to 0.8)" for axis in "xy"
-    )
+    outside = [f"outside the calibration's range: {axis}: amplitude 1.2 (table: 0.05 to 0.8)" for axis in "xy"]
+    assert [one.text for one in flagged.findings if one.kind == "outside_calibration"] == outside
     text = estimate_text(flagged, bump_map(), probability=0.95)
     assert text.startswith("CAUTION: outside the calibration's range: x: amplitude 1.2")
-    assert run(use=calibration()).diagnostics.outside_calibration == ()
+    assert not any(one.kind == "outside_calibration" for one in run(use=calibration()).findings)
 
 
 def test_far_outside_the_calibration_there_is_no_size() -> None:
@@ -180,7 +179,7 @@ def test_coarse_cells_are_flagged() -> None:
     found = estimate_map(
         tactile_map, calibration=None, options=EstimateOptions("optimise", OFF), rng=np.random.default_rng(1)
     )
-    assert found.diagnostics.coarse_cells is True
+    assert "coarse_cells" in [one.kind for one in found.findings]
     assert "smaller --cell-mm" in estimate_text(found, tactile_map, probability=0.95)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map
 
+from tactile_bayes.findings import Finding
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card, campaign_html, worst
 from tactile_bayes.report.thumbnail import LONGEST_PX, thumbnail_png
@@ -43,8 +44,12 @@ def page_of(*cards: Card) -> str:
     return campaign_html(cards, lines=["3 exams."], links={"trial.csv": "trial.csv"}, version="1")
 
 
+def told(text: str) -> tuple[Finding, ...]:
+    return (Finding("side", text, about=text), Finding("few_strokes", text, on_paper=text))
+
+
 def card_of(text: str) -> Card:
-    return Card(text, UNSIZED, (text,), text, None, (text,), (text,), b"png", {text: text})
+    return Card(text, UNSIZED, (text,), text, None, told(text), b"png", {text: text})
 
 
 def test_hostile_texts_add_no_tag_and_no_attribute() -> None:
@@ -80,8 +85,8 @@ def test_the_worst_come_first() -> None:
     cards = [
         Card("narrow", SIZED, size=SIZE | {"low": 13.5, "high": 14.5}),
         Card("wide", SIZED, size=SIZE),
-        Card("checked", SIZED, size=SIZE, checks=("a", "b")),
-        Card("doubtful", SIZED, size=SIZE, cautions=("a",)),
+        Card("checked", SIZED, size=SIZE, findings=(Finding("few_strokes", "a"), Finding("curved_skin", "b"))),
+        Card("doubtful", SIZED, size=SIZE, findings=(Finding("side", "a"),)),
         Card("empty", UNSIZED, reason="no lump"),
         Card("lost", FAILED, reason="map failed: damaged"),
     ]
@@ -90,7 +95,9 @@ def test_the_worst_come_first() -> None:
 
 
 def test_each_exam_can_be_filtered_by_its_status_and_its_flags() -> None:
-    page = page_of(Card("a", FAILED, reason="x"), Card("b", SIZED, size=SIZE, checks=("look",)))
+    page = page_of(
+        Card("a", FAILED, reason="x"), Card("b", SIZED, size=SIZE, findings=(Finding("few_strokes", "look"),))
+    )
     found = {attrs["data-status"]: attrs["data-flagged"] for tag, attrs in Tags(page).tags if tag == "article"}
     assert found == {FAILED: "no", SIZED: "yes"}
     options = [attrs["value"] for tag, attrs in Tags(page).tags if tag == "option"]

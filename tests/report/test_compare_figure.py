@@ -15,7 +15,7 @@ from tactile_bayes.size.comparison import Compared
 PLACE = np.array([60.0, 90.0])
 BESIDE = np.array([12.0, 6.0])
 """From the mass to a second bump, in the patient's frame: to the patient's right, and up."""
-REFUSED = {"status": "not_one_mass", "reason": "a test", "advice": ""}
+REFUSED = {"status": "not_one_mass", "reason": "a test", "advice": "", "findings": []}
 
 
 def visit(angle_rad: float, *, height: float, landmarks: bool = True) -> DrawnMap:

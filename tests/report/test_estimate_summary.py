@@ -14,10 +14,10 @@ from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.findings import Finding
 from tactile_bayes.inference.summary import summarise
+from tactile_bayes.mapping.assumptions import broken_assumptions
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.posterior.correlated.selection import Structure
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
@@ -134,6 +134,9 @@ def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder
     assert supposed_line(exchanged, supposed_median, places=1) == [f"{words.format(*sizes[::-1])}."]
 
 
+CHECKS = tuple(Finding(kind, f"a reason for {kind}") for kind in ("coarse_cells", "uneven_level", "irregular"))
+
+
 def crowded() -> tuple[Estimate, dict]:
     """An estimate with everything there is to say about it."""
     options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
@@ -142,14 +145,13 @@ def crowded() -> tuple[Estimate, dict]:
     assert found.diagnostics is not None
     odd = replace(
         found.diagnostics,
-        outside_calibration=tuple(f"reason {i}" for i in range(9)),
-        coarse_cells=True,
         noise=replace(found.diagnostics.noise, level_offset=0.2, places_share=0.4),
     )
     full = replace(
         found,
         masses=(Mass(-10.0, 2.0, 1.0, found, reported=True), *((mass,) * 9)),
         diagnostics=odd,
+        findings=(*(Finding("outside_calibration", f"reason {i}") for i in range(9)), *CHECKS),
         reason="of a reason",
         advice="advice",
     )
@@ -177,29 +179,29 @@ def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show(
 
 def test_a_broken_assumption_stands_first_and_one_to_check_after_the_size() -> None:
     full, quantities = crowded()
-    assert full.diagnostics is not None
-    words = {"broken_assumptions": ("the lump lags",), "assumptions_to_check": ("the skin is curved",)}
-    marked = replace(full, diagnostics=replace(full.diagnostics, **words))
+    told = (Finding("curved_skin", "the skin is curved"), Finding("lump_dragged", "the lump lags"))
+    marked = replace(full, findings=(*told, *full.findings))
     short = estimate_summary(marked, quantities, probability=0.9).splitlines()
-    assert short[0].startswith("CAUTION: the lump lags; outside the calibration's range: reason 0; ")
+    assert short[0].startswith("CAUTION: the lump lags; reason 0; reason 1 (and 7 more).")
     assert len(short) <= MOST_LINES
-    assert any(line.startswith("Check: ") for line in short)
+    assert "To check: the skin is curved; a reason for coarse_cells (and 2 more)." in short
     whole = estimate_text(marked, MAPS["clear.nc"], probability=0.9).splitlines()
     assert whole[0] == "CAUTION: the lump lags."
-    assert "The skin is curved." in whole[1:]
+    assert "To check: the skin is curved." in whole[1:]
     # the control: an even scan's report has neither
     for line in estimate_text(full, MAPS["clear.nc"], probability=0.9).splitlines():
-        assert not line.startswith(("CAUTION: the", "The skin"))
+        assert not line.startswith(("CAUTION: the", "To check: the skin"))
 
 
 def test_a_pool_names_the_map_whose_strokes_see_the_lump_apart(folder: Path) -> None:
-    lagging = replace(MAPS["again.nc"], quality={"stroke_lag_mm": 3.0, "stroke_lag_sd_mm": 0.1})
+    lagging = broken_assumptions({"stroke_lag_mm": 3.0, "stroke_lag_sd_mm": 0.1})
+    lagging = replace(MAPS["again.nc"], findings=lagging)
     write_map(folder / "lagging.nc", lagging, provenance=Provenance("import", {}))
     for more in ((), ("-v",)):
         words = ("--pool", "--method", "laplace", *more)
         text = run_here("estimate", "clear.nc", "lagging.nc", *words, cwd=folder).stdout
-        assert "CAUTION: lagging.nc: strokes in opposite directions see the lump some 6 mm apart" in text
-        assert "CAUTION: clear.nc" not in text
+        assert "CAUTION: map 2: strokes in opposite directions see the lump some 6 mm apart" in text
+        assert "map 1: strokes" not in text
         assert "CAUTION" not in run_here("estimate", "clear.nc", "again.nc", *words, cwd=folder).stdout
 
 
@@ -238,22 +240,3 @@ def test_sources_of_variance_are_ranked_and_only_large_ones_have_a_remedy() -> N
     assert "strokes" not in lines[1]
     assert width_lines({"map": 100.0})[1] == "What would narrow it: a slower scan with more strokes over the lump."
     assert joined([], most=2, lead="Check: ") == []
-
-
-def test_both_reports_caution_where_the_landmarks_contradict_the_scans_side() -> None:
-    """The lump lies 50 mm to the patient's right of the xiphoid; only the page of an exam said so."""
-    placed = np.eye(4)
-    placed[0, 3] = 60.0
-    tactile_map = replace(mass(1), patient_from_plane=placed)
-    for side, doubted in (("left", True), ("right", False), ("phantom", False)):
-        scans = ({"sha256": "ab" * 32, "side": side},)
-        answer = answer_of(estimate_one(tactile_map, Settings(method="laplace"), scans=scans))
-        for text in (answer.text, answer.full_text):
-            told = text.splitlines()[0]
-            assert (
-                told.startswith(
-                    "CAUTION: the scan says left breast, and the landmarks put the lump 50 mm to the patient's right"
-                )
-                == doubted
-            ), told
-        assert len(answer.text.splitlines()) <= MOST_LINES

@@ -18,6 +18,7 @@ import pytest
 from mapping_scans import gaussian, make_scan, strokes
 
 import tactile_bayes as tb
+from tactile_bayes.findings import Finding
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
@@ -293,7 +294,7 @@ def test_a_second_mass_is_drawn_as_its_ellipse_and_as_a_circle_by_an_older_estim
 def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     with_lump, without = exam().maps[0], without_lump().maps[0]
     size = {name: with_lump.document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
-    pooled = {**size, "reason": "", "figures": with_lump.document["diagnostics"], "fat_apart_mm": None}
+    pooled = {**size, "reason": "", "figures": with_lump.document["diagnostics"], "findings": []}
     pooled["provenance"] = with_lump.document["provenance"]
     pooled["maps"] = [{"map": f"map {n}", "outlying": False} for n in (1, 2)]
     both = Exam((without, with_lump), pooled, SCANS)
@@ -333,16 +334,6 @@ def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() ->
     assert page.named("svg", **{"class": "dial"}) == []
 
 
-def test_a_lump_on_the_other_side_of_the_body_than_the_scan_says_is_a_caution() -> None:
-    """The demo's lump lies to the patient's right of the xiphoid, where a left breast is not."""
-    words = {side: Page(exam_page(exam(({"side": side},)))).words for side in ("left", "right", "phantom", "")}
-    told = (
-        "Caution: the scan says left breast, and the landmarks put the lump 60 mm to the patient's right of the xiphoid"
-    )
-    assert told in words.pop("left")
-    assert all("landmarks put the lump" not in text for text in words.values())
-
-
 def test_a_nipple_off_the_map_is_pointed_to() -> None:
     tactile_map, document = demo()
     far = replace(tactile_map, nipple_mm=tactile_map.nipple_mm + np.array([200.0, 0.0, 0.0]))
@@ -373,11 +364,11 @@ def full() -> Exam:
     tactile_map, document = demo()
     mass = unsized("a reason that is long " * 20)
     masses = [{**mass, "number": 1, "reported": True}, *({**mass, "number": n} for n in range(2, 12))]
-    diagnostics = {**document["diagnostics"], "broken_assumptions": [f"caution {n} " * 80 for n in range(9)]}
-    told = {**document, "masses": masses, "diagnostics": diagnostics}
+    told = {**document, "masses": masses}
+    findings = [Finding("side", f"caution {n} " * 80).as_dict() for n in range(9)]
     tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
     size = {name: document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
-    pooled = {**size, "reason": "", "figures": document["diagnostics"], "fat_apart_mm": [5.0, 20.0]}
+    pooled = {**size, "reason": "", "figures": document["diagnostics"], "findings": findings}
     pooled |= {"provenance": document["provenance"], "maps": [{"map": f"map {n}", "outlying": True} for n in range(12)]}
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
     scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))

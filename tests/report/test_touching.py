@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tactile_bayes.report.masses_document import mass_words
-from tactile_bayes.report.touching import touching_masses, touching_sentences
+from tactile_bayes.report.touching import touching_findings, touching_masses
 
 
 def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> dict[str, Any]:
@@ -46,5 +46,7 @@ def test_the_line_of_the_other_mass_tells_it(x: float, told: bool) -> None:
     first, second = mass(1, 0.0, 12.0), mass(2, x, 8.0)
     words = "may be one lump with mass 1, together 20.0 mm long (19.0 to 21.0)"
     assert (words in mass_words(second, first)) == told
-    sentences = touching_sentences(touching_masses([first, second]))
-    assert sentences == (["masses 1 and 2 may be one lump: together 20.0 mm long (19.0 to 21.0)"] if told else [])
+    found = touching_findings(touching_masses([first, second]))
+    assert [one.text for one in found] == (
+        ["masses 1 and 2 may be one lump: together 20.0 mm long (19.0 to 21.0)"] if told else []
+    )

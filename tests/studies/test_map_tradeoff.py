@@ -11,9 +11,9 @@ import pytest
 
 import tactile_bayes
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.schema import check_document
 from tactile_bayes.mapping.thinning import first_seconds
-from tactile_bayes.pipeline.scans import load_scans
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.pipeline.tradeoff import tradeoff_of_scan
 from tactile_bayes.report.ladder_document import ladder_document
@@ -29,8 +29,7 @@ DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
 
 @cache
 def demo() -> Scan:
-    (scan,), _ = load_scans([DEMO])
-    return scan
+    return read_scan(DEMO)
 
 
 @cache

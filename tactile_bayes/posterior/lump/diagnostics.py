@@ -49,16 +49,12 @@ class NoiseFigures:
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
-    """Diagnostics and flags of an estimate.
+    """Diagnostics of an estimate.
 
     Parameters
     ----------
     cells, covered_share
         Cells in the fit window, and the share of it that they cover.
-    coarse_cells
-        Whether the cells are coarse for the width.
-    outside_calibration
-        What lies outside the calibration's range, in words.
     fat_mm
         Depth of fat that the size is for; None where the map does not give it.
     by_place, by_place_used
@@ -73,18 +69,12 @@ class Diagnostics:
         Which calibration gave the size and what it cannot know, in words.
     repeatability
         How far exams of one mass lie apart at the site, in words; empty where nobody learned it.
-    broken_assumptions
-        What in the scan may put the size outside its interval, in words, see `mapping.assumptions`.
-    assumptions_to_check
-        What in it differs from the calibration's bodies, in words.
     convergence
         Of chains: R-hat, effective draws and Monte-Carlo errors of each size and width, see `arviz_data.convergence`.
     """
 
     cells: int
     covered_share: float
-    coarse_cells: bool
-    outside_calibration: tuple[str, ...]
     fat_mm: float | None
     method: str
     sampler: Mapping[str, float]
@@ -92,8 +82,6 @@ class Diagnostics:
     calibration: str = ""
     size_calibration: str = ""
     repeatability: str = ""
-    broken_assumptions: tuple[str, ...] = ()
-    assumptions_to_check: tuple[str, ...] = ()
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     by_place: tuple[float, ...] | None = None
     by_place_used: bool = False
@@ -108,10 +96,6 @@ class Diagnostics:
         return {
             "cells": self.cells,
             "covered_share": self.covered_share,
-            "coarse_cells": self.coarse_cells,
-            "outside_calibration": list(self.outside_calibration),
-            "broken_assumptions": list(self.broken_assumptions),
-            "assumptions_to_check": list(self.assumptions_to_check),
             "fat_mm": self.fat_mm,
             "by_place": None if self.by_place is None else dict(zip(BY_PLACE, self.by_place, strict=True)),
             "by_place_used": self.by_place_used,

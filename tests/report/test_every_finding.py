@@ -1,0 +1,382 @@
+"""Every kind of finding is followed through every output: its sentence stands in each of them, and the verdict with it.
+
+`OUTPUTS` is the one list of outputs. A module that prints the line "Research use only" prints a result; each such
+module is behind an output of the list or named among those that print no size, so that a new one cannot be forgotten.
+"""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+import pytest
+from in_process import run_here
+from posterior_maps import bump_map
+
+import tactile_bayes as tb
+from tactile_bayes.api.comparisons import Comparison
+from tactile_bayes.api.estimates import PooledSize, SizeEstimate
+from tactile_bayes.api.maps import Map
+from tactile_bayes.exports.exam import MapFile, estimate_of
+from tactile_bayes.exports.fhir import bundle_of
+from tactile_bayes.exports.identity import Identity
+from tactile_bayes.exports.redcap import records_csv
+from tactile_bayes.files.manifest_csv import Exam as Listed
+from tactile_bayes.files.map_nc import read_map, write_map
+from tactile_bayes.files.posterior_nc import write_pooled
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.scan_mcap import read_scan, write_scan
+from tactile_bayes.findings import KINDS, LEADS, Finding, by_weight, verdict
+from tactile_bayes.geometry import rigid
+from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.overlap import scan_findings
+from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.pipeline.campaign_growth import growth_text
+from tactile_bayes.pipeline.campaign_tables import Row, done_text
+from tactile_bayes.pipeline.compared import ComparedOutcome, drawn_maps
+from tactile_bayes.pipeline.exam_report import EstimatedMap, Given, make_exam
+from tactile_bayes.pipeline.one_map import answer_of, estimate_one
+from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.report.campaign_html import SIZED, Card, campaign_html
+from tactile_bayes.report.compare_figure import draw_comparison
+from tactile_bayes.report.compare_text import compare_summary, compare_text
+from tactile_bayes.report.exam_page import exam_page
+from tactile_bayes.report.growth import Growth, of_document
+from tactile_bayes.report.map_figure import map_figure
+from tactile_bayes.report.map_text import map_text
+from tactile_bayes.report.pooled import pooled_summary, pooled_text
+
+FAST = Settings(method="laplace")
+SCANS = ({"sha256": "ab" * 32, "side": "right", "posture": "supine"},)
+
+
+def finding(kind: str) -> Finding:
+    return Finding(kind, f"words for {kind}", f"give --{kind}", f"ask about {kind}")
+
+
+def plain_map(seed: int) -> TactileMap:
+    """A map with a lump 60 mm to the patient's right of the xiphoid, and no finding."""
+    noise = 0.01 * np.random.default_rng(seed).standard_normal((51, 51))
+    made = bump_map(noise=noise, amplitude=0.3, x=0.0, y=0.0, sigma_x=4.0, sigma_y=4.0)
+    return replace(
+        made,
+        recipe=MapRecipe("scan", "gain", 1.0, (5.0, 14.0)),
+        plane_from_base=np.eye(4),
+        patient_from_plane=rigid(np.eye(3), np.array([60.0, 90.0, 0.0])),
+        quality={"gain_passes": 3.0, "gain_last_change": 1e-7},
+    )
+
+
+@cache
+def sound() -> tuple[SizeEstimate, PooledSize, Comparison]:
+    """An estimate, a pooled size and a comparison that nothing speaks against."""
+    ones = [
+        SizeEstimate(estimate_one(plain_map(seed), FAST, scans=({**SCANS[0], "sha256": f"{seed:064x}"},)), "exam")
+        for seed in (1, 2)
+    ]
+    return ones[0], tb.pool(ones, method="laplace"), tb.compare(*ones, method="laplace")
+
+
+class Made:
+    """The same three results with findings."""
+
+    def __init__(self, findings: Sequence[Finding]) -> None:
+        self.findings = by_weight(findings)
+        one, pooled, compared = sound()
+        outcome = one.outcome
+        told = {"findings": [each.as_dict() for each in self.findings], "verdict": verdict(findings, answered=True)}
+        self.map = replace(outcome.tactile_map, findings=self.findings)
+        estimate = replace(outcome.estimate, findings=self.findings)
+        self.estimate = SizeEstimate(replace(outcome, tactile_map=self.map, estimate=estimate), "exam")
+        self.answer = answer_of(self.estimate.outcome)
+        self.pooled = replace(pooled, outcome=replace(pooled.outcome, document={**pooled.outcome.document, **told}))
+        document = {**compared.outcome.document, **told}
+        inside = replace(compared.outcome.compared, findings=self.findings)
+        self.compared = replace(compared, outcome=ComparedOutcome(inside, document))
+
+    @property
+    def exported(self) -> Any:
+        return estimate_of(self.answer.document, Path("e.json"))
+
+    @property
+    def pooled_export(self) -> Any:
+        return estimate_of(self.pooled.document, Path("p.json"))
+
+    @property
+    def map_file(self) -> MapFile:
+        return MapFile(Path("m.nc"), "ab" * 32, self.map, {"side": "right"})
+
+
+def folder() -> Path:
+    return Path(mkdtemp(prefix="findings-"))
+
+
+def shown(path: Path) -> str:
+    return run_here("show", path.name, cwd=path.parent).stdout
+
+
+def words_of(page: str) -> str:
+    return html.unescape(re.sub("<[^>]*>", " ", page))
+
+
+def figure_words(figure: Any) -> str:
+    return " ".join(text.get_text() for text in figure.findobj(lambda one: hasattr(one, "get_text")))
+
+
+def stored_map(made: Made) -> str:
+    path = folder() / "map.nc"
+    write_map(path, made.map, provenance=Provenance("test", {}, scans=SCANS))
+    assert read_map(path).findings == made.findings
+    return shown(path)
+
+
+def stored_estimate(made: Made, *words: str) -> str:
+    path = folder() / "post.nc"
+    made.estimate.outcome.write(path, document=made.answer.document)
+    return run_here(*(words or ("show",)), path.name, cwd=path.parent).stdout
+
+
+def stored_pool(made: Made) -> str:
+    path, found = folder() / "post.nc", made.pooled.outcome
+    assert found.pooled.size is not None
+    write_pooled(path, found.pooled.size, provenance=found.provenance, document=found.document)
+    return shown(path)
+
+
+def stored_scan(made: Made) -> str:
+    """Through the file of a scan to its map."""
+    path = folder() / "scan.mcap"
+    scan = replace(tb.demo_scan(), findings=made.findings)
+    write_scan(path, scan, provenance=Provenance("import", {}))
+    back = read_scan(path)
+    assert back.findings == made.findings == scan_findings(back)
+    assert set(made.findings) <= set(build_map(back, every=4).findings)
+    return shown(path)
+
+
+def exam_words(made: Made, *, several: bool) -> str:
+    exam = make_exam([EstimatedMap(made.map, made.answer, SCANS)], FAST, Given())
+    return words_of(exam_page(replace(exam, pooled=made.pooled.document) if several else exam))
+
+
+def nrrd(made: Made) -> str:
+    pytest.importorskip("nrrd")
+    from tactile_bayes.exports.nrrd_map import nrrd_bytes
+
+    return nrrd_bytes(made.map_file).partition(b"\n\n")[0].decode()
+
+
+def dicom(made: Made, name: str) -> str:
+    """All texts of a file of the exam: its comments and those of its content."""
+    pytest.importorskip("highdicom")
+    pydicom = pytest.importorskip("pydicom")
+    out = folder() / "out"
+    tb.export(made.estimate, out, to="dicom", study_date="2026-11-24T10:30")
+    file = pydicom.dcmread(out / f"{name}.dcm")
+    return " ".join(str(one.value) for one in file.iterall() if one.keyword in ("TextValue", "ImageComments"))
+
+
+def campaign_row(made: Made) -> str:
+    row = Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.document, scans=SCANS, findings=made.findings)
+    (cells,) = csv.DictReader(io.StringIO(done_text([row])))
+    return f"{cells['verdict']} {cells['findings']}"
+
+
+def growth_of(made: Made) -> Growth:
+    (row,) = of_document("P", "1", ["1", "2"], made.compared.document, "")
+    return row
+
+
+def growth_table(made: Made) -> str:
+    (cells,) = csv.DictReader(io.StringIO(growth_text([growth_of(made)])))
+    return cells["findings"]
+
+
+def campaign_card(made: Made) -> str:
+    size = {"median": 15.0, "low": 13.0, "high": 17.0, "probability": 0.95, "sd": 1.0}
+    cards = [Card("a", SIZED, size=size, findings=made.findings)]
+    return words_of(campaign_html(cards, lines=(), links={}, version="1"))
+
+
+def drawn(made: Made) -> Any:
+    maps = drawn_maps([[made.map], [made.map]], [[made.answer], [made.answer]])
+    return draw_comparison(made.compared.outcome.compared, made.compared.document, maps, None)
+
+
+@dataclass(frozen=True)
+class Output:
+    """How an output is made, whether for paper, whether it shortens lists, how it says the verdict, if it does."""
+
+    made: Callable[[Made], str]
+    paper: bool
+    shortens: bool = False
+    verdict: str = ""
+
+
+def fhir(file: Any) -> str:
+    return json.dumps(bundle_of(file, Identity()))
+
+
+OUTPUTS: dict[str, Output] = {
+    "scan: show": Output(stored_scan, paper=False),
+    "map: text": Output(lambda made: map_text(made.map), paper=False),
+    "map: file, show": Output(stored_map, paper=False),
+    "map: figure": Output(lambda made: figure_words(map_figure(made.map, None)), paper=True),
+    "map: Python": Output(lambda made: words_of(Map(made.map)._repr_html_()) and repr(Map(made.map)), paper=True),
+    "map: NRRD": Output(nrrd, paper=True),
+    "estimate: text": Output(lambda made: made.answer.text, paper=False, shortens=True),
+    "estimate: text -v": Output(lambda made: made.answer.full_text, paper=False),
+    "estimate: JSON": Output(lambda made: told_in(made.answer.document), paper=False, verdict="{}"),
+    "estimate: file, show": Output(stored_estimate, paper=False, verdict="{}"),
+    "estimate: file, diagnose": Output(lambda made: stored_estimate(made, "diagnose"), paper=False),
+    "estimate: figure of the size": Output(lambda made: figure_words(made.estimate.plot()), paper=True),
+    "estimate: figure of the map": Output(lambda made: figure_words(made.estimate.plot_map()), paper=True),
+    "estimate: figure of the fit": Output(lambda made: figure_words(made.estimate.plot_fit()), paper=True),
+    "estimate: notebook": Output(lambda made: words_of(made.estimate._repr_html_()), paper=True),
+    "estimate: page": Output(lambda made: exam_words(made, several=False), paper=True, shortens=True),
+    "map: DICOM": Output(lambda made: dicom(made, "map"), paper=True),
+    "estimate: DICOM": Output(lambda made: dicom(made, "report"), paper=True, verdict="Verdict: {}."),
+    "estimate: FHIR": Output(lambda made: fhir(made.exported), paper=True, verdict="Verdict: {}."),
+    "estimate: REDCap": Output(lambda made: records_csv([made.exported], Identity(), id_from_scan=False), paper=True),
+    "pool: text": Output(lambda made: pooled_summary(made.pooled.document), paper=False, shortens=True),
+    "pool: text -v": Output(lambda made: pooled_text(made.pooled.document), paper=False),
+    "pool: JSON": Output(lambda made: told_in(made.pooled.document), paper=False, verdict="{}"),
+    "pool: file, show": Output(stored_pool, paper=False, verdict="{}"),
+    "pool: figure": Output(lambda made: figure_words(made.pooled.plot()), paper=True),
+    "pool: notebook": Output(lambda made: words_of(made.pooled._repr_html_()), paper=True),
+    "pool: page": Output(lambda made: exam_words(made, several=True), paper=True, shortens=True),
+    "pool: FHIR": Output(lambda made: fhir(made.pooled_export), paper=True, verdict="Verdict: {}."),
+    "compare: text": Output(lambda made: compare_summary(made.compared.document), paper=False, shortens=True),
+    "compare: text -v": Output(lambda made: compare_text(made.compared.document), paper=False),
+    "compare: JSON": Output(lambda made: told_in(made.compared.document), paper=False, verdict="{}"),
+    "compare: figure": Output(lambda made: figure_words(drawn(made)), paper=False, shortens=True),
+    "compare: notebook": Output(lambda made: words_of(made.compared._repr_html_()), paper=False, shortens=True),
+    "campaign: growth, table": Output(growth_table, paper=False),
+    "campaign: growth, page": Output(lambda made: growth_of(made).words, paper=True),
+    "campaign: table": Output(campaign_row, paper=False, verdict="{}"),
+    "campaign: page": Output(campaign_card, paper=True),
+}
+PRINTERS = {
+    # behind the outputs above
+    "api/comparisons", "api/maps", "api/sized", "commands/diagnose", "commands/show", "exports/dicom_map",
+    "exports/dicom_picture", "exports/dicom_report", "exports/fhir", "exports/nrrd_map", "exports/redcap",
+    "files/posterior_nc", "report/campaign_html", "report/compare_document", "report/compare_figure",
+    "report/compare_text", "report/estimate_document", "report/estimate_summary", "report/estimate_text",
+    "report/exam_page", "report/fit_figure", "report/map_figure", "report/map_text", "report/pooled",
+    "report/size_figure",
+    # the live view says cautions alone, see below; recorder and import speak of a scan that has no size yet
+    "report/live_text", "report/record_text", "commands/import_", "commands/repair",
+    # of draws, not of a size; names of files that were written
+    "report/posterior_figures", "commands/campaign", "commands/demo", "commands/export", "commands/report",
+    # of trials, calibrations, devices and studies
+    "api/trials", "commands/calibrate_array", "commands/compare_model", "commands/head", "commands/plan",
+    "commands/population", "commands/simulate", "commands/study", "commands/tables", "commands/tradeoff_forward",
+    "files/repeatability_json", "files/size_json", "files/size_population_eq6_json", "files/size_quadratic_json",
+    "files/size_site_json", "pipeline/trial", "presets", "report/calibration_text", "report/eq6_figure",
+    "report/head_figure", "report/head_text", "report/ladder_document", "report/ladder_figure", "report/ladder_text",
+    "report/model_figure", "report/model_text", "report/population_text", "report/repeatability_text",
+    "report/sbc_text", "report/site_text", "report/solid_figures", "report/study_figures", "report/tradeoff_figures",
+    "report/trial_html", "report/trial_text",
+}  # fmt: skip
+
+
+def told_in(document: Any) -> str:
+    """Verdict and findings of a JSON object as `Finding.sentence` puts them together."""
+    lines = [f"{LEADS[one['severity']]}{one['text']}; {one['remedy']}" for one in document["findings"]]
+    return " ".join([document["verdict"], *lines])
+
+
+def plain(text: str) -> str:
+    return " ".join(text.split())
+
+
+@cache
+def said(output: str, kinds: tuple[str, ...]) -> str:
+    return plain(OUTPUTS[output].made(Made([finding(kind) for kind in kinds])))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_it_is_said(output: str, kind: str) -> None:
+    """With its remedy for that reader; an output that counts the rest of a long list has this one finding."""
+    how, one = OUTPUTS[output], finding(kind)
+    text = said(output, (kind,) if how.shortens else tuple(KINDS))
+    assert f"{LEADS[one.severity]}{one.sentence(paper=how.paper)}" in text
+    assert (one.remedy in text) is not how.paper
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_nothing_is_said_where_nothing_speaks_against_it_and_the_verdict_is_told(output: str) -> None:
+    clear, doubted = said(output, ()), said(output, tuple(KINDS) if not OUTPUTS[output].shortens else ("side",))
+    assert "words for" not in clear
+    assert not any(lead in clear for lead in LEADS.values())
+    if words := OUTPUTS[output].verdict:
+        assert words.format("sound") in clear
+        assert words.format("doubtful") in doubted
+
+
+@pytest.mark.parametrize("kind", [kind for kind, severity in KINDS.items() if severity == "caution"])
+def test_python_begins_with_the_caution(kind: str) -> None:
+    made = Made([finding("few_strokes"), finding(kind)])
+    for one in (made.estimate, made.pooled, made.compared):
+        assert repr(one).split(" ", 1)[1].startswith(f"CAUTION: words for {kind}; ask about {kind}.")
+        assert [each.kind for each in one.findings] == [kind, "few_strokes"]
+        assert one.verdict == "doubtful"
+    assert all("CAUTION" not in repr(one) and one.verdict == "sound" for one in sound())  # the control
+
+
+def test_a_notebook_has_both_intervals_and_the_probability() -> None:
+    table = words_of(sound()[0]._repr_html_())
+    assert re.search(r"largest size if exams differ by 15 % +\d+\.\d mm", table)
+    assert re.search(r"probability of a lump +1\.000", table)
+
+
+def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path: Path) -> None:
+    """Written to a file, estimated by commands; only what is of one size alone is judged anew from all maps."""
+    for number in (1, 2):
+        made = replace(plain_map(number), findings=(finding("late_poses"),) if number == 2 else ())
+        scans = ({"sha256": f"{number:064x}", "side": "right", "subject": "P"},)
+        write_map(tmp_path / f"{number}.nc", made, provenance=Provenance("test", {}, scans=scans))
+    sentence = "CAUTION: {}words for late_poses; give --late_poses"
+
+    def run(*words: object) -> str:
+        done = run_here(*words, "--method", "laplace", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert run("estimate", "2.nc").startswith(sentence.format(""))
+    assert run("estimate", "1.nc", "2.nc", "--pool").startswith(sentence.format("map 2: "))
+    assert run("compare", "1.nc", "--with", "2.nc").startswith(sentence.format("visit 2: "))
+    assert "CAUTION" not in run("estimate", "1.nc")
+    (tmp_path / "exams.csv").write_text("file,patient,visit,mass,replicate\n1.nc,P,1,1,1\n2.nc,P,1,1,2\n")
+    run("campaign", "run", "exams.csv", "-o", "out")
+    with (tmp_path / "out" / "exams_done.csv").open(newline="") as lines:
+        told = {row["file"]: (row["verdict"], sentence.format("") in row["findings"]) for row in csv.DictReader(lines)}
+    assert told == {"1.nc": ("sound", False), "2.nc": ("doubtful", True)}
+    assert "words for late_poses" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_the_live_view_says_a_caution_before_the_size() -> None:
+    from tactile_bayes.commands.live_view import Turn, live_estimate
+
+    shipped = Path(tb.__file__).parent / "calibrations" / "solid.json"
+    live = replace(plain_map(1), findings=(finding("late_poses"), finding("few_strokes")))
+    assert live_estimate(live, str(shipped), Turn()).text.startswith(
+        "CAUTION: words for late_poses; give --late_poses."
+    )
+
+
+def test_every_module_that_prints_a_result_is_behind_an_output_or_prints_no_size() -> None:
+    package = Path(tb.__file__).parent
+    modules = {path.relative_to(package).with_suffix("").as_posix(): path for path in package.rglob("*.py")}
+    assert {name for name, path in modules.items() if "RESEARCH_USE" in path.read_text()} == PRINTERS
