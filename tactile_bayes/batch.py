@@ -175,8 +175,7 @@ def _stored(outcome: Outcome[Result], store: BatchStore) -> Outcome[Result]:
 class _Run(Generic[Item, Result]):
     """A running batch: submits a few items ahead of their results, and stores each outcome as it arrives.
 
-    When worker processes are lost they are replaced. Whatever was handed out then is run again, one item at a time, so
-    that an item that ends its process again is known to be at fault.
+    An item whose worker process was lost is run again at the end, alone: if its process ends again, it is at fault.
     """
 
     def __init__(
@@ -193,7 +192,7 @@ class _Run(Generic[Item, Result]):
         self._suspects: deque[tuple[str, Item]] = deque()
         self._waiting: dict[Future[tuple[Result | None, str]], tuple[str, Item]] = {}
         self._finished: SimpleQueue[Future[tuple[Result | None, str]]] = SimpleQueue()
-        self._alone = self._broken = False
+        self._alone = False
 
     def run(self) -> None:
         """Run all items; on the way out of an interruption or a fault keep what is finished."""
@@ -208,25 +207,17 @@ class _Run(Generic[Item, Result]):
 
     def _hand_out(self) -> None:
         """Submit what may run now: an item suspected of killing its worker alone, otherwise the next few."""
-        if not self._waiting and self._broken and self._workers is not None:
-            self._workers.renew()
-            self._broken = False
-        if not self._waiting:
-            self._alone = bool(self._suspects)
-            if self._alone:
-                self._submit(self._suspects.popleft())
+        if not self._waiting and not self._rest:
+            self._alone = True
+            self._submit(self._suspects.popleft())
         ahead: int = getattr(self._executor, "ahead", _WINDOW)
-        while self._rest and not (self._alone or self._broken) and len(self._waiting) < ahead:
+        while self._rest and len(self._waiting) < ahead:
             self._submit(self._rest.popleft())
             if not self._finished.empty():
                 return
 
     def _submit(self, work: tuple[str, Item]) -> None:
-        try:
-            future = self._executor.submit(_attempt, self._function, work[1])
-        except BrokenExecutor as error:
-            future = Future()
-            future.set_exception(error)
+        future = self._executor.submit(_attempt, self._function, work[1])
         self._waiting[future] = work
         future.add_done_callback(self._finished.put)
 
@@ -240,7 +231,6 @@ class _Run(Generic[Item, Result]):
             if outcome.error == CLUSTER_LOST:
                 self._give_up()
             return
-        self._broken = True
         if self._alone:
             self._keep(Outcome(work[0], error=DIED_TWICE))
         else:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes import __version__
@@ -14,13 +14,15 @@ from tactile_bayes.errors import UsageError, one_line
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
+    from multiprocessing.process import BaseProcess
 
 
 class LocalWorkers(Executor):
     """Local worker processes, spawned and not forked: libraries with threads do not survive a fork.
 
-    A worker leaves Ctrl-C to its parent and ends when the parent does, even if that was killed. When one is killed,
-    all items that were handed out come back with `BrokenExecutor`; then `renew` and hand them out again.
+    A worker leaves Ctrl-C to its parent and ends when the parent does, even if that was killed. Each has a pipe of its
+    own, so that one that is killed in the middle of handing over its result holds up nobody: its item comes back with
+    `BrokenExecutor`, and another process takes its place. `concurrent.futures` has one pipe for all and waits for ever.
 
     Parameters
     ----------
@@ -30,51 +32,91 @@ class LocalWorkers(Executor):
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
-        self._start()
+        self._threads = ThreadPoolExecutor(workers)  # one for each process: it hands over items and waits for results
+        self._own = threading.local()
+        self._lock = threading.Lock()
+        self._running: dict[BaseProcess, Connection] = {}
+        self._stopped = False
 
     @property
     def ahead(self) -> int:
-        """Number of items to submit ahead; small, because all of them run again when a worker is lost."""
+        """Number of items to submit ahead."""
         return 2 * self._workers
-
-    def _start(self) -> None:
-        import multiprocessing
-        from concurrent.futures import ProcessPoolExecutor
-
-        context = multiprocessing.get_context("spawn")
-        theirs, self._leash = context.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(
-            self._workers, mp_context=context, initializer=prepare_worker, initargs=(theirs,)
-        )
-        self._theirs = theirs
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """The future of ``fn(*args, **kwargs)`` in one of the processes."""
-        return self._pool.submit(fn, *args, **kwargs)
+        return self._threads.submit(self._ask, fn, args, kwargs)
+
+    def _ask(self, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Have this thread's process run an item."""
+        if getattr(self._own, "process", None) not in self._running:
+            self._own.process = self._start()
+        process = self._own.process
+        line = self._running[process]
+        try:
+            line.send((fn, args, kwargs))
+            done, value = line.recv()
+        except (EOFError, OSError):
+            with self._lock:
+                self._running.pop(process, None)
+            line.close()
+            raise BrokenExecutor("the item's process ended without an answer") from None
+        if not done:
+            raise value
+        return value
+
+    def _start(self) -> BaseProcess:
+        import multiprocessing
+
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs,), daemon=True)
+        with self._lock:
+            if self._stopped:
+                raise BrokenExecutor("the processes were stopped")
+            process.start()
+            self._running[process] = ours
+        theirs.close()
+        return process
 
     def stop(self) -> None:
         """Kill all processes now; their running items are lost."""
-        self._leash.close()
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def renew(self) -> None:
-        """Start new processes in place of lost ones."""
-        self.stop()
-        self._theirs.close()
-        self._start()
+        with self._lock:
+            self._stopped = True
+            for process in self._running:
+                process.kill()
+        self._threads.shutdown(wait=False, cancel_futures=True)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let the processes end when their items are done."""
-        self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
-        self._leash.close()
-        self._theirs.close()
+        self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
+        if wait:
+            for process, line in self._running.items():
+                line.close()
+                process.join()
 
 
-def prepare_worker(leash: Connection | None = None) -> None:
-    """Set up a worker process: ignore Ctrl-C, and end when the parent process does, even if that was killed.
+def _work(line: Connection) -> None:
+    """Run items from a pipe until its other end is closed."""
+    prepare_worker()
+    while True:
+        try:
+            fn, args, kwargs = line.recv()
+            answer = True, fn(*args, **kwargs)
+        except EOFError:
+            return
+        except Exception as error:
+            answer = False, error
+        try:
+            line.send(answer)
+        except OSError:
+            return
+        except Exception as error:  # it cannot be pickled
+            line.send((False, TypeError(one_line(error))))
 
-    With a `leash`, the reading end of a pipe, the worker ends when the parent closes the other end, by its death too.
-    """
+
+def prepare_worker() -> None:
+    """Set up a worker process: ignore Ctrl-C, and end when the parent process does, even if that was killed."""
     import multiprocessing
     import signal
 
@@ -82,14 +124,11 @@ def prepare_worker(leash: Connection | None = None) -> None:
     parent = multiprocessing.parent_process()
 
     def end_with_parent() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            if leash is not None:
-                leash.recv()
-            elif parent is not None:
-                parent.join()
+        if parent is not None:
+            parent.join()
         os._exit(1)
 
-    if leash is not None or parent is not None:
+    if parent is not None:
         threading.Thread(target=end_with_parent, daemon=True).start()
 
 

@@ -149,6 +149,52 @@ def test_a_killed_worker_costs_no_result(tmp_path):
     assert [outcome.value for outcome in outcomes] == list(range(8))
 
 
+def test_a_worker_killed_while_it_hands_over_its_result_holds_up_nobody(tmp_path, child_environment):
+    """With one pipe for all workers the batch waited for the rest of the result for ever."""
+    script = tmp_path / "run.py"
+    script.write_text(
+        textwrap.dedent(
+            """
+            import os, sys, time
+            from pathlib import Path
+            from tactile_bayes.batch import run_batch
+            from tactile_bayes.executors import local_executor
+
+            def large(item):
+                (Path(sys.argv[1]) / "writing").write_text(str(os.getpid()))
+                (Path(sys.argv[1]) / "writing").rename(Path(sys.argv[1]) / f"pid-{item}")
+                time.sleep(0.2)
+                return bytes(20_000_000)
+
+            if __name__ == "__main__":
+                with local_executor(2) as executor:
+                    outcomes = run_batch(large, range(3), key=str, executor=executor)
+                print([len(outcome.value) for outcome in outcomes])
+            """
+        )
+    )
+    command = [sys.executable, str(script), str(tmp_path)]
+    process = subprocess.Popen(command, env=child_environment, stdout=subprocess.PIPE, text=True)
+    try:
+        wait_until((tmp_path / "pid-0").exists)
+        process.send_signal(signal.SIGSTOP)
+        worker = int((tmp_path / "pid-0").read_text())
+        wait_until(lambda: waits_to_write(worker))
+        os.kill(worker, signal.SIGKILL)
+        wait_until(lambda: not is_running(worker))
+        process.send_signal(signal.SIGCONT)
+        told, _ = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert told == "[20000000, 20000000, 20000000]\n"
+
+
+def waits_to_write(pid: int) -> bool:
+    """Whether a process sleeps in the middle of sending: the pipe is full and nobody reads."""
+    where = Path(f"/proc/{pid}/syscall").read_text().split()[0]
+    return where in ("1", "44", "46", "64", "206")  # write, sendto, sendmsg of x86-64; write, sendto of arm64
+
+
 def test_an_item_whose_worker_dies_twice_is_at_fault_and_no_other():
     with local_executor(2) as executor:
         outcomes = run_batch(die_on_three, range(8), key=str, executor=executor)

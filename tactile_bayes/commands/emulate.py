@@ -33,7 +33,8 @@ _SHARE = FiniteRange(0.0, 1.0)
 @click.option(
     "--tcp",
     metavar="HOST:PORT",
-    help="Listen there (port 0: any; both: the tracker on the next port). Default: a pseudo-terminal.",
+    help="Listen there (port 0: any; both: the tracker on the next port); without HOST for this computer only. "
+    "Default: a pseudo-terminal.",
 )
 @click.option(
     "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
@@ -176,4 +177,4 @@ def _link(tcp: str | None, *, after: int) -> Link:
     number = int(port) + after if port.isdigit() and int(port) else 0
     if not colon or not port.isdigit() or number > 65535:
         raise UsageError(f"--tcp {tcp!r} is not HOST:PORT; give 127.0.0.1:0 for any free port")
-    return TcpLink(host, number)
+    return TcpLink(host or "127.0.0.1", number)  # a patient's scan: other computers only where an address is given

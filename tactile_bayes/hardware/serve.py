@@ -12,8 +12,11 @@ import ipaddress
 import json
 import math
 import secrets
+import select
 import socket
 import threading
+import time
+from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
@@ -29,6 +32,9 @@ _PAGE: Final = Path(__file__).with_name("live_page.html")
 # How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
 OPEN_S: Final = 4.0
 CLOSE_S: Final = 0.5
+MOST_OPEN: Final = 32
+"""Connections at a time; nobody has as many pages open."""
+WAIT_S: Final = 0.1
 _SECURITY: Final = (
     "default-src 'none'; connect-src 'self' ws://{host}; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
     "frame-ancestors 'none'; base-uri 'none'"
@@ -58,6 +64,50 @@ def address_of(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
+class _Door(socket.socket):
+    """A listening socket that keeps `MOST_OPEN` connections, whatever comes.
+
+    A server of websockets ends for good when a connection cannot be accepted, for example without file descriptors.
+    Beyond the limit the oldest that is no page gives way, so that whoever knows the address is let in.
+    """
+
+    def __init__(self, host: str, port: int, pages: Callable[[], set[socket.socket]]) -> None:
+        super().__init__(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        self._open: list[socket.socket] = []
+        self._pages = pages
+        self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.bind((host, port))
+        self.listen()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection; raises OSError only where this socket was closed."""
+        while True:
+            self._wait()
+            self._open = [one for one in self._open if one.fileno() >= 0]
+            if len(self._open) >= MOST_OPEN:
+                self._shed()
+            with contextlib.suppress(OSError):  # its other end has gone, or the system has nothing left
+                made, address = super().accept()
+                self._open.append(made)
+                return made, address
+            if len(self._open) >= MOST_OPEN:
+                time.sleep(WAIT_S)
+
+    def _wait(self) -> None:
+        """Wait for somebody to knock."""
+        while self.fileno() >= 0:
+            with contextlib.suppress(ValueError):  # it was closed meanwhile
+                if select.select([self], [], [], WAIT_S)[0]:
+                    return
+        raise OSError("closed")
+
+    def _shed(self) -> None:
+        pages = self._pages()
+        for one in [one for one in self._open if one not in pages][: 1 + len(self._open) - MOST_OPEN]:
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)  # its thread closes it
+
+
 class LiveServer:
     """Sends states to the pages whose address has the secret.
 
@@ -81,8 +131,7 @@ class LiveServer:
         try:
             self._server = serve(
                 self._talk,
-                host,
-                port,
+                sock=_Door(host, port, self._sockets),
                 process_request=self._admit,
                 compression=None,
                 open_timeout=OPEN_S,
@@ -120,6 +169,10 @@ class LiveServer:
             with contextlib.suppress(OSError):
                 page.socket.shutdown(socket.SHUT_RDWR)
         closing.join(CLOSE_S)
+
+    def _sockets(self) -> set[socket.socket]:
+        with self._news:
+            return {page.socket for page in self._pages}
 
     def _admit(self, connection: Any, request: Any) -> Any:
         """Return the page or a refusal; None accepts a websocket."""

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from emulated_devices import serving, short_scan
 
+from tactile_bayes.commands.emulate import _link
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
@@ -145,3 +146,14 @@ def test_a_replay_in_a_terminal_starts_at_once(tmp_path, child_environment):
     os.close(far)
     assert done.returncode == 0, done.stderr
     assert re.search(r"again.mcap: scan, ended by the head stopped\n40 frames", done.stdout)
+
+
+@pytest.mark.parametrize(
+    ("given", "host"), [(":0", "127.0.0.1"), ("127.0.0.1:0", "127.0.0.1"), ("0.0.0.0:0", "0.0.0.0")]
+)
+def test_a_port_without_an_address_is_for_this_computer_only(given: str, host: str) -> None:
+    link = _link(given, after=0)
+    try:
+        assert link.url.startswith(f"socket://{host}:")
+    finally:
+        link.close()
