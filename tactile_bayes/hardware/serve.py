@@ -32,9 +32,10 @@ _PAGE: Final = Path(__file__).with_name("live_page.html")
 # How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
 OPEN_S: Final = 4.0
 CLOSE_S: Final = 0.5
-MOST_OPEN: Final = 32
+MOST_OPEN: Final = 24
 """Connections at a time; nobody has as many pages open."""
 WAIT_S: Final = 0.1
+SHED_S: Final = 0.01
 _SECURITY: Final = (
     "default-src 'none'; connect-src 'self' ws://{host}; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; "
     "frame-ancestors 'none'; base-uri 'none'"
@@ -86,12 +87,13 @@ class _Door(socket.socket):
             self._open = [one for one in self._open if one.fileno() >= 0]
             if len(self._open) >= MOST_OPEN:
                 self._shed()
+                time.sleep(SHED_S)
+                continue
             with contextlib.suppress(OSError):  # its other end has gone, or the system has nothing left
                 made, address = super().accept()
                 self._open.append(made)
                 return made, address
-            if len(self._open) >= MOST_OPEN:
-                time.sleep(WAIT_S)
+            time.sleep(SHED_S)
 
     def _wait(self) -> None:
         """Wait for somebody to knock."""
@@ -103,7 +105,7 @@ class _Door(socket.socket):
 
     def _shed(self) -> None:
         pages = self._pages()
-        for one in [one for one in self._open if one not in pages][: 1 + len(self._open) - MOST_OPEN]:
+        for one in [one for one in self._open if one not in pages][:1]:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)  # its thread closes it
 

@@ -229,27 +229,28 @@ def test_the_page_is_for_those_who_know_the_address(server):
 
 def test_connections_without_the_token_do_not_end_the_page(server):
     """Some 250 of them took all file descriptors, and the server never accepted another."""
-    limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-    used = len(list(Path("/proc/self/fd").iterdir()))
     host, port = server.url.split("/")[2].split(":")
     flood = (
-        "import socket\nkept = []\nfor i in range(150):\n"
+        "import socket\ninput()\nkept = []\nfor i in range(300):\n"
         f"    kept.append(socket.create_connection(({host!r}, {port}), timeout=20))\n"
         "    if i % 2: kept[-1].send(b'GET / HTTP/1.1\\r\\n')\n"
-        "print(len(kept), flush=True)\nimport time\ntime.sleep(60)\n"
+        "print(len(kept), flush=True)\ninput()\n"
     )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 60, limit[1]))
-    try:
-        with subprocess.Popen([sys.executable, "-c", flood], stdout=subprocess.PIPE, text=True) as flooding:
-            try:
-                assert flooding.stdout is not None
-                assert flooding.stdout.readline() == "150\n"
-                assert get(server.url)[0] == 200
-                assert get(server.url.split("?")[0])[0] == 403
-            finally:
-                flooding.kill()
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, limit)
+    ends = subprocess.PIPE
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with subprocess.Popen([sys.executable, "-c", flood], stdin=ends, stdout=ends, text=True, bufsize=1) as flooding:
+        used = len(list(Path("/proc/self/fd").iterdir()))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (used + 180, limit[1]))
+        try:
+            assert flooding.stdin is not None
+            assert flooding.stdout is not None
+            flooding.stdin.write("go\n")
+            assert flooding.stdout.readline() == "300\n"
+            assert get(server.url)[0] == 200
+            assert get(server.url.split("?")[0])[0] == 403
+        finally:
+            flooding.kill()
+            resource.setrlimit(resource.RLIMIT_NOFILE, limit)
 
 
 def test_the_websocket_takes_its_own_page_only(server, state):
