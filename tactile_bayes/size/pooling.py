@@ -24,6 +24,7 @@ from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import OVAL_SD, ShapePrior
 from tactile_bayes.size.mass_calibration import MassCalibration
+from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_size_probability, spread_tested
 from tactile_bayes.size.posterior import SizePosterior, shares
 from tactile_bayes.size.shape_draws import ShapeDraws, matched_draws
 from tactile_bayes.size.site_shift import site_variance
@@ -38,6 +39,7 @@ Where B is skewed, its score is one more.
 _SCORE = 2
 """Coordinate of the spread of B."""
 MOST_INVALID = 0.05
+DISAGREE = "the maps show sizes too far apart for one mass"
 IRREGULAR_SD = 0.15
 """SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
 
@@ -250,7 +252,7 @@ class PooledEstimate:
     Parameters
     ----------
     status, reason
-        As of `Estimate`.
+        As of `Estimate`; also ``maps_disagree``, where the maps are not of one size, or not of one mass.
     size
         None without an estimate.
     centres
@@ -263,6 +265,9 @@ class PooledEstimate:
         The one used: for the depth of fat that the maps tell, where they do.
     fat_apart_mm
         Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise.
+    one_size, one_size_apart
+        Probability that maps of one mass come out as far apart in size or farther, by the spread that `one_size`
+        supposes and by the paper's maps; None of a single map, or where the site's spread is known.
     """
 
     status: str
@@ -273,6 +278,8 @@ class PooledEstimate:
     outside: tuple[str, ...] = ()
     calibration: BodyCalibration | None = None
     fat_apart_mm: tuple[float, float] | None = None
+    one_size: float | None = None
+    one_size_apart: float | None = None
 
 
 def pool_maps(
@@ -284,7 +291,8 @@ def pool_maps(
 ) -> PooledEstimate:
     """Pool the maps of a mass to one size; None stands for a map on which no lump was found.
 
-    When fewer than half of the maps show the lump there is no size: those that do may be the noise's.
+    When fewer than half of the maps show the lump there is no size: those that do may be the noise's. Maps that are not
+    of one size have none in common.
     """
     found = [i for i, shape in enumerate(shapes) if shape is not None]
     if 2 * len(found) < len(shapes) or not found:
@@ -303,10 +311,17 @@ def pool_maps(
     far = [f"map {i + 1}: {text}" for i, middle in named for text in fitted.mass.too_far(*middle)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
+    sizes = fitted.log_sizes(used)
+    centres = {i: float(np.nanmean(one)) for i, one in zip(found, sizes, strict=True)}
+    centre, noise = np.array(list(centres.values())), np.array([np.nanvar(one) for one in sizes])
+    chances = _one_size(centre, noise, priors)
+    if chances["one_size"] is not None and chances["one_size"] < LEAST_PROBABILITY:
+        far_off = outlying_maps(centre, noise, spread_tested(priors.between_maps))
+        apart = tuple(sorted(found[i] for i in far_off))
+        return PooledEstimate("maps_disagree", DISAGREE, None, centres, apart, (), fitted.mass, fat_apart_mm, **chances)
     size = pooled_size(used, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
-    centres = {i: float(np.nanmean(one)) for i, one in zip(found, fitted.log_sizes(used), strict=True)}
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in fitted.mass.outside(*middle)]
     outside += fitted.mass.beyond_lumps(size.median_mm)
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
@@ -314,4 +329,17 @@ def pool_maps(
     if len(used) > 1:
         weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
         size = replace(size, figures={**size.figures, **weights})
-    return PooledEstimate("estimate", reason, size, centres, outlying, tuple(outside), fitted.mass, fat_apart_mm)
+    return PooledEstimate(
+        "estimate", reason, size, centres, outlying, tuple(outside), fitted.mass, fat_apart_mm, **chances
+    )
+
+
+def _one_size(centre: FloatArray, noise: FloatArray, priors: SizePriors) -> dict[str, float | None]:
+    """Probabilities that maps of one mass come out so far apart; the second where a second interval is told too."""
+    if len(centre) < 2:
+        return {"one_size": None, "one_size_apart": None}
+    another = None if priors.between_maps is not None else priors.another_exam
+    return {
+        "one_size": one_size_probability(centre, noise, spread_tested(priors.between_maps)),
+        "one_size_apart": None if another is None else one_size_probability(centre, noise, another),
+    }
