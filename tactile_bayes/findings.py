@@ -40,6 +40,7 @@ KINDS: Final[Mapping[str, Severity]] = {
     "uneven_level": "check",
     "touching": "check",
     # of several maps or visits
+    "maps_disagree": "caution",
     "another_mass": "caution",
     "same_scan": "caution",
     "fat_apart": "caution",

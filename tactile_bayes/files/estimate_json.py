@@ -35,8 +35,8 @@ def check_estimate(document: Mapping[str, Any], schema_name: str, *, path: Path)
 
 
 def _check_sizes(document: Mapping[str, Any]) -> None:
-    if document["status"] == "no_estimate" and document["max_size_mm"] is not None:
-        raise BadDataError("status is 'no_estimate', and there is a max_size_mm", way_out=_WAY_OUT)
+    if document["status"] != "estimate" and document["max_size_mm"] is not None:
+        raise BadDataError(f"status is {document['status']!r}, and there is a max_size_mm", way_out=_WAY_OUT)
     for where, holder in _holders(document):
         for name in _SIZES:
             if holder.get(name) is not None:

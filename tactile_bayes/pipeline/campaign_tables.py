@@ -108,7 +108,8 @@ def _of_pooled(campaign: Campaign) -> dict[str, tuple[Finding, ...]]:
         name: tuple(
             replace(one, about="")
             for one in findings_in(document["findings"])
-            if one.about == f"map {number}" and one.kind != "several_masses"  # its row says which mass it is of
+            if (one.about == f"map {number}" and one.kind != "several_masses")  # its row says which mass it is of
+            or one.kind == "maps_disagree"
         )
         for document in pooled_documents(campaign).values()
         for number, name in enumerate(document["maps"], start=1)

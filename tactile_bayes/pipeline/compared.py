@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.change import JointSizes
     from tactile_bayes.size.comparison import Compared
-    from tactile_bayes.size.same_mass import Apart, Place
+    from tactile_bayes.size.mass_calibration import MassCalibration
+    from tactile_bayes.size.pooling import SizePriors
+    from tactile_bayes.size.same_mass import Apart
     from tactile_bayes.size.shape_draws import ShapeDraws
 
 
@@ -141,10 +143,13 @@ def _by_place(
     visits: Sequence[Sequence[Answer]], comparing: Comparing
 ) -> tuple[Compared | None, tuple[Apart | None, ...], list[Finding]]:
     """Refusal where the places do not show one mass, the distances from the first visit, and what else speaks of it."""
+    from tactile_bayes.pipeline.one_mass import place_of
     from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_place_probability
     from tactile_bayes.size.same_mass import Place, apart
 
-    places = [Place.mean_of([one for one in map(_place, maps) if one is not None]) for maps in visits]
+    of_maps = [[place for answer in maps if (place := place_of(answer.document)) is not None] for maps in visits]
+    places = [Place.mean_of(one) for one in of_maps]
     found = tuple(
         None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
         for first, later in ((places[0], later) for later in places[1:])
@@ -153,6 +158,11 @@ def _by_place(
         f"the masses of visits 1 and {number} lie {one.words}"
         for number, one in enumerate(found, start=2)
         if one is not None and one.doubtful
+    ]
+    doubts += [
+        f"the masses on the maps of visit {number} lie too far apart for one"
+        for number, maps in enumerate(of_maps, start=1)
+        if one_place_probability(maps, registration_mm=comparing.registration_mm) < LEAST_PROBABILITY
     ]
     unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
     if not comparing.same_mass and doubts:
@@ -185,7 +195,8 @@ def _sized(
         sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
         for maps in visits
     ]
-    fitted = [one.mass for one in visit_calibrations(shapes, calibration)]
+    by_visit = visit_calibrations(shapes, calibration)
+    fitted = [one.mass for one in by_visit]
     far = _by_visit(shapes, fitted, lambda at, middle: at.too_far(*middle))
     if far:
         return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
@@ -204,6 +215,7 @@ def _sized(
         *doubts,
         *(Finding("outside_calibration", f"outside the calibration's range: {text}") for text in outside),
         *_fat_apart(shapes, calibration),
+        *_sizes_apart(shapes, by_visit, priors),
     ]
     another = None if priors.another_exam is None else joint(priors.another_exam)
     return Compared("compared", "", "", apart, tuple(findings), sizes, another)
@@ -224,6 +236,21 @@ def _by_visit(
     return list(dict.fromkeys(found))
 
 
+def _sizes_apart(
+    shapes: Sequence[Sequence[ShapeDraws]], by_visit: Sequence[MassCalibration], priors: SizePriors
+) -> list[Finding]:
+    """Cautions where the maps of one visit are not of one size."""
+    from tactile_bayes.report.pooled import disagreement
+    from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_size_of
+
+    found = []
+    for number, (maps, at) in enumerate(zip(shapes, by_visit, strict=True), start=1):
+        chance = one_size_of(at.log_sizes(maps), priors.between_maps)
+        if chance < LEAST_PROBABILITY:
+            found.append(disagreement("its maps show different sizes", chance).at(f"visit {number}"))
+    return found
+
+
 def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[Finding]:
     """Caution where the maps differ too much in the depth of fat to be of one breast."""
     from tactile_bayes.report.pooled import fat_apart
@@ -242,19 +269,6 @@ def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
         for one in answer.findings
         if one.kind != "outside_calibration"
     ]
-
-
-def _place(answer: Answer) -> Place | None:
-    """Where a map's lump lies in the patient; None without landmarks."""
-    import numpy as np
-
-    from tactile_bayes.size.same_mass import Place
-
-    centre = None if answer.document is None else answer.document["centre_patient_mm"]
-    if centre is None:
-        return None
-    x, y = centre["x"], centre["y"]
-    return Place(np.array([x["median"], y["median"]]), np.diag([x["sd"] ** 2, y["sd"] ** 2]))
 
 
 def _refuse_repeated(visits: Sequence[Sequence[Answer]], names: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from tactile_bayes.files.file_names import given_twice
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.one_map import Answer, answer_of, estimate_one
 from tactile_bayes.pipeline.one_mass import elsewhere
-from tactile_bayes.pipeline.pooled import pool_answers
+from tactile_bayes.pipeline.pooled import check_one_mass, pool_answers
 from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.exam import Exam, exam_map
@@ -22,10 +22,6 @@ from tactile_bayes.report.lump_place import side_of
 
 Notice = Callable[[str], None]
 Scans = Sequence[Mapping[str, str]]
-SHARED: Final = ("subject", "side", "mass")
-"""Facts in which the maps of one page must not differ."""
-
-
 _LONGEST: Final = {"title": 60, "name": 50}
 _DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 
@@ -153,7 +149,7 @@ def make_exam(
         When the maps are of different exams, or cannot be pooled.
     """
     scans = [scan for one in maps for scan in one.scans]
-    _check_one_exam(scans)
+    check_one_mass(scans)
     pooled = None
     if len(maps) > 1:
         names = [f"map {number}" for number in range(1, len(maps) + 1)]
@@ -211,13 +207,3 @@ def _read_estimate(source: Path) -> dict[str, Any]:
     check_estimate(document, "estimate.schema.json", path=source)
     found: dict[str, Any] = document
     return found
-
-
-def _check_one_exam(scans: Scans) -> None:
-    for name in SHARED:
-        values = sorted({scan[name] for scan in scans if scan.get(name)})
-        if len(values) > 1:
-            raise BadDataError(
-                f"the maps differ in {name} ({', '.join(values)})",
-                way_out="give the maps of one mass; make a page for each other exam",
-            )

@@ -14,6 +14,7 @@ import numpy as np
 from tactile_bayes.pipeline.campaign_settings import MATCH_MM
 from tactile_bayes.pipeline.one_map import Answer
 from tactile_bayes.records import dataclass
+from tactile_bayes.size.same_mass import Place as PatientPlace
 
 Document = Mapping[str, Any]
 Place = tuple[float, float]
@@ -117,3 +118,12 @@ def _nearest(masses: Sequence[_Mass], common: _Mass) -> _Mass | None:
     """The mass nearest to a place, if it lies within `MATCH_MM` of it."""
     near = min(masses, key=common.away_mm, default=None)
     return near if near is not None and near.away_mm(common) <= MATCH_MM else None
+
+
+def place_of(document: Document | None) -> PatientPlace | None:
+    """Where a map's reported mass lies in the patient; None without a lump or landmarks."""
+    centre = None if document is None else document["centre_patient_mm"]
+    if centre is None:
+        return None
+    x, y = centre["x"], centre["y"]
+    return PatientPlace(np.array([x["median"], y["median"]]), np.diag([x["sd"] ** 2, y["sd"] ** 2]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.pooling import PooledEstimate
+    from tactile_bayes.size.same_mass import Place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,30 +46,42 @@ def pool_answers(
     Raises
     ------
     BadDataError
-        When the maps were normalised in several ways, or one was made with another head than the calibration's.
+        When the maps were normalised in several ways, one was made with another head than the calibration's, or their
+        scans name different patients, sides, masses or visits.
     UsageError
         When the calibration cannot pool maps.
     """
     import numpy as np
 
     from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
-    from tactile_bayes.pipeline.one_mass import apart_from_others, one_place
+    from tactile_bayes.pipeline.one_mass import apart_from_others, one_place, place_of
     from tactile_bayes.report.pooled import pooled_document
-    from tactile_bayes.size.pooling import pool_maps
+    from tactile_bayes.size.one_size import one_place_probability
+    from tactile_bayes.size.pooling import DISAGREE, pool_maps
 
+    documents = [answer.document for answer in answers if answer.document is not None]
+    scans = [scan for document in documents for scan in scans_of(document["provenance"])]
+    check_one_mass(scans)
     path, calibration = common_calibration(answers, settings, names=names)
     digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
     check_repeatability(settings, calibration, digests)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
-    pooled = _too_far(answers) or pool_maps(
-        [answer.shape for answer in answers],
-        calibration=calibration,
-        priors=size_priors(settings),
-        rng=np.random.default_rng([settings.seed, *words]),
+    places = [place for one in answers if one.shape is not None and (place := place_of(one.document)) is not None]
+    chance = one_place_probability(places) if len(places) > 1 else None
+    pooled = (
+        _too_far(answers)
+        or _apart(places, chance)
+        or pool_maps(
+            [answer.shape for answer in answers],
+            calibration=calibration,
+            priors=size_priors(settings),
+            rng=np.random.default_rng([settings.seed, *words]),
+        )
     )
-    documents = [answer.document for answer in answers if answer.document is not None]
-    scans = [scan for document in documents for scan in scans_of(document["provenance"])]
+    pooled = replace(pooled, one_place=chance)
+    if pooled.status == DISAGREE and pooled.one_size is not None:
+        pooled = replace(pooled, reason=f"{pooled.reason}, {_sizes(documents)}")
     provenance = Provenance("estimate --pool", _plain(settings), digests, seed=settings.seed, scans=scans)
     document = pooled_document(
         pooled,
@@ -92,6 +105,43 @@ def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
         if answer.document is not None and answer.document["reason_code"] == "extrapolated":
             return PooledEstimate("no_estimate", f"map {i + 1}: {answer.document['reason']}")
     return None
+
+
+def _apart(places: Sequence[Place], chance: float | None) -> PooledEstimate | None:
+    """Reason for no size where landmarks show that the maps are of several masses; else None."""
+    from itertools import combinations
+
+    import numpy as np
+
+    from tactile_bayes.size.one_size import LEAST_PROBABILITY
+    from tactile_bayes.size.pooling import DISAGREE, PooledEstimate
+
+    if chance is None or chance >= LEAST_PROBABILITY:
+        return None
+    most = max(float(np.hypot(*(a.centre_mm - b.centre_mm))) for a, b in combinations(places, 2))
+    return PooledEstimate(DISAGREE, f"by the landmarks the masses of the maps lie up to {most:.0f} mm apart")
+
+
+def _sizes(documents: Sequence[Mapping[str, Any]]) -> str:
+    """The maps' own sizes in words."""
+    found = [f"{one['max_size_mm']['median']:.1f}" for one in documents if one["max_size_mm"] is not None]
+    return f"{', '.join(found[:-1])} and {found[-1]} mm" if len(found) > 1 else f"{', '.join(found)} mm"
+
+
+def check_one_mass(scans: Sequence[Mapping[str, str]]) -> None:
+    """Refuse scans that say they are of different masses, or of one mass at different visits.
+
+    Raises
+    ------
+    BadDataError
+        Naming what they differ in.
+    """
+    for name in ("subject", "side", "mass", "visit"):
+        values = sorted({scan[name].casefold(): scan[name] for scan in scans if scan.get(name)}.values())
+        if len(values) > 1:
+            visits = "; `compare` takes several visits" if name == "visit" else ""
+            way_out = f"give the maps of one mass at one visit, and others by themselves{visits}"
+            raise BadDataError(f"the maps differ in {name} ({', '.join(values)})", way_out=way_out)
 
 
 def _shipped_for(answers: Sequence[Answer]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.mapping.clock_face import ClockPosition, clock_position
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.report.masses_document import patient_mm
+from tactile_bayes.size.pooling import DISAGREE
 
 NOT_SIZED = "not sized"
 Quantity = Mapping[str, Any]
@@ -117,6 +118,11 @@ class Exam:
     def document(self) -> Mapping[str, Any]:
         """The JSON object of the size that the page reports: the pooled one of several maps."""
         return self.main.document if self.pooled is None else self.pooled
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the maps are not of one size, or not of one mass."""
+        return self.pooled is not None and self.pooled["status"] == DISAGREE
 
     @property
     def figures(self) -> Mapping[str, Any]:

@@ -135,6 +135,8 @@ def _picture(exam: Exam) -> Iterator[str]:
     if largest(exam) is not None:
         of_all = " of all maps" if len(exam.maps) > 1 else ""
         lines.append(f"Full line: the estimated size{of_all}; dashed: the ends of its interval.")
+    elif exam.disagrees:
+        lines.append("Full line: the size by this map alone; dashed: the ends of its interval.")
     if not exam.main.masses:
         lines.append("Crosses: the highest rises, none of which was taken for a lump.")
     view = orientation_of(tactile_map)
@@ -214,7 +216,7 @@ def _repeats(exam: Exam) -> Iterator[str]:
     if len(exam.maps) < 2:
         return
     assert exam.pooled is not None
-    yield f"<h2>The {len(exam.maps)} maps of this mass</h2>"
+    yield f"<h2>The {len(exam.maps)} maps{'' if exam.disagrees else ' of this mass'}</h2>"
     shown = exam.maps[:MOST_REPEATS]
     yield '<div class="repeats">'
     small = small_pictures(shown, room_mm=_REPEAT_MM)
@@ -224,7 +226,9 @@ def _repeats(exam: Exam) -> Iterator[str]:
         yield f"<figure>{picture}<figcaption>{number}: {alone}</figcaption></figure>"
     yield "</div>"
     if len(exam.maps) > MOST_REPEATS:
-        yield from _paragraphs([f"And {len(exam.maps) - MOST_REPEATS} more maps, pooled too."])
+        yield from _paragraphs(
+            [f"And {len(exam.maps) - MOST_REPEATS} more maps{'' if exam.disagrees else ', pooled too'}."]
+        )
 
 
 def _quality(exam: Exam) -> Iterator[str]:

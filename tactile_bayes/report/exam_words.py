@@ -36,6 +36,8 @@ def headline(exam: Exam) -> str:
         what = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
         interval = f"{_percent(size)} interval {size['low']:.1f} to {size['high']:.1f} mm"
         return f"{what} about {size['median']:.1f} mm, {interval}"
+    if exam.disagrees:
+        return _capital(exam.document["reason"])
     if masses:
         return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
     return "No lump found in the area covered" if exam.main.document["reason_code"] in UNDETECTED else "No size"
@@ -95,6 +97,14 @@ def _supposed(exam: Exam) -> str:
 def nothing_sentences(exam: Exam) -> Iterator[str]:
     """Why there is no size, what would help, and what was covered."""
     document = exam.document
+    if exam.disagrees:
+        yield "No common size is given: look at each map."
+        for number, one in enumerate(exam.document["maps"], start=1):
+            size = one["max_size_mm"]
+            if size is not None:
+                ends = f"{_percent(size)}: {size['low']:.1f} to {size['high']:.1f} mm"
+                yield f"By map {number} alone the largest diameter is about {size['median']:.1f} mm ({ends})."
+        return
     if exam.main.document["reason_code"] in UNDETECTED:
         tactile_map = exam.main.tactile_map
         area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
@@ -112,7 +122,7 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
 def detail_sentence(exam: Exam) -> str:
     """Why there is no size, as the program's other reports give it; empty where there is one."""
     document = exam.document
-    reason = document["reason"] if largest(exam) is None else ""
+    reason = document["reason"] if largest(exam) is None and not exam.disagrees else ""
     return f"In detail: {reason.replace('cm2', 'cm²')}." if reason else ""
 
 

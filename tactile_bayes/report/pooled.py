@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.findings import (
     Finding,
@@ -35,7 +33,8 @@ from tactile_bayes.report.size_text import (
 from tactile_bayes.report.supposed_text import supposed_document, supposed_line, supposed_lines
 from tactile_bayes.size import omissions
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.pooling import PooledEstimate
+from tactile_bayes.size.one_size import LEAST_PROBABILITY
+from tactile_bayes.size.pooling import DISAGREE, PooledEstimate
 from tactile_bayes.size.posterior import EXTREMES, SizePosterior
 from tactile_bayes.size.repeatability import Repeatability
 
@@ -84,6 +83,8 @@ def pooled_document(
         ANOTHER_EXAM: _another_exam(size, probability),
         "supposing": supposed_document(size, largest),
         "maps": [_map(i, name, documents[i], pooled) for i, name in enumerate(names)],
+        "one_size_probability": None if pooled.one_size is None else nine_digits(pooled.one_size),
+        "one_place_probability": None if pooled.one_place is None else nine_digits(pooled.one_place),
         "variance_share": None if size is None else {k: nine_digits(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: nine_digits(value) for name, value in size.figures.items()},
         "left_out": _omitted(used, documents),
@@ -119,9 +120,14 @@ def _map(index: int, name: str, document: Mapping[str, Any], pooled: PooledEstim
         "status": document["status"],
         "reason": document["reason"],
         "detected_probability": document["detected_probability"],
-        "log_size": nine_digits(pooled.centres[index]) if index in pooled.centres else None,
+        "max_size_mm": _alone(document["max_size_mm"]),
         "outlying": index in pooled.outlying,
     }
+
+
+def _alone(size: Mapping[str, Any] | None) -> dict[str, float] | None:
+    """The largest size by one map, as its own estimate has it."""
+    return None if size is None else {name: size[name] for name in ("median", "low", "high", "probability")}
 
 
 def _reported(document: Mapping[str, Any]) -> list[int]:
@@ -139,7 +145,10 @@ def _findings(
     one_place: bool | None,
 ) -> Iterator[Finding]:
     """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
-    for index in sorted(pooled.centres):
+    if pooled.status == DISAGREE:
+        yield disagreement(pooled.reason, *_chances(pooled))
+    sized = [i for i, document in enumerate(documents) if document["status"] == "estimate"]
+    for index in sized if pooled.status == DISAGREE else sorted(pooled.centres):
         for one in findings_in(documents[index]["findings"]):
             if one.kind != "outside_calibration":  # of the size alone
                 yield one.at(_number(index))
@@ -161,6 +170,34 @@ def _findings(
             yield Finding("several_masses", text, same, same, _number(index))
 
 
+def _chances(pooled: PooledEstimate) -> tuple[float, float | None]:
+    """Probability of the maps of one mass being so far apart, in place or in size, and that by the paper's spread."""
+    if pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:
+        return pooled.one_place, None
+    assert pooled.one_size is not None
+    return pooled.one_size, pooled.one_size_apart
+
+
+def disagreement(what: str, probability: float, if_exams_differ: float | None = None) -> Finding:
+    """Caution where maps are not of one size, or not of one mass.
+
+    Parameters
+    ----------
+    probability, if_exams_differ
+        Of maps of one mass that are as far apart or farther, by the spread supposed and by the paper's.
+    """
+    patients = (
+        "" if if_exams_differ is None else f" ({_chance(if_exams_differ)} if exams differ as those of patients did)"
+    )
+    text = f"{what}; one mass gives maps so far apart with a probability of {_chance(probability)}{patients}"
+    on_paper = "look at each map: one may be of another mass or of another day"
+    return Finding("maps_disagree", text, f"{on_paper}, or exams differ more at this site (--repeatability)", on_paper)
+
+
+def _chance(probability: float) -> str:
+    return "under 0.001" if probability < 0.001 else f"{probability:.1g}"
+
+
 def _number(index: int) -> str:
     """A map by its number: a file's name may be a patient's."""
     return f"map {index + 1}"
@@ -175,10 +212,11 @@ def fat_apart(depths_mm: tuple[float, float]) -> Finding:
 def pooled_summary(document: Mapping[str, Any]) -> str:
     """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
     findings = findings_in(document["findings"])
-    lines = finding_summary(findings, "caution", most=2) + _maps_lines(document["maps"])
+    apart = document["status"] == DISAGREE
+    lines = finding_summary(findings, "caution", most=2) + _maps_lines(document["maps"], with_ends=apart)
     lines += finding_summary(findings, "check", most=2)
-    if document["status"] == "no_estimate":
-        lines.append(f"No estimate: {document['reason']}.")
+    if document["max_size_mm"] is None:
+        lines.append(_no_size(document))
     else:
         largest, spread = document["max_size_mm"], document["figures"]["between_map_sd"]
         lines += _table(document) + width_lines(document["variance_share"])
@@ -193,12 +231,21 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
     return "\n".join([*lines, MORE, RESEARCH_USE]) + "\n"
 
 
-def _maps_lines(maps: Sequence[Mapping[str, Any]]) -> list[str]:
+def _maps_lines(maps: Sequence[Mapping[str, Any]], *, with_ends: bool) -> list[str]:
     """Sizes of the maps in one line."""
-    found = [one for one in maps if one["log_size"] is not None]
-    sizes = ", ".join(f"{np.exp(one['log_size']):.1f}" for one in found[:MOST_NAMED])
+    found = [one for one in maps if one["max_size_mm"] is not None]
+    sizes = ", ".join(_size_words(one["max_size_mm"], with_ends=with_ends) for one in found[:MOST_NAMED])
     more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
     return [f"A lump was found on {len(found)} of {len(maps)} maps, alone sized at {sizes}{more} mm."] if found else []
+
+
+def _size_words(size: Mapping[str, float], *, with_ends: bool) -> str:
+    return f"{size['median']:.1f}" + (f" ({size['low']:.1f} to {size['high']:.1f})" if with_ends else "")
+
+
+def _no_size(document: Mapping[str, Any]) -> str:
+    head = "No common size" if document["status"] == DISAGREE else "No estimate"
+    return f"{head}: {document['reason']}."
 
 
 def pooled_text(document: Mapping[str, Any]) -> str:
@@ -207,14 +254,17 @@ def pooled_text(document: Mapping[str, Any]) -> str:
     lines = finding_lines(findings, "caution")
     lines += [f"{number}. {_map_line(one)}" for number, one in enumerate(document["maps"], start=1)]
     lines += finding_lines(findings, "check")
-    if document["status"] == "no_estimate":
-        return "\n".join([*lines, f"No estimate: {document['reason']}.", RESEARCH_USE]) + "\n"
+    if document["max_size_mm"] is None:
+        return "\n".join([*lines, _no_size(document), RESEARCH_USE]) + "\n"
     worst, figures = _worst(document), document["figures"]
     lines += ["", *_table(document)]
     lines += ["", *width_lines(document["variance_share"])]
     places = decimals(worst["mc_error"], most=SIZE_DECIMALS)
     lines += supposed_lines(document["supposing"], document["max_size_mm"]["median"], places=places)
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
+    if document["one_size_probability"] is not None:
+        chance = _chance(document["one_size_probability"])
+        lines.append(f"Probability that maps of one mass are as far apart in size or farther: {chance}.")
     if "repeatability" in document:
         lines.append(site_interval_text(document["repeatability"]))
     lines.append(shape_text(figures))
@@ -253,10 +303,11 @@ def _row(label: str, q: Mapping[str, float], places: int) -> str:
 
 
 def _map_line(one: Mapping[str, Any]) -> str:
-    if one["log_size"] is None:
+    size = one["max_size_mm"]
+    if size is None:
         return f"{one['map']}: no estimate ({one['reason']})"
     mass = "  (mass {} of {} on this map)".format(*one["mass"]) if one.get("mass") else ""
-    return f"{one['map']}: {np.exp(one['log_size']):.1f} mm{mass}"
+    return f"{one['map']}: {_size_words(size, with_ends=True)} mm alone{mass}"
 
 
 def _unknowns(document: Mapping[str, Any]) -> str:

@@ -54,6 +54,12 @@ def one_size_probability(centre: FloatArray, noise: FloatArray, between: Between
     return float(prior @ _above(q, len(centre) - 1))
 
 
+def one_size_of(log_sizes: Sequence[FloatArray], known: BetweenMaps | None) -> float:
+    """`one_size_probability` of maps by the draws of each one's log size."""
+    centre, noise = (np.array([of(one) for one in log_sizes]) for of in (np.nanmean, np.nanvar))
+    return one_size_probability(centre, noise, spread_tested(known))
+
+
 def one_place_probability(places: Sequence[Place], *, registration_mm: float = REGISTRATION_MM) -> float:
     r"""Probability that the places of one mass come out as far apart or farther.
 

@@ -39,7 +39,8 @@ Where B is skewed, its score is one more.
 _SCORE = 2
 """Coordinate of the spread of B."""
 MOST_INVALID = 0.05
-DISAGREE = "the maps show sizes too far apart for one mass"
+DISAGREE = "maps_disagree"
+"""Status of maps that are not of one size, or not of one mass."""
 IRREGULAR_SD = 0.15
 """SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
 
@@ -267,7 +268,9 @@ class PooledEstimate:
         Least and largest depth of fat by single maps, where they can hardly be of one body; None otherwise.
     one_size, one_size_apart
         Probability that maps of one mass come out as far apart in size or farther, by the spread that `one_size`
-        supposes and by the paper's maps; None of a single map, or where the site's spread is known.
+        supposes and, where a second interval is told, by the paper's maps; None without several maps.
+    one_place
+        Likewise for the places of their masses in the patient; None without landmarks.
     """
 
     status: str
@@ -280,6 +283,7 @@ class PooledEstimate:
     fat_apart_mm: tuple[float, float] | None = None
     one_size: float | None = None
     one_size_apart: float | None = None
+    one_place: float | None = None
 
 
 def pool_maps(
@@ -318,7 +322,9 @@ def pool_maps(
     if chances["one_size"] is not None and chances["one_size"] < LEAST_PROBABILITY:
         far_off = outlying_maps(centre, noise, spread_tested(priors.between_maps))
         apart = tuple(sorted(found[i] for i in far_off))
-        return PooledEstimate("maps_disagree", DISAGREE, None, centres, apart, (), fitted.mass, fat_apart_mm, **chances)
+        return PooledEstimate(
+            DISAGREE, "the maps show different sizes", None, centres, apart, (), fitted.mass, fat_apart_mm, **chances
+        )
     size = pooled_size(used, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")

@@ -159,9 +159,10 @@ def test_the_order_of_the_maps_leaves_the_size(pooled: dict, folder: Path) -> No
         assert other[end] == pytest.approx(pooled["max_size_mm"][end], abs=0.1 * sd)
 
 
-def test_a_map_of_another_mass_is_named(folder: Path) -> None:
+def test_a_map_of_another_mass_is_named_and_there_is_no_common_size(folder: Path) -> None:
     done = run_here("estimate", "mass1.nc", "mass2.nc", "mass3.nc", "mass4.nc", "--pool", *FAST, cwd=folder)
-    assert done.returncode == 0
+    assert done.returncode == 6
+    assert "No common size: the maps show different sizes" in done.stdout
     told = "To check: map 4: lies apart from the others: look at this map."
     assert told in done.stdout
     whole = run_here("estimate", "mass1.nc", "mass2.nc", "mass3.nc", "mass4.nc", "--pool", "-v", *FAST, cwd=folder)

@@ -114,7 +114,7 @@ def test_estimate_pool_sizes_one_mass(exams: Path) -> None:
     pooled = json.loads(run_here("estimate", "m1.nc", "m2.nc", "m3.nc", "--pool", "--json", *FAST, cwd=exams).stdout)
     assert [one["mass"] for one in pooled["maps"]] == [[], [], [2, 2]]
     assert pooled["findings"] == []
-    sizes = [np.exp(one["log_size"]) for one in pooled["maps"]]
+    sizes = [one["max_size_mm"]["median"] for one in pooled["maps"]]
     assert max(sizes) < 1.15 * min(sizes)
     assert sizes[2] < 0.8 * largest
     text = run_here("estimate", "m1.nc", "m2.nc", "m3.nc", "--pool", "-v", *FAST, cwd=exams).stdout
