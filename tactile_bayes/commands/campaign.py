@@ -317,6 +317,7 @@ def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"failed: {len(found.faults) - _MOST_NAMED} more, see failures.csv", err=True)
     _say_names("no size after excision, left out of trial.csv", written.left_out)
+    _say_names("masses whose exams disagree, without a pooled size", written.disagreeing)
     _say_names("exams with a mass that no row names, see their findings", written.unnamed)
     _say_names("folders of exams that the table does not list", left)
     if written.report:

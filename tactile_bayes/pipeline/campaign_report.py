@@ -95,6 +95,8 @@ class Written:
         Exams whose map shows a mass that no row names.
     growth
         What became of masses with several visits, in a sentence; empty where there are none.
+    disagreeing
+        Masses at a visit whose exams are not of one size or place.
     """
 
     sized: int
@@ -106,6 +108,7 @@ class Written:
     no_report: str = field(default="")
     unnamed: tuple[str, ...] = ()
     growth: str = ""
+    disagreeing: tuple[str, ...] = ()
 
 
 def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
@@ -141,9 +144,19 @@ def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path 
     known = {(row.exam.patient, row.exam.mass) for row in rows}
     left_out = sorted(known - masses) if masses is not None else []
     names = tuple(f"{patient} {mass}" for patient, mass in left_out)
+    disagreeing = tuple(
+        dict.fromkeys(row.exam.of_mass for row in rows if any(one.kind == "maps_disagree" for one in row.findings))
+    )
     unnamed = tuple(row.exam.name for row in rows if any(one.kind == "unnamed_mass" for one in row.findings))
     return Written(
-        *counts, len(campaign.found.results["pool"]), names, report, fault, unnamed, growth_line(growth, GROWN)
+        *counts,
+        len(campaign.found.results["pool"]),
+        names,
+        report,
+        fault,
+        unnamed,
+        growth_line(growth, GROWN),
+        disagreeing,
     )
 
 

@@ -69,6 +69,11 @@ class SizePriors:
         """The spread between the maps at hand where it was learned; None where it is stated, or the calibration's."""
         return self.between_maps if self.between_maps is not None and self.between_maps.log_sd > 0 else None
 
+    @property
+    def spread_of_others(self) -> BetweenMaps:
+        """The prior from which maps teach the spread that a further one is held against."""
+        return self.another_exam or self.learned_between_maps or BetweenMaps()
+
 
 def pooled_size(
     maps: Sequence[ShapeDraws],
@@ -135,7 +140,7 @@ def pooled_size(
     variance = float(np.nanvar(np.log(size.max_size_mm)))
     return replace(
         size,
-        outliers=outlying_maps(centre, noise, another or priors.learned_between_maps or BetweenMaps()),
+        outliers=outlying_maps(centre, noise, priors.spread_of_others),
         another_exam=None if another is None else pool.size(another, figures),
         supposing=suppositions(calibration, priors.known, (log_a, log_width), variance=variance),
     )
@@ -320,7 +325,7 @@ def pool_maps(
     centre, noise = np.array(list(centres.values())), np.array([np.nanvar(one) for one in sizes])
     chances = _one_size(centre, noise, priors)
     if chances["one_size"] is not None and chances["one_size"] < LEAST_PROBABILITY:
-        far_off = outlying_maps(centre, noise, spread_tested(priors.between_maps))
+        far_off = outlying_maps(centre, noise, priors.spread_of_others)
         apart = tuple(sorted(found[i] for i in far_off))
         return PooledEstimate(
             DISAGREE, "the maps show different sizes", None, centres, apart, (), fitted.mass, fat_apart_mm, **chances

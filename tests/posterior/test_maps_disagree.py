@@ -116,6 +116,7 @@ def test_a_campaign_leaves_the_pooled_size_out_and_its_cards_say_why(folder: Pat
     (folder / "exams.csv").write_text("\n".join(rows) + "\n")
     done = run_here("campaign", "run", "exams.csv", "-o", "out", *FAST, cwd=folder)
     assert done.returncode == 0, done.stderr
+    assert "masses whose exams disagree, without a pooled size: P1.v1.m1" in done.stdout
     with (folder / "out" / "trial.csv").open(newline="") as file:
         trial = {(row["patient"], row["modality"]): row for row in csv.DictReader(file)}
     assert trial["P1", "tactile-pooled"]["status"] == "not_done"  # it was found: it does not count as missed

@@ -294,7 +294,7 @@ def test_a_second_mass_is_drawn_as_its_ellipse_and_as_a_circle_by_an_older_estim
 def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     with_lump, without = exam().maps[0], without_lump().maps[0]
     size = {name: with_lump.document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
-    pooled = {**size, "reason": "", "figures": with_lump.document["diagnostics"], "findings": []}
+    pooled = {**size, "status": "estimate", "reason": "", "figures": with_lump.document["diagnostics"], "findings": []}
     pooled["provenance"] = with_lump.document["provenance"]
     pooled["maps"] = [{"map": f"map {n}", "outlying": False} for n in (1, 2)]
     both = Exam((without, with_lump), pooled, SCANS)
@@ -368,7 +368,7 @@ def full() -> Exam:
     findings = [Finding("side", f"caution {n} " * 80).as_dict() for n in range(9)]
     tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
     size = {name: document[name] for name in ("max_size_mm", "min_size_mm", "another_exam", "variance_share")}
-    pooled = {**size, "reason": "", "figures": document["diagnostics"], "findings": findings}
+    pooled = {**size, "status": "estimate", "reason": "", "figures": document["diagnostics"], "findings": findings}
     pooled |= {"provenance": document["provenance"], "maps": [{"map": f"map {n}", "outlying": True} for n in range(12)]}
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
     scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
