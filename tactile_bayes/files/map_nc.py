@@ -245,26 +245,23 @@ def _recipe(fields: dict[str, Any]) -> MapRecipe:
         "pressure_window_kpa": window is None
         or (isinstance(window, list) and len(window) == 2 and all(_is_number(end) for end in window)),
         "latency_ms": _is_number(fields.get("latency_ms")),
+        "flat_field": isinstance(fields.get("flat_field"), bool),
+        "registered": isinstance(fields.get("registered"), bool),
+        "units": isinstance(fields.get("units"), str) and fields["units"].isprintable(),
     }
     for name, good in checks.items():
         if not good:
             raise BadDataError(f"recipe.{name} is {_short(fields.get(name))}", way_out=_WAY_OUT)
     ends = None if window is None else (float(window[0]), float(window[1]))
-    later = {name: fields.get(name, False) for name in ("flat_field", "registered")}  # not in the first maps
-    for name, value in later.items():
-        if not isinstance(value, bool):
-            raise BadDataError(f"recipe.{name} is {_short(value)}", way_out=_WAY_OUT)
-    units = fields.get("units", "")  # nor this
-    if not isinstance(units, str) or not units.isprintable():
-        raise BadDataError(f"recipe.units is {_short(units)}", way_out=_WAY_OUT)
     return MapRecipe(
         fields["source"],
         fields["normalise"],
         float(fields["cell_mm"]),
         ends,
         float(fields["latency_ms"]),
-        **later,
-        units=units,
+        fields["flat_field"],
+        fields["registered"],
+        fields["units"],
     )
 
 

@@ -344,7 +344,6 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
     frames = _frames(records, head)
     if not len(frames) and not records.finished:
         raise BadDataError("was cut off before its first complete chunk", way_out="nothing can be kept; scan again")
-    account = records.metadata.get("recording", {})
     scan = Scan(
         frames,
         _poses(records),
@@ -363,7 +362,6 @@ def _assemble(records: McapRecords, *, path: Path) -> ScanFile:
         topics=records.topic_counts(),
         provenance=provenance,
         schema=SCAN_SCHEMA,
-        account=account,
     )
 
 

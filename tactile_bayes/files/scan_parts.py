@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,8 +37,6 @@ class ScanFile:
         What made the file, as `Provenance.as_dict` wrote it.
     schema
         Schema id of the file.
-    account
-        What a recording that ended in order said of itself; empty for other scans and for one that was cut off.
     """
 
     scan: Scan
@@ -48,7 +46,6 @@ class ScanFile:
     topics: Mapping[str, int]
     provenance: Mapping[str, Any]
     schema: str
-    account: Mapping[str, str] = field(default_factory=dict)
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:

@@ -39,9 +39,8 @@ OTHER_HEAD = (
 """How to make a calibration for another head."""
 _IRREGULAR = Finding(
     "irregular",
-    "irregular outline: the bump is more skewed, its axis ratio changes more outwards, or it depends more on the "
-    "place under the head than a ball's; two lumps that touch, an upright, tilted or rough one look so, and sizes "
-    "get a wider interval",
+    "irregular outline, unlike a ball's or an ellipsoid's: two lumps that touch, or an upright, tilted or rough one "
+    "look so, and the interval is wider",
 )
 _NEAR_LEVEL = 0.02
 """An offset of the background of this size and more is mentioned."""

@@ -13,7 +13,6 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.report.masses_document import patient_mm
 from tactile_bayes.size.pooling import DISAGREE
 
-NOT_SIZED = "not sized"
 Quantity = Mapping[str, Any]
 
 
@@ -144,20 +143,13 @@ def exam_map(tactile_map: TactileMap | None, document: Mapping[str, Any], *, sid
 
 def _masses(tactile_map: TactileMap | None, document: Mapping[str, Any], side: str) -> Iterator[ExamMass]:
     """The reported mass first, then the others in the JSON's order."""
-    listed = document.get("masses")
-    number = 1
-    if listed:
-        number = next((one["number"] for one in listed if one["reported"]), 1)
+    listed = document["masses"]
     if document["centre_mm"] is not None:
+        number = next((one["number"] for one in listed if one["reported"]), 1)
         yield _reported(number, tactile_map, document, side)
-    for one in listed or []:
+    for one in listed:
         if not one["reported"]:
             yield _listed(one, tactile_map, side)
-    if listed is None:
-        for i, rise in enumerate(document.get("other_rises", []), start=2):
-            centre = (rise["x_mm"], rise["y_mm"])
-            words = {"probability": rise["probability"], "why": NOT_SIZED}
-            yield _placed(i, centre, tactile_map, side, **words)
 
 
 def _reported(number: int, tactile_map: TactileMap | None, document: Mapping[str, Any], side: str) -> ExamMass:
@@ -183,9 +175,9 @@ def _reported(number: int, tactile_map: TactileMap | None, document: Mapping[str
 
 
 def _listed(one: Mapping[str, Any], tactile_map: TactileMap | None, side: str) -> ExamMass:
-    """A mass besides the reported one; a circle of its size where an older estimate does not tell the axes."""
-    largest, another, angle = one["max_size_mm"], one["another_exam"], one.get("angle_deg")
-    along, across = (one.get(name) or largest for name in ("d_x_mm", "d_y_mm"))
+    """A mass besides the reported one."""
+    largest, another, angle = one["max_size_mm"], one["another_exam"], one["angle_deg"]
+    along, across = one["d_x_mm"], one["d_y_mm"]
     return _placed(
         one["number"],
         (one["centre_mm"]["x"], one["centre_mm"]["y"]),

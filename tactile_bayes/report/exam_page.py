@@ -36,7 +36,7 @@ NO_MAP: Final = (
 MOST_REPEATS: Final = 5
 MOST_MASSES: Final = 4
 _LONGEST: Final = 400
-_LONGEST_FINDING: Final = 200
+_LONGEST_FINDING: Final = 320
 _PICTURE_MM: Final = (108.0, 96.0)
 _LOWER_MM: Final = 54.0
 """Height of the picture on a crowded page: one that has both repeats and several masses below it."""

@@ -13,7 +13,7 @@ from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.clock_face import clock_text
 from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
 from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.report.exam import NOT_SIZED, Exam, ExamMass, Quantity
+from tactile_bayes.report.exam import Exam, ExamMass, Quantity
 from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
@@ -169,7 +169,7 @@ def finding_sentences(exam: Exam) -> list[str]:
     """What speaks against the result, cautions first; long lists end with their number."""
     told = finding_lines(findings_in(exam.document["findings"]), paper=True)
     more = len(told) - MOST_FINDINGS
-    return [*told[:MOST_FINDINGS], f"And {more} more: see `estimate -v`."] if more > 0 else told
+    return [*told[:MOST_FINDINGS], f"And {more} more, which the full report tells."] if more > 0 else told
 
 
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
@@ -265,7 +265,7 @@ def mass_row(mass: ExamMass) -> tuple[str, str, str]:
     """Number, size with its interval, and place of a mass, for a table of several."""
     if mass.largest is None:
         chance = "" if mass.probability is None else f" (probability of a lump {mass.probability:.2f})"
-        size = NOT_SIZED + chance if mass.why == NOT_SIZED else f"no size{chance}: {mass.why}"
+        size = f"no size{chance}: {mass.why}"
     else:
         size = f"{mass.largest['median']:.1f} mm ({mass.largest['low']:.1f} to {mass.largest['high']:.1f})"
     return str(mass.number), size, short_place(mass)

@@ -79,7 +79,6 @@ def size_figure(
                 _draw_interval(axes, intervals[name], size=_SIZES[name], row=row, colour=colour)
         if "another" in intervals:
             _draw_interval(axes, intervals["another"], size=_SIZES["max"], row=len(rows), colour=_ANOTHER_COLOUR)
-            figure.get_layout_engine().set(rect=(0.0, 0.1, 1.0, 0.9))  # type: ignore[union-attr,call-arg]
         axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
         _finish_size(axes)
@@ -135,13 +134,14 @@ def _draw_density(axes: Axes, name: str, draws_mm: FloatArray, *, colour: str, d
 
 def _draw_interval(axes: Axes, interval: SizeInterval, *, size: str, row: int, colour: str) -> None:
     """Draw a bar below the densities, labelled with the size that it is of, its ends, probability and kind."""
-    from matplotlib.transforms import blended_transform_factory
+    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
-    across = blended_transform_factory(axes.transData, axes.transAxes)
-    height = -0.2 - 0.12 * row
+    # in inches below the axes: the layout makes room for what does not grow with them
+    below = ScaledTranslation(0.0, -0.52 - 0.32 * row, axes.figure.dpi_scale_trans)
+    across = blended_transform_factory(axes.transData, axes.transAxes) + below
     axes.plot(
         [interval.low_mm, interval.high_mm],
-        [height, height],
+        [0.0, 0.0],
         transform=across,
         color=colour,
         linewidth=3,
@@ -156,7 +156,7 @@ def _draw_interval(axes: Axes, interval: SizeInterval, *, size: str, row: int, c
     text = f"{text} {interval.supposes}".rstrip()
     axes.text(
         (interval.low_mm + interval.high_mm) / 2,
-        height - 0.02,
+        -0.02,
         text,
         transform=across,
         ha="center",

@@ -148,7 +148,7 @@ REFUSED = [
     (("a.nc", "b.nc", "a.json"), 2, "an estimate goes with one map"),
     (("post.nc", "a.json"), 2, "an estimate goes with one map"),
     (("both.nc",), 3, "both.nc: holds a size pooled from several maps; give the maps"),
-    (("old.nc",), 3, "old.nc: holds draws without their estimate, as earlier versions wrote it; give its map"),
+    (("old.nc",), 3, "old.nc: holds draws without their estimate; give its map"),
     (("a.nc", "a.nc"), 2, "a.nc is given twice; give each file once"),
     (("a.nc", "other.nc"), 3, "the maps differ in subject (P1, P2); give the maps of one mass"),
     (("a.nc", "a.json", "--size-calibration", "eq6"), 2, "an estimate has settings of its own; leave out --size"),

@@ -380,3 +380,10 @@ def test_every_module_that_prints_a_result_is_behind_an_output_or_prints_no_size
     package = Path(tb.__file__).parent
     modules = {path.relative_to(package).with_suffix("").as_posix(): path for path in package.rglob("*.py")}
     assert {name for name, path in modules.items() if "RESEARCH_USE" in path.read_text()} == PRINTERS
+
+
+def test_every_kind_is_made_somewhere() -> None:
+    """A kind that nothing makes any more is dead."""
+    made = "".join(path.read_text() for path in Path(tb.__file__).parent.rglob("*.py"))
+    for kind in KINDS:
+        assert len(re.findall(rf'"{kind}"', made)) > 1, kind
