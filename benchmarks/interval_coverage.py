@@ -62,6 +62,7 @@ KINDS: dict[str, dict[str, float]] = {
     "field 6 mm": {"white": 0.01, "field": 0.01, "length_mm": 6.0},
     "field-dominated": {"white": 0.002, "field": 0.02, "length_mm": 4.0},
     "super-Gaussian, exponent 2.5": {"white": 0.01, "field": 0.01, "length_mm": 3.0, "exponent": 1.25},
+    "super-Gaussian, exponent 3": {"white": 0.01, "field": 0.01, "length_mm": 3.0, "exponent": 1.5},
 }
 BY_SQUARES = "the same, nearest by plain squares"
 CONTROL = "control: independent errors assumed, field 3 mm"

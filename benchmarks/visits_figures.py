@@ -137,7 +137,7 @@ class Judged:
     error: float
     sd: float
     held: bool
-    grown: float
+    verdict: str
     apart_sd: float
 
 
@@ -161,8 +161,8 @@ def _judged(body: Body, calibration: BodyCalibration, one: SharedBody) -> Iterat
                 continue
             change = _joint(pair, calibration, one).change(0, 1)
             q, true = change.log_summary(0.95), float(body.log_d[j] - body.log_d[i])
-            grown, separate = change.probability_above(0.0), float(np.sqrt(alone[i] + alone[j]))
-            yield Judged(count, true, q.median - true, change.log_sd, q.low <= true <= q.high, grown, separate)
+            held, separate = q.low <= true <= q.high, float(np.sqrt(alone[i] + alone[j]))
+            yield Judged(count, true, q.median - true, change.log_sd, held, verdict(change), separate)
 
 
 def _log_variance(maps: Sequence[ShapeDraws], calibration: BodyCalibration) -> float:
@@ -177,7 +177,7 @@ def _print_pairs(rows: Sequence[Judged], *, in_full: bool) -> None:
     for count in (1, 2):
         some = [r for r in rows if r.maps == count]
         still = [r for r in some if abs(r.growth) < 0.01]
-        alarms = [verdict(r.grown) != "no_change_shown" for r in still]
+        alarms = [r.verdict != "no_change_shown" for r in still]
         held, scores = [r.held for r in some], [r.error / r.sd for r in some]
         print(
             f"  {count} map(s) a visit: false alarms {_share(alarms)}; 95 % intervals hold {_share(held)}; "
@@ -199,7 +199,7 @@ def _print_power(rows: Sequence[Judged]) -> None:
         wanted = np.log1p(percent / 100)
         some = [r for r in rows if abs(r.growth - wanted) < 0.01]
         right = ["grown" if percent > 0 else "shrunk"] * len(some)
-        found = [verdict(r.grown) for r in some]
+        found = [r.verdict for r in some]
         detected = [a == b for a, b in zip(found, right, strict=True)]
         wrong = sum(a not in (b, "no_change_shown") for a, b in zip(found, right, strict=True))
         held = _share([r.held for r in some])

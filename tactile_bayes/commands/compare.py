@@ -121,8 +121,8 @@ def command(
     Each visit is one map or several. First the visits must be shown to be of one mass: by what their scans say
     (patient, side, mass) and by where it lies from the landmarks; if not, the reason is printed and the exit code is
     6. Then the sizes are estimated together: what the body hides is the same at both visits and cancels in the change.
-    A mass has grown, or shrunk, where the probability is above 0.975; else the least growth that would have been seen
-    is told.
+    A mass has grown, or shrunk, where the 95 % interval of the change leaves out none; else the least growth and
+    shrinkage that would have been seen are told.
 
     Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92
     """

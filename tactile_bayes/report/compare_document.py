@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from tactile_bayes.size.same_mass import Apart
 
 SCHEMA: Final = "tactile-bayes/compare/1"
-SHOWN: Final = 0.975
-"""Probability from which a growth, or a shrinking, is called one."""
-DETECTABLE: Final = 0.95
-"""Probability of the interval that the smallest detectable change would leave out zero by."""
+SHOWN: Final = 0.95
+"""Probability of the interval that leaves out no change where a growth, or a shrinkage, is called one."""
 
 
 def compare_document(
@@ -127,29 +125,30 @@ def _change(
 ) -> dict[str, Any]:
     """Change from the first visit to a later one."""
     change = joint.change(0, later)
-    grown = change.probability_above(0.0)
+    growth, shrinkage = (nine_digits(100.0 * share) for share in change.smallest_detectable(SHOWN))
     return {
         "earlier": 1,
         "later": later + 1,
-        "verdict": verdict(grown),
+        "verdict": verdict(change),
         "log_ratio": change.log_summary(probability).as_dict(),
         "percent": change.percent(probability).as_dict(),
-        "probability_grown": nine_digits(grown),
+        "probability_grown": nine_digits(change.probability_above(0.0)),
         "grown_by": [
             {"percent": nine_digits(100.0 * share), "probability": nine_digits(change.probability_above(share))}
             for share in grown_by
         ],
-        "smallest_detectable_percent": nine_digits(100.0 * change.smallest_detectable(DETECTABLE)),
+        "smallest_detectable_percent": {"growth": growth, "shrinkage": shrinkage},
         "growth_rate": None if days is None else _rate(change, days[later] - days[0], probability),
         "another_exam": None if another is None else _another(another, later, probability),
     }
 
 
-def verdict(probability_grown: float) -> str:
-    """``"grown"`` or ``"shrunk"`` where the odds carry it, else ``"no_change_shown"``."""
-    if probability_grown > SHOWN:
+def verdict(change: Change) -> str:
+    """``"grown"`` or ``"shrunk"`` where the 95 % interval leaves out no change, else ``"no_change_shown"``."""
+    q = change.log_summary(SHOWN)
+    if q.low > 0.0:
         return "grown"
-    return "shrunk" if 1.0 - probability_grown > SHOWN else "no_change_shown"
+    return "shrunk" if q.high < 0.0 else "no_change_shown"
 
 
 def _another(another: JointSizes, later: int, probability: float) -> dict[str, Any]:
@@ -159,7 +158,6 @@ def _another(another: JointSizes, later: int, probability: float) -> dict[str, A
         "between_map_sd": nine_digits(another.between_map_sd),
         "percent": change.percent(probability).as_dict(),
         "probability_grown": nine_digits(change.probability_above(0.0)),
-        "verdict": verdict(change.probability_above(0.0)),
     }
 
 

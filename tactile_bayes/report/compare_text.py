@@ -91,15 +91,24 @@ def _change_line(change: Mapping[str, Any]) -> str:
 
 
 def _odds_line(change: Mapping[str, Any]) -> str:
-    more = "".join(f"; by more than {one['percent']:g} %: {_odds(one['probability'])}" for one in change["grown_by"])
-    return f"Probability that it has grown: {_odds(change['probability_grown'])}{more}."
+    more = "".join(
+        f"; that it has grown by more than {one['percent']:g} %: {_odds(one['probability'])}"
+        for one in change["grown_by"]
+    )
+    return f"Probability that it {_direction(change)}{more}."
+
+
+def _direction(figures: Mapping[str, Any]) -> str:
+    """The likelier direction with its probability, worded alike for both."""
+    grown = figures["probability_grown"]
+    return f"has grown: {_odds(grown)}" if grown >= 0.5 else f"has shrunk: {_odds(1.0 - grown)}"
 
 
 def _verdict_line(change: Mapping[str, Any]) -> str:
-    least = change["smallest_detectable_percent"]
-    if change["verdict"] == "no_change_shown":
-        return f"No change shown; a growth of less than {least:.0f} % would not have been seen."
-    return f"The mass has {change['verdict']}; the least growth that these maps show is {least:.0f} %."
+    if change["verdict"] != "no_change_shown":
+        return f"The mass has {change['verdict']}."
+    growth, shrinkage = (f"{change['smallest_detectable_percent'][name]:.0f} %" for name in ("growth", "shrinkage"))
+    return f"No change shown; a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen."
 
 
 def _rate_lines(document: Mapping[str, Any], change: Mapping[str, Any]) -> list[str]:
@@ -135,9 +144,8 @@ def _another_line(change: Mapping[str, Any]) -> list[str]:
     if another is None:
         return []
     q, spread = another["percent"], 100 * another["between_map_sd"]
-    odds = f"{_signed(q['low'])} to {_signed(q['high'])} %, probability of growth {_odds(another['probability_grown'])}"
-    lost = change["verdict"] != "no_change_shown" and another["verdict"] == "no_change_shown"
-    return [f"If exams of one mass differ by {spread:.0f} %: {odds}{': no change shown then' if lost else ''}."]
+    odds = f"{_signed(q['low'])} to {_signed(q['high'])} %, probability that it {_direction(another)}"
+    return [f"If exams of one mass differ by {spread:.0f} %: {odds}."]
 
 
 def _site_line(document: Mapping[str, Any]) -> list[str]:

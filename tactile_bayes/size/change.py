@@ -60,14 +60,14 @@ class Change:
         """Posterior SD of the log ratio."""
         return float(np.sqrt(np.mean(self.sd**2) + np.var(self.mean)))
 
-    def smallest_detectable(self, probability: float) -> float:
-        """Least growth, as a share, whose interval of this probability would leave out no change.
+    def smallest_detectable(self, probability: float) -> tuple[float, float]:
+        """Least growth and least shrinkage, as shares, whose interval of this probability would leave out no change.
 
-        Notes
-        -----
-        :math:`\\exp(z s) - 1`, s the SD of the log ratio. Half of all growths of just this size are shown.
+        From the arms of this change's own interval, so a change beyond them is one that the interval shows. Half of all
+        changes of just this size are shown.
         """
-        return float(np.expm1(self._score(probability) * self.log_sd))
+        q = self.log_summary(probability)
+        return float(np.expm1(q.median - q.low)), float(-np.expm1(q.median - q.high))
 
     def percent(self, probability: float) -> Quantity:
         """Summary of the change of the diameter in percent."""
@@ -76,10 +76,6 @@ class Change:
     def log_summary(self, probability: float) -> Quantity:
         """Summary of the log ratio."""
         return summarise(self.log_ratio, probability=probability, replicates=self.replicates)
-
-    @staticmethod
-    def _score(probability: float) -> float:
-        return float(normal_quantile(np.array(0.5 + probability / 2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,9 +20,11 @@ from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document
 from tactile_bayes.geometry import rigid
+from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare_document import verdict
 from tactile_bayes.report.compare_text import _signed, compare_summary
+from tactile_bayes.size.change import Change
 
 FAST = ("--method", "laplace")
 MASS = (-70.0, 80.0)
@@ -97,8 +99,8 @@ def test_the_same_bump_shows_no_change_and_says_what_would_not_have_been_seen(fo
     done = run(folder, "a0.nc", "a1.nc", "--with", "same0.nc", "same1.nc")
     assert done.returncode == 0, done.stderr
     assert "No change shown; a growth of less than " in done.stdout
-    assert "has grown;" not in done.stdout
-    assert "has shrunk;" not in done.stdout
+    assert " or a shrinkage of less than " in done.stdout
+    assert "The mass has" not in done.stdout
     lines = done.stdout.splitlines()
     assert len(lines) <= 12
     assert lines[-1] == RESEARCH_USE
@@ -278,24 +280,54 @@ def test_help_tells_the_options_groups() -> None:
     assert "--with VISIT2.nc..." in text
 
 
+def change_of(in_sds: float, sd: float = 0.1) -> Change:
+    """A normal change of ln d, some of its SDs from none."""
+    score = normal_quantile((np.arange(4000) + 0.5) / 4000)
+    mean = np.full(4000, in_sds * sd)
+    return Change(mean + sd * score, mean, np.full(4000, sd), np.repeat(np.arange(8), 500))
+
+
 @pytest.mark.parametrize(
-    ("grown", "called"),
+    ("in_sds", "called"),
     [
-        (0.976, "grown"),
-        (0.975, "no_change_shown"),
-        (0.5, "no_change_shown"),
-        (0.025, "no_change_shown"),
-        (0.024, "shrunk"),
+        (1.98, "grown"),
+        (1.94, "no_change_shown"),
+        (0.0, "no_change_shown"),
+        (-1.94, "no_change_shown"),
+        (-1.98, "shrunk"),
     ],
 )
-def test_a_change_is_called_one_where_the_odds_carry_it(grown: float, called: str) -> None:
-    assert verdict(grown) == called
+def test_a_change_is_called_one_where_its_interval_leaves_out_none(in_sds: float, called: str) -> None:
+    assert verdict(change_of(in_sds)) == called
 
 
-def test_the_report_says_where_the_wider_spread_between_exams_shows_no_change(grown: dict) -> None:
+def test_what_is_shown_is_beyond_the_smallest_detectable_change_and_what_is_not_lies_within() -> None:
+    for in_sds in np.linspace(-3.0, 3.0, 25):
+        change = change_of(float(in_sds))
+        growth, shrinkage = change.smallest_detectable(0.95)
+        share = float(np.expm1(change.log_summary(0.95).median))
+        assert (verdict(change) == "grown") == (share > growth)
+        assert (verdict(change) == "shrunk") == (share < -shrinkage)
+
+
+def reworded(grown: dict, **figures: object) -> str:
     (change,) = grown["changes"]
-    for wider, told in (("no_change_shown", True), ("grown", False)):
-        another = {**change["another_exam"], "verdict": wider}
-        text = compare_summary({**grown, "changes": [{**change, "another_exam": another}]})
-        assert "The mass has grown" in text
-        assert ("no change shown then" in text) is told
+    return compare_summary({**grown, "changes": [{**change, **figures}]})
+
+
+def test_growth_and_shrinkage_are_worded_alike_in_one_verdict(grown: dict) -> None:
+    unlikely = {"probability_grown": 0.004, "grown_by": [{"percent": 20.0, "probability": 0.0001}]}
+    shrunk = reworded(grown, verdict="shrunk", **unlikely)
+    assert "Probability that it has shrunk: 0.996; that it has grown by more than 20 %: <0.001." in shrunk
+    for text, word in ((compare_summary(grown), "grown"), (shrunk, "shrunk")):
+        assert f"The mass has {word}." in text
+        assert "No change shown" not in text
+        assert "can stay unseen" not in text
+
+
+def test_a_wider_spread_between_exams_adds_no_second_verdict(grown: dict) -> None:
+    another = {**grown["changes"][0]["another_exam"], "probability_grown": 0.9}
+    text = reworded(grown, another_exam=another)
+    assert "probability that it has grown: 0.900." in text
+    assert text.count("The mass has") == 1
+    assert "no change shown" not in text.lower()

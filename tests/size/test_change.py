@@ -197,13 +197,15 @@ def test_changes_at_a_site_hold_by_its_repeatability_and_not_by_half_of_it():
     assert without[:, 0].mean() < 0.75
 
 
-def test_the_smallest_detectable_change_is_the_growth_whose_interval_begins_at_none():
-    """exp(1.96 SD) - 1: at that estimated growth the probability of a growth is 0.975."""
+def test_the_smallest_detectable_change_is_that_whose_interval_begins_at_none():
+    """exp(1.96 SD) - 1 or 1 - exp(-1.96 SD): at that estimated change the probability of its direction is 0.975."""
     change = joint([shape(2.7)], [shape(2.75, seed=1)]).change(0, 1)
-    least = change.smallest_detectable(0.95)
-    assert least == pytest.approx(np.expm1(1.96 * change.log_sd), rel=1e-3)
-    moved = replace(change, mean=change.mean - change.mean.mean() + np.log1p(least))
-    assert moved.probability_above(0.0) == pytest.approx(0.975, abs=0.003)
+    growth, shrinkage = change.smallest_detectable(0.95)
+    assert growth == pytest.approx(np.expm1(1.96 * change.log_sd), rel=0.02)
+    assert shrinkage == pytest.approx(-np.expm1(-1.96 * change.log_sd), rel=0.02)
+    for least, probability in ((growth, 0.975), (-shrinkage, 0.025)):
+        moved = replace(change, mean=change.mean - change.mean.mean() + np.log1p(least))
+        assert moved.probability_above(0.0) == pytest.approx(probability, abs=0.003)
 
 
 def test_odds_fall_with_the_growth_that_is_asked_for():

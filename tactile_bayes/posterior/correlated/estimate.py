@@ -19,7 +19,7 @@ from tactile_bayes.posterior.correlated.fit import FieldFit, field_window, modal
 from tactile_bayes.posterior.correlated.neighbour import WANTED, add_beside, rising_ribs
 from tactile_bayes.posterior.correlated.noise import cosines_for
 from tactile_bayes.posterior.correlated.outline import irregular
-from tactile_bayes.posterior.correlated.peakedness import ask_departure
+from tactile_bayes.posterior.correlated.peakedness import ask_departure, exponent_covariance
 from tactile_bayes.posterior.correlated.pose_error import pose_covariance
 from tactile_bayes.posterior.correlated.problem import Problem
 from tactile_bayes.posterior.correlated.ridge import ridge_instead, ridge_text
@@ -163,9 +163,9 @@ def draw(
 def _posterior(
     fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved, places: FloatArray
 ) -> MapPosterior:
-    """Draws by name, with tracker position error added."""
+    """Draws by name, with tracker position error and what the noise field leaves open of a non-Gaussian bump added."""
     shape = draws.theta.shape[:2]
-    theta = draws.theta + _displaced(fit, draws, places, rng).reshape(draws.theta.shape)
+    theta = draws.theta + _displaced(fit, draws, places + exponent_covariance(fit), rng).reshape(draws.theta.shape)
     sigma_x, sigma_y, angle = shape_draws(fit, theta)
     amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
     return MapPosterior(

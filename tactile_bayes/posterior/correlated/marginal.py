@@ -192,8 +192,7 @@ class CollapsedTarget:
 
     def field_summary(self, theta: FloatArray) -> dict[str, float]:
         """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
-        evidence = self.by_field(theta[None])[0]
-        weight = np.exp(evidence - np.logaddexp.reduce(evidence))
+        weight = self.field_weights(theta)
         length = np.concatenate([np.full(len(one.shares), one.field.length_mm) for one in self.fields])
         share = np.concatenate([one.shares for one in self.fields])
         return {"field_length_mm": float(weight @ length), "field_share": float(weight @ (share / (1.0 + share)))}
@@ -271,14 +270,24 @@ class CollapsedTarget:
 
     def products(self, one: FloatArray, other: FloatArray, theta: FloatArray) -> FloatArray:
         """(v, w) inner products of (v, n) and (w, n) cell values under the noise field likeliest at one shape."""
-        best = int(np.argmax(self.by_field(theta[None])[0]))
-        columns, share = [(one, h) for one in self.fields for h in range(len(one.shares))][best]
-        first, second = (
+        return np.asarray(self.products_by_field(one, other)[int(np.argmax(self.by_field(theta[None])[0]))])
+
+    def products_by_field(self, one: FloatArray, other: FloatArray) -> FloatArray:
+        """(h, v, w) inner products of (v, n) and (w, n) cell values under each noise field."""
+        low = [
             self.window.project(Profiles(grid=self.window.on_grid(vectors)), self._weighted_plain).low
-            @ columns.field.turn
             for vectors in (one, other)
-        )
-        return np.asarray((one / self.window.variance) @ other.T - (first * columns.weight[:, share]) @ second.T)
+        ]
+        independent, found = (one / self.window.variance) @ other.T, []
+        for columns in self.fields:
+            first, second = (vectors @ columns.field.turn for vectors in low)
+            found += [independent - (first * weight) @ second.T for weight in columns.weight.T]
+        return np.stack(found)
+
+    def field_weights(self, theta: FloatArray) -> FloatArray:
+        """(h,) posterior probability of each noise field at one shape."""
+        evidence = self.by_field(theta[None])[0]
+        return np.asarray(np.exp(evidence - np.logaddexp.reduce(evidence)))
 
     def gains(self, templates: Profiles, theta: FloatArray) -> FloatArray:
         """(m,) log evidence gained at `theta` by adding each template; -inf for a dent.

@@ -2,8 +2,9 @@ r"""Non-Gaussian lumps: an extra regressor for the profile's exponent, used when
 
 The column is how :math:`\exp(-h^e)` with :math:`h = u^2/2`, u in widths, changes with its exponent e at the Gaussian's
 1: :math:`-h \ln h\, e^{-h}`. What it has in common with a change of amplitude, widths, centre, level and tilt is taken
-off under the noise field, so it leaves the widths those of the nearest Gaussian, as they are without it (White 1982,
-Econometrica 50:1). But without it the misfit of the bump counts as noise, and intervals hold too often.
+off under the noise fields, so it leaves the widths those of the nearest Gaussian, as they are without it (White 1982,
+Econometrica 50:1). But without it the misfit of the bump counts as noise, and intervals hold too often. Which Gaussian
+is nearest depends on the noise field, so that the widths are as uncertain as it is (record 0132).
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def ask_departure(choice: SceneChoice) -> SceneChoice:
 
 
 def _fitted(fit: FieldFit, column: FloatArray) -> FieldFit | None:
-    """Refit with the regressor, made orthogonal under the new noise; None where there is no mode."""
+    """Refit with the regressor, made orthogonal on average over the new noise fields; None where there is no mode."""
     found: FieldFit | None = fit
     for left in reversed(range(SETTLINGS)):
         assert found is not None
@@ -63,23 +64,48 @@ def _fitted(fit: FieldFit, column: FloatArray) -> FieldFit | None:
     return found
 
 
+def exponent_covariance(fit: FieldFit) -> FloatArray:
+    """(p, p) covariance of the scene's parameters from the unknown noise field, of a bump with the regressor.
+
+    A bump that is no Gaussian has other nearest widths under each noise field, by the exponent times what the raw
+    column shares with a change of them. Draws have the mean over the fields; this is the spread about it.
+    """
+    found = np.zeros((len(fit.mode), len(fit.mode)))
+    if fit.target.problem.departure is None:
+        return found
+    shared, exponent, _ = _regression(fit)
+    weight, p = fit.target.field_weights(fit.mode), len(fit.scene.alone().names)
+    moved = exponent * (shared - weight @ shared)[:, 1 : p + 1]
+    found[:p, :p] = (weight[:, None] * moved).T @ moved
+    return found
+
+
 def _departure(fit: FieldFit) -> tuple[FloatArray, float, float]:
-    """Regressor at a fit's mode, e - 1 by least squares under the noise, and the log odds against 0."""
+    """Regressor at a fit's mode, e - 1 by least squares under the likeliest noise, and the log odds against 0."""
+    shared, exponent, log_odds = _regression(fit)
+    mean = fit.target.field_weights(fit.mode) @ shared
+    column = _raw_column(fit) - mean @ tangent_columns(fit)
+    return column / np.abs(column).max(), exponent, log_odds
+
+
+def _regression(fit: FieldFit) -> tuple[FloatArray, float, float]:
+    """(h, v) parts of the raw column in the tangent columns under each field; e - 1 and its log odds as above."""
     cells = fit.target.window.cells
     known, raw = tangent_columns(fit), _raw_column(fit)
     value = cells.value - cells.value.mean()
     columns = np.concatenate([known, raw[None], value[None]])
-    products = fit.target.products(columns, columns, fit.mode)
+    by_field = fit.target.products_by_field(columns, columns)
     v = len(known)
-    shared = np.linalg.solve(products[:v, :v], products[:v, v:])
-    left = products[v:, v:] - products[v:, :v] @ shared
+    shared = np.linalg.solve(by_field[:, :v, :v], by_field[:, :v, v:])
+    best = int(np.argmax(fit.target.field_weights(fit.mode)))
+    products = by_field[best]
+    left = products[v:, v:] - products[v:, :v] @ shared[best]
     exponent = float(left[0, 1] / left[0, 0])
     dof = max(len(cells) - v - 1, 1)
     amplitude = fit.target.amplitude_at(fit.mode)
     squares = max(float(left[1, 1] - exponent * left[0, 1]), FLOOR * float(products[-1, -1]))
     variance = squares / dof / float(left[0, 0]) / amplitude**2
-    column = raw - shared[:, 0] @ known
-    return column / np.abs(column).max(), exponent / amplitude, _log_odds(exponent / amplitude, variance)
+    return shared[:, :, 0], exponent / amplitude, _log_odds(exponent / amplitude, variance)
 
 
 def _log_odds(exponent: float, variance: float) -> float:

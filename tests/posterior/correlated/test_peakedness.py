@@ -12,7 +12,7 @@ import pytest
 from posterior_maps import correlated_field, grid_map
 
 from tactile_bayes.posterior.correlated.fit import FieldFit
-from tactile_bayes.posterior.correlated.peakedness import _departure, ask_departure
+from tactile_bayes.posterior.correlated.peakedness import _departure, ask_departure, exponent_covariance
 from tactile_bayes.posterior.correlated.selection import Structure
 from tactile_bayes.posterior.correlated.tangent import tangent_columns
 from tactile_bayes.posterior.estimate import estimate_map
@@ -90,16 +90,28 @@ def test_what_the_column_takes_is_no_longer_noise() -> None:
     assert with_it.sd("u") < 0.6 * without.sd("u")
 
 
-def test_the_column_is_orthogonal_to_all_that_the_scene_leaves_free() -> None:
+def test_the_column_leaves_the_widths_alone_on_average_over_the_noise_fields() -> None:
     fit = fit_of(estimated(1.0))
-    column, _, _ = _departure(fit)
-    known = tangent_columns(fit)
+    column, known = _departure(fit)[0], tangent_columns(fit)
+    v = len(known)
     columns = np.concatenate([known, column[None]])
-    products = fit.target.products(columns, columns, fit.mode)
-    scale = np.sqrt(np.diag(products))
-    assert np.abs(products[-1, :-1] / scale[-1] / scale[:-1]).max() < 1e-6
-    # the control: the bump and its widths are not orthogonal to each other
-    assert abs(products[0, 1] / scale[0] / scale[1]) > 0.1
+    products = fit.target.products_by_field(columns, columns)
+    shared = np.linalg.solve(products[:, :v, :v], products[:, :v, v:])[:, :, 0]
+    assert np.abs(fit.target.field_weights(fit.mode) @ shared).max() < 1e-6
+    # the control: under one field alone it shares something with them
+    assert np.abs(shared).max() > 1e-3
+
+
+def test_the_widths_of_a_bump_that_is_no_gaussian_are_as_uncertain_as_the_noise_field() -> None:
+    found = estimated(1.5)
+    fit, drawn = fit_of(found), found.map_posterior
+    assert drawn is not None
+    u = fit.scene.names.index("u")
+    variance = exponent_covariance(fit)[u, u]
+    assert np.sqrt(variance) > 0.3 * fit.sd("u")
+    assert np.var(np.log(drawn.sigma_x_mm)) == pytest.approx(variance + fit.covariance[u, u], rel=0.1)
+    # the control: of a Gaussian the nearest Gaussian is the same under any field
+    assert not exponent_covariance(fit_of(estimated(1.0))).any()
 
 
 def test_a_bump_with_a_neighbour_is_not_asked() -> None:
