@@ -36,7 +36,8 @@ NO_MAP: Final = (
 MOST_REPEATS: Final = 5
 MOST_MASSES: Final = 4
 _LONGEST: Final = 400
-_LONGEST_FINDING: Final = 320
+_FINDINGS: Final = ((2, 320), (1, 220))
+"""Findings and letters of each, and on a crowded page."""
 _PICTURE_MM: Final = (108.0, 96.0)
 _LOWER_MM: Final = 54.0
 """Height of the picture on a crowded page: one that has both repeats and several masses below it."""
@@ -72,6 +73,7 @@ svg image{image-rendering:pixelated}
 def exam_page(exam: Exam) -> str:
     """Full HTML page of an exam; equal exams give equal text."""
     title = _cut(exam.title, 60) or TITLE
+    most, longest = _FINDINGS[_crowded(exam)]
     parts = [
         "<!doctype html>",
         '<html lang="en"><head><meta charset="utf-8">',
@@ -83,7 +85,7 @@ def exam_page(exam: Exam) -> str:
         *_facts(exam),
         f'<p class="mark">{html.escape(RESEARCH_USE)}</p>',
         f'<p class="finding">{html.escape(headline(exam))}</p>',
-        *_paragraphs([_cut(text, _LONGEST_FINDING) for text in finding_sentences(exam)], kind="caution"),
+        *_paragraphs([_cut(text, longest) for text in finding_sentences(exam, most)], kind="caution"),
         '<div class="columns"><div class="figure">',
         *_picture(exam),
         *_place(exam),

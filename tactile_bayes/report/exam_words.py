@@ -19,7 +19,6 @@ from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
 
 UNDETECTED: Final = ("undetected", "empty")
-MOST_FINDINGS: Final = 2
 _OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
@@ -165,11 +164,11 @@ def narrowing_sentences(exam: Exam) -> list[str]:
     return [] if share is None else [_OPTIONS.sub("", line) for line in width_lines(share)]
 
 
-def finding_sentences(exam: Exam) -> list[str]:
-    """What speaks against the result, cautions first; long lists end with their number."""
+def finding_sentences(exam: Exam, most: int) -> list[str]:
+    """What speaks against the result, cautions first; lists longer than `most` end with their number."""
     told = finding_lines(findings_in(exam.document["findings"]), paper=True)
-    more = len(told) - MOST_FINDINGS
-    return [*told[:MOST_FINDINGS], f"And {more} more, which the full report tells."] if more > 0 else told
+    more = len(told) - most
+    return [*told[:most], f"And {more} more, which the full report tells."] if more > 0 else told
 
 
 def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
