@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tactile_bayes.records import dataclass
 
-CODES = ("empty", "undetected", "unresolved", "window", "prior", "extrapolated", "method")
+CODES = ("empty", "undetected", "coarse", "unresolved", "window", "prior", "extrapolated", "method")
 
 
 @dataclass(frozen=True, slots=True)

@@ -113,7 +113,7 @@ class SizeEstimate(SizedExam):
 
     @property
     def masses(self) -> tuple[MassEstimate, ...]:
-        """All masses of the map, the largest first; this estimate is of the one that is `reported`."""
+        """All masses of the map, the surest first; this estimate is of the one that is `reported`."""
         from tactile_bayes.report.masses_document import patient_mm
 
         found, tactile_map = self.outcome.estimate, self.outcome.tactile_map

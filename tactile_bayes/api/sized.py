@@ -162,7 +162,7 @@ class MassEstimate(Sized):
     Parameters
     ----------
     number
-        By size, the largest first; those without a size come last.
+        By evidence, the surest first; those without a size come last.
     mass
         Its place and its own estimate.
     patient_mm

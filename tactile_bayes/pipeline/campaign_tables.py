@@ -23,7 +23,7 @@ _TRIAL_COLUMNS: Final = (
     "reader", "visit", "date", "reason", "synthetic",
 )  # fmt: skip
 _OF_ESTIMATE: Final = (
-    "status", "reason", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "findings",
+    "status", "reason", "reason_code", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "findings",
 )  # fmt: skip
 _OF_POOLED: Final = ("status", "reason", "max_size_mm", "findings")
 """What tables and pages show of a document: the rest of it is a hundred times as much."""
@@ -83,7 +83,8 @@ def _status(document: Mapping[str, Any] | None) -> str:
         return "not_done"
     if document["max_size_mm"] is not None:
         return "detected"
-    return "not_detected" if document["status"] == "no_estimate" else "not_done"
+    looked = document["status"] == "no_estimate" and document.get("reason_code") != "coarse"
+    return "not_detected" if looked else "not_done"
 
 
 def exam_rows(campaign: Campaign) -> list[Row]:

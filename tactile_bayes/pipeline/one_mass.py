@@ -1,6 +1,6 @@
 """Which mass of each map is the one that is pooled: by its place in the patient.
 
-A report is about the largest mass of its map, so of two maps of one breast each may report another one. With landmarks
+A report is about the surest mass of its map, so of two maps of one breast each may report another one. With landmarks
 the masses of all maps have places in patient axes, and the one that most maps show is pooled.
 """
 
@@ -22,12 +22,13 @@ Place = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class _Mass:
-    """A mass of one map: its places in the patient and on the map, mm, and its size."""
+    """A mass of one map: its places in the patient and on the map, mm, and what ranks it."""
 
     patient_mm: Place
     map_mm: Place
-    size_mm: float | None
+    sized: bool
     reported: bool
+    amplitude: float
 
     def away_mm(self, other: _Mass) -> float:
         return float(np.hypot(*np.subtract(self.patient_mm, other.patient_mm)))
@@ -67,7 +68,7 @@ def apart_from_others(documents: Sequence[Document | None]) -> dict[int, str]:
         return {}
     reported = {i: [one for one in masses if one.reported] for i, masses in maps.items()}
     found = [one for masses in reported.values() for one in masses]
-    common = _common(reported) or max(found, key=lambda one: one.size_mm or 0.0, default=None)
+    common = _common(reported) or max(found, key=lambda one: one.amplitude, default=None)
     away = {i: one.away_mm(common) for i, masses in reported.items() for one in masses if common is not None}
     words = "its mass lies {:.0f} mm from that of the other maps and may be another one"
     return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
@@ -94,24 +95,24 @@ def _masses(documents: Sequence[Document | None]) -> dict[int, list[_Mass]] | No
 
 
 def _mass(document: Document) -> _Mass:
-    patient, here, size = document["centre_patient_mm"], document["centre_mm"], document["max_size_mm"]
+    patient, here, amplitude = document["centre_patient_mm"], document["centre_mm"], document["amplitude"]
     return _Mass(
-        (patient["x"], patient["y"]), (here["x"], here["y"]), None if size is None else size["median"],
-        document["reported"],
+        (patient["x"], patient["y"]), (here["x"], here["y"]), document["max_size_mm"] is not None,
+        document["reported"], 0.0 if amplitude is None else amplitude["median"],
     )  # fmt: skip
 
 
 def _common(maps: Mapping[int, Sequence[_Mass]]) -> _Mass | None:
-    """A mass at the place where most maps show one, with a size on most, then the largest; None where all are apart."""
+    """A mass at the place where most maps show one, sized by most, then reported by most; None where all are apart."""
     best = max((one for masses in maps.values() for one in masses), key=lambda one: _worth(maps, one), default=None)
     return best if best is not None and _worth(maps, best)[0] > 1 else None
 
 
-def _worth(maps: Mapping[int, Sequence[_Mass]], common: _Mass) -> tuple[int, int, float]:
-    """On how many maps a mass is found, on how many with a size, and the median of these sizes."""
+def _worth(maps: Mapping[int, Sequence[_Mass]], common: _Mass) -> tuple[int, int, int, float]:
+    """On how many maps a mass is found, sized and reported, and the median of its amplitudes."""
     there = [one for one in (_nearest(masses, common) for masses in maps.values()) if one is not None]
-    sizes = [one.size_mm for one in there if one.size_mm is not None]
-    return len(there), len(sizes), float(np.median(sizes)) if sizes else 0.0
+    amplitude = float(np.median([one.amplitude for one in there]))
+    return len(there), sum(one.sized for one in there), sum(one.reported for one in there), amplitude
 
 
 def _nearest(masses: Sequence[_Mass], common: _Mass) -> _Mass | None:

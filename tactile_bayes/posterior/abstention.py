@@ -39,6 +39,8 @@ LEAST_READ = 0.25
 
 One empty scan of 45 had a spot of 0.16 at its corner, in cells of 3 readings for 29.
 """
+COARSEST_MM = 4.0
+"""Cells above this say nothing of a lump that they do not show: one of 10 mm close to the skin has a sigma of 2 mm."""
 HOPELESS = 2.0
 """Widths at the mode so many times beyond a limit decide without draws: chains for a stripe of readings took 30 s."""
 MOST_PRIOR_SHARE = 0.5
@@ -64,6 +66,14 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
         place = f"centre_mm ({centre_mm[0]:g}, {centre_mm[1]:g})"
         raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
     return f"near ({centre_mm[0]:.1f}, {centre_mm[1]:.1f}) mm"
+
+
+def no_verdict(cell_mm: float) -> Abstention | None:
+    """Reason why a map that shows no lump does not say that there is none; None where its cells are fine enough."""
+    if cell_mm <= COARSEST_MM:
+        return None
+    reason = f"the map cannot show whether there is a lump: its cells of {cell_mm:g} mm are too large"
+    return Abstention("coarse", reason, "map the scan again with smaller cells (they have 1 mm by default)")
 
 
 def chance_text(probability: float) -> str:

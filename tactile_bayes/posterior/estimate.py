@@ -12,7 +12,7 @@ from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, searched, undetected
+from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, no_verdict, searched, undetected
 from tactile_bayes.posterior.assessment import Assessment, MapDraws, bump_of
 from tactile_bayes.posterior.drawn import Drawn, draw_sized
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
@@ -76,6 +76,8 @@ def estimate_map(
         check_recipe(tactile_map, calibration, options.fit)
         calibration = calibration_for(tactile_map, calibration)
     found = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
+    if found.code == "undetected" and (why := no_verdict(tactile_map.recipe.cell_mm)) is not None:
+        found = replace(found, code=why.code, reason=why.reason, advice=why.advice, detection=None)
     return replace(found, findings=by_weight((*tactile_map.findings, *found.findings)))
 
 

@@ -27,12 +27,14 @@ LEAST_SHARE = 0.15
 times as high, one came out twice as large as it was, and what a lump leaves of itself is some per cent of it."""
 APART_IN_WIDTHS = 2.0
 """Two equal Gaussians nearer than this many widths have one maximum."""
+DOUBTFUL_SHARE = 0.3
+"""Of the highest measured mass's amplitude: a lower rise is in doubt, though the calibration may hold it alone."""
 BOTH = "scan again with more lines over both"
 Estimator = Callable[[TactileMap, EstimateOptions], Estimate]
 
 
 def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptions, estimator: Estimator) -> Estimate:
-    """Find and size all masses of a map; returns the estimate of the largest one, with all in `masses`.
+    """Find and size all masses of a map; returns the estimate of the surest (`by_evidence`), with all in `masses`.
 
     The estimate of the place that was given is kept where one was, and of the first lump where properties of a lump are
     known: they are of that lump.
@@ -53,12 +55,31 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
             mass = Mass(rise.x_mm, rise.y_mm, rise.probability, _hidden(rise))
         if mass is not None and all(_apart(mass, one) for one in found):
             found.append(mass)
-    found.sort(key=lambda one: (-(one.largest_mm or 0.0), -_amplitude(one.estimate)))
+    found = by_evidence(found)
     kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
-    reported = first if kept or not found or found[0].largest_mm is None else found[0].estimate
+    reported = first if kept or not found else found[0].estimate
     masses = tuple(replace(one, reported=one.estimate is reported) for one in found)
     beside = tuple(_rise(one, masses) for one in masses if not one.reported)
     return replace(reported, candidates=first.candidates, masses=masses, other_rises=beside)
+
+
+def by_evidence(masses: Sequence[Mass]) -> list[Mass]:
+    """Masses in the order in which they are numbered: the first is reported where no place was given.
+
+    First come those that stand out (`DOUBTFUL_SHARE`), then those with a size, those that the calibration holds, those
+    with more evidence of a lump, and the higher ones. Size has no part in it: a wide shoulder of the level is sized
+    larger than the lump beside it.
+    """
+    measured = [one for one in masses if one.largest_mm is not None or one.estimate.code == "extrapolated"]
+    highest = max((_amplitude(one.estimate) for one in measured), default=0.0)
+
+    def rank(mass: Mass) -> tuple[bool, bool, bool, float, float]:
+        estimate, height = mass.estimate, _amplitude(mass.estimate)
+        held = all(one.kind != "outside_calibration" for one in estimate.findings)
+        evidence = -np.inf if estimate.detection is None else estimate.detection.log_bayes_factor
+        return height >= DOUBTFUL_SHARE * highest, mass.largest_mm is not None, held, evidence, height
+
+    return sorted(masses, key=rank, reverse=True)
 
 
 def _apart(one: Mass, other: Mass) -> bool:
@@ -123,7 +144,7 @@ def _sized_at(
         # frames felt both lumps, whatever is taken off the cells
         less = _estimated(replace(without(tactile_map, first.map_posterior), frames=None), given, estimator)
         found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
-    if found.code == "undetected":
+    if found.code in ("undetected", "coarse"):
         return None
     if _stays(found, rise, first):
         return Mass(*_place(found), max(rise.probability, _probability(found)), found)

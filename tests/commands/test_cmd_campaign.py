@@ -21,10 +21,12 @@ from campaign_files import JOURNAL, ROWS, contents, rows_of, steps, thinned, wri
 from in_process import run_here
 
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.manifest_csv import Exam as Listed
 from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.pipeline.campaign_folder import open_campaign
 from tactile_bayes.pipeline.campaign_steps import Task, run_step
+from tactile_bayes.pipeline.campaign_tables import Row
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 FAST = ("--method", "laplace")
@@ -275,6 +277,13 @@ def test_half_a_place_is_refused(tmp_path: Path) -> None:
 
 
 # --- one run
+
+
+@pytest.mark.parametrize(("code", "status"), [("coarse", "not_done"), ("undetected", "not_detected")])
+def test_an_exam_on_cells_too_large_was_not_done(code: str, status: str) -> None:
+    """Not held against the modality; the control is a map that could have shown a lump."""
+    document = {"status": "no_estimate", "reason_code": code, "max_size_mm": None}
+    assert Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), document).status == status
 
 
 def test_every_exam_has_its_row_and_its_status(undisturbed: Path) -> None:

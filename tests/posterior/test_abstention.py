@@ -53,6 +53,18 @@ def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advi
     assert ("What would help" in text) == bool(found.advice)
 
 
+def test_cells_too_large_to_show_a_lump_are_no_verdict_on_the_breast() -> None:
+    """A lump of sigma 3 mm on cells of 10 mm once read "no lump found"; the control is the same map on fine cells."""
+    coarse = grid_map(1.0 + WHITE[:9, :9], cell_mm=10.0)
+    settings = EstimateOptions(fit=FIELD)
+    found = estimate_map(coarse, calibration=None, options=settings, rng=np.random.default_rng(1))
+    assert found.code == "coarse"
+    assert found.reason == "the map cannot show whether there is a lump: its cells of 10 mm are too large"
+    assert "smaller cells" in found.advice
+    assert found.detection is None  # no probability beside it
+    assert run(1 + WHITE).code == "undetected"
+
+
 @pytest.mark.parametrize(
     ("bump", "fault", "code", "advice"),
     [

@@ -1,4 +1,4 @@
-"""All masses of a map are listed with their sizes, the largest first; no other where there is one lump."""
+"""All masses of a map are listed with their sizes, the surest first; no other where there is one lump."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ from tactile_bayes.api.estimates import SizeEstimate
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document
+from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.one_map import Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.posterior import masses as masses_module
-from tactile_bayes.posterior.masses import with_masses
+from tactile_bayes.posterior.masses import by_evidence, with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.result import Estimate, Mass, Rise
+from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
+from tactile_bayes.posterior.white.detection import Detection
+from tactile_bayes.size.posterior import SizePosterior
 
 WIDE, NARROW = (-17.0, 2.0), (16.0, 2.0)
 
@@ -48,21 +51,65 @@ def places(masses: tuple[Mass, ...]) -> list[tuple[float, float]]:
     return [(round(one.x_mm), round(one.y_mm)) for one in masses]
 
 
-def test_the_largest_is_reported_though_another_is_higher() -> None:
+def test_the_surest_is_reported_though_another_is_sized_larger() -> None:
     estimate = found_on(scene(narrow=0.6)).estimate
-    assert places(estimate.masses) == [WIDE, NARROW]
+    assert places(estimate.masses) == [NARROW, WIDE]
     assert [one.reported for one in estimate.masses] == [True, False]
-    larger, smaller = (one.largest_mm for one in estimate.masses)
+    surest, larger = (one.largest_mm for one in estimate.masses)
+    assert surest is not None
     assert larger is not None
-    assert smaller is not None
-    assert larger > 1.2 * smaller
+    assert larger > 1.2 * surest
     assert estimate.map_posterior is not None
-    assert float(np.median(estimate.map_posterior.x_mm)) == pytest.approx(WIDE[0], abs=0.5)
-    assert [round(one.x_mm) for one in estimate.other_rises] == [NARROW[0]]
-    # the control: the search itself takes the higher one
-    highest = found_on(scene(narrow=0.6), centre_mm=NARROW).estimate
-    assert highest.masses[1].reported
-    assert highest.masses[1].largest_mm == pytest.approx(smaller, rel=0.02)
+    assert float(np.median(estimate.map_posterior.x_mm)) == pytest.approx(NARROW[0], abs=0.5)
+    assert [round(one.x_mm) for one in estimate.other_rises] == [WIDE[0]]
+    # the control: a place that somebody gives is reported
+    given = found_on(scene(narrow=0.6), centre_mm=WIDE).estimate
+    assert given.masses[1].reported
+    assert given.masses[1].largest_mm == pytest.approx(larger, rel=0.02)
+
+
+def test_a_shoulder_sized_larger_than_the_lump_beside_it_is_not_reported() -> None:
+    """A lump, and a low wide shoulder of the level, as uneven pressure leaves it; `benchmarks.masses` has a hundred."""
+    rng = np.random.default_rng(1)
+    values = bump_values(half_mm=40.0, x=-16.0, y=2.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.31)
+    values += bump_values(half_mm=40.0, x=14.0, y=2.0, sigma_x=9.0, sigma_y=9.0, amplitude=0.12, level=0.0)
+    values += 0.003 * correlated_field(rng, len(values), length_cells=3.0)
+    masses = found_on(grid_map(values + 0.005 * rng.standard_normal(values.shape), normalise="gain")).estimate.masses
+    lump, shoulder = masses
+    assert places(masses) == [(-16, 2), (14, 2)]
+    assert lump.reported
+    assert lump.largest_mm is not None
+    assert shoulder.largest_mm is not None
+    assert shoulder.largest_mm > 1.5 * lump.largest_mm  # the control: by size it would come first
+
+
+def ranked(*masses: tuple[float, float | None, float, bool]) -> list[int]:
+    """Order of masses of some amplitude, size, evidence, and whether the calibration holds them."""
+    outside = (Finding("outside_calibration", "outside"),)
+    found = []
+    for amplitude, size, evidence, held in masses:
+        draws = None if size is None else SizePosterior(*[np.full((1, 3), size)] * 2, {}, 0, np.zeros(3))
+        estimate = Estimate(
+            "no_estimate" if size is None else "estimate",
+            "",
+            detection=Detection(1.0, evidence),
+            size=draws,
+            bump=ModalBump(amplitude, 0.0, 0.0, 5.0, 5.0),
+            findings=() if held else outside,
+            code="window" if size is None else "",
+        )
+        found.append(Mass(0.0, 0.0, 1.0, estimate))
+    return [found.index(one) for one in by_evidence(found)]
+
+
+def test_masses_are_ranked_by_evidence_inside_the_calibration() -> None:
+    assert ranked((0.30, 12.0, 40.0, True), (0.25, 24.0, 30.0, True)) == [0, 1]
+    assert ranked((0.25, 24.0, 30.0, True), (0.30, 12.0, 40.0, True)) == [1, 0]
+    # what the calibration does not hold comes after what it holds, and before what has no size
+    assert ranked((0.30, 24.0, 40.0, False), (0.25, 12.0, 30.0, True)) == [1, 0]
+    assert ranked((0.30, None, 40.0, True), (0.25, 24.0, 30.0, False)) == [1, 0]
+    # but a low shoulder does not go before a lump that is beyond the calibration
+    assert ranked((1.50, 32.0, 400.0, False), (0.08, 24.0, 4.5, True)) == [0, 1]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -74,13 +121,14 @@ def test_one_lump_is_one_mass(seed: int) -> None:
 
 
 def test_a_second_lump_in_the_window_is_listed_and_sized() -> None:
-    estimate = found_on(scene(narrow=0.25, away=18.0)).estimate
-    assert estimate.scene is not None
-    assert estimate.scene.fit.scene.extra == "second lump"
-    assert places(estimate.masses) == [WIDE, (1, 2)]
-    alone = found_on(scene(narrow=0.25)).estimate.masses[1]
+    masses = {round(one.x_mm): one for one in found_on(scene(narrow=0.25, away=18.0)).estimate.masses}
+    assert sorted(masses) == [WIDE[0], 1]
+    choice = masses[int(WIDE[0])].estimate.scene
+    assert choice is not None
+    assert choice.fit.scene.extra == "second lump"
+    (alone,) = (one for one in found_on(scene(narrow=0.25)).estimate.masses if one.x_mm > 0)
     assert alone.largest_mm is not None
-    assert estimate.masses[1].largest_mm == pytest.approx(alone.largest_mm, rel=0.25)
+    assert masses[1].largest_mm == pytest.approx(alone.largest_mm, rel=0.25)
 
 
 def narrow_bumps(*, second: float, seed: int = 1) -> TactileMap:
@@ -122,9 +170,9 @@ def test_what_is_known_of_a_lump_is_used_for_the_first_alone() -> None:
     two = scene(narrow=0.6)
     known = found_on(two, known=(("seat", 1.2),)).estimate
     plain = found_on(two).estimate
-    assert [one.reported for one in known.masses] == [False, True]  # the higher one, as without other masses
-    assert known.masses[0].largest_mm == pytest.approx(plain.masses[0].largest_mm, rel=0.01)
-    assert known.masses[1].largest_mm != pytest.approx(plain.masses[1].largest_mm, rel=0.01)
+    assert [one.reported for one in known.masses] == [True, False]
+    assert known.masses[0].largest_mm != pytest.approx(plain.masses[0].largest_mm, rel=0.01)
+    assert known.masses[1].largest_mm == pytest.approx(plain.masses[1].largest_mm, rel=0.01)
 
 
 def test_a_fit_that_moves_to_the_first_lump_gives_no_size() -> None:
@@ -150,12 +198,12 @@ def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
     assert [(one["number"], one["reported"]) for one in masses] == [(1, True), (2, False)]
     assert masses[0]["max_size_mm"] == document["max_size_mm"]
     assert masses[0]["another_exam"] == document["another_exam"]
-    assert masses[1]["max_size_mm"]["median"] < masses[0]["max_size_mm"]["median"]
-    assert masses[1]["centre_mm"]["x"] == pytest.approx(NARROW[0], abs=0.5)
+    assert masses[1]["max_size_mm"]["median"] > masses[0]["max_size_mm"]["median"]
+    assert masses[1]["centre_mm"]["x"] == pytest.approx(WIDE[0], abs=0.5)
     assert masses[1]["centre_patient_mm"] is None
     text = run_here(*words, cwd=tmp_path).stdout
     assert "Mass 1 of 2: probability of a lump 1.000" in text
-    assert "Mass 2 at (16.0, 2.0) mm, 33 mm from mass 1: largest size " in text
+    assert "Mass 2 at (-16.9, 1.9) mm, 33 mm from mass 1: largest size " in text
     assert "a second lump within 20 mm" in text
     bare = json.loads(run_here(*words, "--json", "--size-calibration", "none", cwd=tmp_path).stdout)["masses"]
     assert [one["max_size_mm"] for one in bare] == [None, None]
@@ -173,7 +221,7 @@ def test_a_mass_besides_the_reported_one_has_its_axes_their_angle_and_its_ellips
     """The second bump is 5.5 by 3.2 mm wide, its long axis 35 degrees from x towards y."""
     rng = np.random.default_rng(1)
     half = {"half_mm": 35.0}
-    values = bump_values(**half, x=WIDE[0], y=WIDE[1], sigma_x=7.5, sigma_y=7.5, amplitude=0.4)
+    values = bump_values(**half, x=WIDE[0], y=WIDE[1], sigma_x=6.0, sigma_y=6.0, amplitude=0.8)
     values += bump_values(
         **half, x=NARROW[0], y=NARROW[1], sigma_x=5.5, sigma_y=3.2, angle_deg=35.0, amplitude=0.4, level=0.0
     )
@@ -187,7 +235,7 @@ def test_a_mass_besides_the_reported_one_has_its_axes_their_angle_and_its_ellips
     for name in ("d_x_mm", "d_y_mm", "angle_deg"):
         assert reported[name] == document[name], name  # which are the first mass's
     along, across, angle = (second[name] for name in ("d_x_mm", "d_y_mm", "angle_deg"))
-    assert angle["low"] < 35.0 < angle["high"] < 55.0
+    assert angle["low"] - 1.0 < 35.0 < angle["high"] < 55.0
     assert across["low"] < across["median"] < across["high"] < along["median"] < along["high"]
     assert second["max_size_mm"]["median"] == pytest.approx(along["median"], rel=0.03)
     assert second["position"] is None  # no nipple was touched

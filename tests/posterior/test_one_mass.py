@@ -24,13 +24,17 @@ CALIBRATION = "solid"
 
 
 def document(*masses: tuple[float, float | None, bool], landmarks: bool = True, shift: float = 0.0) -> dict[str, Any]:
-    """An estimate with masses at x in the patient, of a size, reported or not; on the map they lie `shift` farther."""
+    """An estimate with masses at x in the patient, of a size and a hundredth of it high, reported or not.
+
+    On the map they lie `shift` farther.
+    """
     return {
         "masses": [
             {
                 "centre_patient_mm": {"x": x, "y": 90.0} if landmarks else None,
                 "centre_mm": {"x": x + shift, "y": 0.0},
                 "max_size_mm": None if size is None else {"median": size},
+                "amplitude": None if size is None else {"median": size / 100.0},
                 "reported": reported,
             }
             for x, size, reported in masses
@@ -48,12 +52,12 @@ def test_a_map_that_reports_another_mass_is_told_the_place_of_the_common_one_on_
     assert elsewhere([*maps, document((20.0, 29.0, False), (52.0, 7.0, True))]) == {}
 
 
-def test_of_two_masses_that_all_maps_show_the_larger_is_pooled() -> None:
-    """As a report is about the largest: small noise in sizes does not mix the two."""
+def test_of_two_masses_that_all_maps_show_the_one_that_most_report_is_pooled() -> None:
+    """Not the larger: the ranking of each map alone decides, and noise in it does not mix the two."""
     maps = [
-        document((10.0, 12.0, True), (45.0, 11.5, False)),
-        document((11.0, 11.9, False), (44.0, 12.4, True)),
-        document((9.0, 12.2, True), (45.0, 11.8, False)),
+        document((10.0, 12.0, True), (45.0, 16.5, False)),
+        document((11.0, 11.9, False), (44.0, 17.4, True)),
+        document((9.0, 12.2, True), (45.0, 16.8, False)),
     ]
     assert elsewhere(maps) == {1: (11.0, 0.0)}
 
@@ -70,7 +74,7 @@ def test_without_landmarks_or_a_common_place_nothing_is_estimated_again() -> Non
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_maps_whose_masses_lie_apart_are_told(order: tuple[int, int]) -> None:
-    """The smaller one is named whatever the order; 14 mm between exams are landmarks touched anew."""
+    """The lower one is named whatever the order; 14 mm between exams are landmarks touched anew."""
     far = [document((10.0, 12.0, True)), document((50.0, 14.0, True))]
     told = apart_from_others([far[i] for i in order])
     assert told == {order.index(0): "its mass lies 40 mm from that of the other maps and may be another one"}
@@ -94,13 +98,13 @@ def of_breast(masses: Sequence[tuple[float, float, float]], *, seed: int, shift_
 
 @pytest.fixture(scope="module")
 def exams(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three maps with one mass at x = 0 in the patient; the third has a wider one beside it, which it reports."""
+    """Three maps with one mass at x = 0 in the patient; the third has a higher one beside it, which it reports."""
     folder = tmp_path_factory.mktemp("breast")
     one = (0.0, 0.5, 3.5)
     maps = [
         of_breast([one], seed=1, shift_mm=0.0),
         of_breast([one], seed=2, shift_mm=2.0),
-        of_breast([one, (-33.0, 0.3, 6.0)], seed=3, shift_mm=16.0),
+        of_breast([one, (-33.0, 0.8, 6.0)], seed=3, shift_mm=16.0),
     ]
     for i, tactile_map in enumerate(maps, start=1):
         write_map(folder / f"m{i}.nc", tactile_map, provenance=Provenance("test", {}, {}))
