@@ -1,4 +1,4 @@
-"""Safe reading of JSON and TOML: limited size and depth, finite numbers, no NUL or surrogates."""
+"""Safe reading of JSON and TOML: limited size and depth, finite numbers, no control characters or surrogates."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, read_t
 MOST_LEVELS: Final = 64
 MOST_KEY_PARTS: Final = 16
 _LARGEST: Final = sys.float_info.max
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # and turned text
 # the parser's time grows with the square of a key's parts
 _LONG_KEY: Final = re.compile(
     rf"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*(?:\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*){{{MOST_KEY_PARTS}}}"""
@@ -94,7 +95,7 @@ def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
 
 
 def check_plain(document: object, *, way_out: str, name: str = "") -> None:
-    """Refuse data that no report can hold: too deep, infinities, NaN, numbers beyond 1.8e308, surrogates, NUL.
+    """Refuse data that no report can hold: too deep, no finite numbers, broken or control characters.
 
     Raises
     ------
@@ -125,11 +126,19 @@ def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, obj
             f"{where or 'the document'} is {value}", way_out=f"give a finite number of at most {_LARGEST:.3g}"
         )
     elif isinstance(item, str):
-        _check_text(where, item, way_out=way_out)
+        check_text(where, item, way_out=way_out)
 
 
-def _check_text(where: str, text: str, *, way_out: str) -> None:
+def check_text(where: str, text: str, *, way_out: str) -> None:
+    """Refuse a text with surrogates, control characters or marks that turn what follows.
+
+    Raises
+    ------
+    BadDataError
+        Naming the place and the character.
+    """
     if not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text):
         raise BadDataError(f"{where or 'a key'} holds a broken character: {text[:40]!a}", way_out=way_out)
-    if "\0" in text:  # the system takes no file name with one
-        raise BadDataError(f"{where or 'a key'} holds the character U+0000: {text[:40]!a}", way_out=way_out)
+    if not text.isprintable() and (found := _CONTROL.search(text)):
+        code = f"U+{ord(found[0]):04X}"  # a terminal obeys some, a table's reader stumbles over all
+        raise BadDataError(f"{where or 'a key'} holds the character {code}: {text[:40]!a}", way_out=way_out)

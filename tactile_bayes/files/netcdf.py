@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.documents import check_text
 from tactile_bayes.files.hdf5_heaps import check_heaps
 from tactile_bayes.files.kinds import HDF5_MAGIC, not_a
 from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, open_input, unpacked_limit
@@ -163,7 +164,10 @@ class Group:
     def attributes(self) -> dict[str, str]:
         """Text attributes by name."""
         held = {str(name): _text(self._place.attrs[name]) for name in self._place.attrs}
-        return {name: text for name, text in held.items() if text is not None}
+        texts = {name: text for name, text in held.items() if text is not None}
+        for name, text in texts.items():
+            check_text(f"attribute {name}", text, way_out=self._way_out)
+        return texts
 
     def dimension(self, name: str) -> int | None:
         """The length of a dimension; None where there is none."""
@@ -281,7 +285,21 @@ def _dimensions(dataset: Any) -> tuple[str, ...]:
     """Name of each axis from the attached scale; a coordinate variable names its own."""
     if dataset.is_scale:
         return (PurePosixPath(dataset.name).name,)
+    if not _has_scales(dataset):
+        return ("",) * len(dataset.shape)
     return tuple(PurePosixPath(axis[0].name).name if len(axis) else "" for axis in dataset.dims)
+
+
+def _has_scales(dataset: Any) -> bool:
+    """Whether a list of scales is attached as it must be: HDF5 ends the process over one of another type."""
+    import h5py
+
+    if "DIMENSION_LIST" not in dataset.attrs:
+        return False
+    listed = dataset.attrs.get_id("DIMENSION_LIST")
+    held = h5py.check_vlen_dtype(listed.dtype)
+    is_reference = held is not None and h5py.check_ref_dtype(held) is h5py.Reference
+    return bool(is_reference and listed.shape == (len(dataset.shape),))
 
 
 @contextlib.contextmanager

@@ -163,6 +163,9 @@ def read_posterior(path: Path) -> PosteriorDraws:
         draws = {name: group.array(name, kind="f8", dimensions=("chain", "draw")) for name in names}
     if not draws or not all(values.size > 1 for values in draws.values()):
         raise BadDataError("holds no draws", way_out=way_out, path=str(path))
+    for name, values in draws.items():
+        if np.isinf(values).any() or np.isnan(values).all():  # single draws may have no value
+            raise BadDataError(f"variable {name} holds infinity, or no number", way_out=way_out, path=str(path))
     diagnostics = parse_json(attributes.get("diagnostics", "{}"))
     figures = diagnostics if isinstance(diagnostics, dict) else {}
     scans = scans_of(parse_json(attributes.get("provenance", "{}")))
