@@ -134,6 +134,10 @@ def _write_values(place: Any, name: str, variable: Variable) -> Any:
     return written
 
 
+MOST: Final = 1e12
+"""Largest number in an array; infinity is none."""
+
+
 class Group:
     """One group of an open netCDF file; all that is read is checked first.
 
@@ -208,7 +212,13 @@ class Group:
             raise BadDataError(f"variable {name} has dimensions {has}, not {dimensions}", way_out=self._way_out)
         check_limit(found.size * found.dtype.itemsize, self._most_bytes, what=f"variable {name} unpacks to {{}} bytes")
         self._check_chunks(name, found)
-        return np.asarray(found[...], dtype=np.dtype(kind))
+        values = np.asarray(found[...], dtype=np.dtype(kind))
+        with np.errstate(invalid="ignore"):
+            if (
+                values.dtype.kind == "f" and (np.abs(values) > MOST).any()
+            ):  # beyond any quantity here, and sums overflow
+                raise BadDataError(f"variable {name} holds values beyond {MOST:g}", way_out=self._way_out)
+        return values
 
     def _own(self, name: str) -> Any:
         """Member of this file by name; links to other places and files are not followed."""

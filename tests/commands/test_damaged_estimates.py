@@ -28,7 +28,18 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "page.html": ("report", "SOURCE", "-o", "page.html"),
     "fhir.json": ("export", "SOURCE", "--to", "fhir", "-o", "fhir.json", *IDENTITY),
     "records.csv": ("export", "SOURCE", "--to", "csv", "-o", "records.csv", *IDENTITY),
-    "dicom": ("export", "SOURCE", "map.nc", "--to", "dicom", "-o", "dicom", "--study-date", "2026-01-02T10:00", *IDENTITY),
+    "dicom": (
+        "export",
+        "SOURCE",
+        "map.nc",
+        "--to",
+        "dicom",
+        "-o",
+        "dicom",
+        "--study-date",
+        "2026-01-02T10:00",
+        *IDENTITY,
+    ),
     "shown": ("show", "SOURCE"),
 }
 OF_DRAWS = {**COMMANDS, "figures": ("diagnose", "SOURCE"), "figures as JSON": ("diagnose", "SOURCE", "--json")}
@@ -47,7 +58,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tb.demo_map().save(made / "map.nc")
     for scene, name in (("scene.toml", "two.nc"), ("empty.toml", "empty.nc")):
         tb.build_map(tb.simulate(DEMO / scene, seed=2)).save(made / name)
-    for name, words in {"one": ("map.nc", "-o", "post.nc"), "none": ("empty.nc",), "pool": ("map.nc", "two.nc", "--pool")}.items():
+    for name, words in {
+        "one": ("map.nc", "-o", "post.nc"),
+        "none": ("empty.nc",),
+        "pool": ("map.nc", "two.nc", "--pool"),
+    }.items():
         (made / f"{name}.json").write_text(run_here("estimate", *words, "--json", cwd=made).stdout)
     return made
 
@@ -56,7 +71,9 @@ def places(document: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ..
     """Where a document has values."""
     if place:
         yield place
-    members = document.items() if isinstance(document, dict) else enumerate(document) if isinstance(document, list) else ()
+    members = (
+        document.items() if isinstance(document, dict) else enumerate(document) if isinstance(document, list) else ()
+    )
     for key, value in members:
         yield from places(value, (*place, key))
 
