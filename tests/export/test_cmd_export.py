@@ -73,10 +73,13 @@ def test_what_does_not_fit_is_told_in_one_line(case: str, folder: Path, tmp_path
 @pytest.mark.parametrize("key", ["settings", "inputs", "scans", "version"])
 @pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
 def test_an_odd_provenance_is_no_fault_or_one_line(key: str, value: Any, estimate: Any, tmp_path: Path) -> None:
-    """Scans and version have no schema: anything may stand there. Settings are an object, inputs name files."""
+    """Scans and version have no schema: anything may stand there but control characters. Settings are an object, inputs
+    name files."""
     odd = estimate | {"provenance": estimate["provenance"] | {key: value}}
     (tmp_path / "e.json").write_text(json.dumps(odd))
-    taken = key in ("scans", "version") or (key == "settings" and isinstance(value, dict))
+    taken = (key in ("scans", "version") and not isinstance(value, str)) or (
+        key == "settings" and isinstance(value, dict)
+    )
     for to in ("csv", "fhir"):
         if to == "fhir":
             pytest.importorskip("fhir.resources")
@@ -86,7 +89,6 @@ def test_an_odd_provenance_is_no_fault_or_one_line(key: str, value: Any, estimat
             assert f"provenance.{key}" in done.stderr
             continue
         assert done.returncode == 0, done.stderr
-        assert "\u202e" not in (tmp_path / f"out.{to}").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("value", [None, 7, [1], {"a": {"b": 1}}, "\x01\u202e\\<b>" * 400])
