@@ -166,7 +166,9 @@ class _Exam:
 
 
 def _lines(estimate: EstimateFile) -> Iterator[str]:
-    """The report in sentences."""
+    """The report in sentences, what speaks against it first."""
+    yield verdict_words(estimate)
+    yield from estimate.lines
     for one in estimate.masses:
         mass = f"Mass {one.number}: " if len(estimate.masses) > 1 else ""
         if one.largest is None or one.smallest is None:
@@ -176,8 +178,6 @@ def _lines(estimate: EstimateFile) -> Iterator[str]:
         yield f"{mass}Smallest size {size_words(one.smallest)}."
         if one.another_exam:
             yield f"{mass}{one.another_exam}."
-    yield verdict_words(estimate)
-    yield from estimate.lines
     yield RESEARCH_USE
 
 
