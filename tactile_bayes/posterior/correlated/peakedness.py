@@ -105,7 +105,7 @@ def _regression(fit: FieldFit) -> tuple[FloatArray, float, float]:
     amplitude = fit.target.amplitude_at(fit.mode)
     squares = max(float(left[1, 1] - exponent * left[0, 1]), FLOOR * float(products[-1, -1]))
     variance = squares / dof / float(left[0, 0]) / amplitude**2
-    return shared[:, :, 0], exponent / amplitude, _log_odds(exponent / amplitude, variance)
+    return np.asarray(shared[:, :, 0]), exponent / amplitude, _log_odds(exponent / amplitude, variance)
 
 
 def _log_odds(exponent: float, variance: float) -> float:
