@@ -4,7 +4,7 @@ The column is how :math:`\exp(-h^e)` with :math:`h = u^2/2`, u in widths, change
 1: :math:`-h \ln h\, e^{-h}`. What it has in common with a change of amplitude, widths, centre, level and tilt is taken
 off under the noise fields, so it leaves the widths those of the nearest Gaussian, as they are without it (White 1982,
 Econometrica 50:1). But without it the misfit of the bump counts as noise, and intervals hold too often. Which Gaussian
-is nearest depends on the noise field, so that the widths are as uncertain as it is (record 0132).
+is nearest depends on the noise field, so that the widths are as uncertain as it is (record 0066).
 """
 
 from __future__ import annotations
