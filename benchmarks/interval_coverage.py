@@ -64,7 +64,7 @@ KINDS: dict[str, dict[str, float]] = {
     "super-Gaussian, exponent 2.5": {"white": 0.01, "field": 0.01, "length_mm": 3.0, "exponent": 1.25},
     "super-Gaussian, exponent 3": {"white": 0.01, "field": 0.01, "length_mm": 3.0, "exponent": 1.5},
 }
-BY_SQUARES = "the same, nearest by plain squares"
+BY_SQUARES = "super-Gaussian, exponent 2.5, nearest by plain squares"
 CONTROL = "control: independent errors assumed, field 3 mm"
 UNTOLD = "control: the frames' places taken for exact"
 MEANS = "simulated head, frames divided by their means"
