@@ -33,9 +33,7 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.bump_by_place import Bump as MapBump
-from tactile_bayes.mapping.bump_by_place import by_place
-from tactile_bayes.presets import BY_PLACE, HEAD_PROFILE
+from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import Scan
 from tactile_bayes.studies.population import MassRow, measure_exam
 
@@ -65,7 +63,6 @@ CANDIDATES: Mapping[str, Sequence[str]] = {
     "bumps of the rows and of the columns apart": ("rows_apart_x", "columns_apart_y"),
     "bumps from thirds of the rows": ROWS,
     "bumps from thirds of the rows, columns apart": (*ROWS, "columns_apart_y"),
-    "by the lump's place under the head": BY_PLACE,
 }
 ORACLES = ("mean_kpa", "fat_kpa", "gland_ratio", "thickness_mm", "stiffness_ratio", "seat")
 CASES: Mapping[str, Mapping[str, Any]] = {
@@ -156,12 +153,6 @@ def measure(row: MassRow, scene: Scene, scan: Scan) -> dict[str, float] | None:
     free, cells = fit_bump(tactile_map, near, widths, row.amplitude)
     bump = fixed_bump(tactile_map, near, widths, row.amplitude)
     frames = HeadFrames.of(scan, tactile_map.plane_from_base, bump)
-    assert tactile_map.frames is not None
-    assert tactile_map.head is not None
-    x_mm, y_mm = (float(value) for value in bump.centre_mm)
-    told = by_place(tactile_map.frames, tactile_map.head, MapBump(row.amplitude, x_mm, y_mm, *widths))
-    if told is None:
-        return None
     return {
         "mean_kpa": row.mean_kpa,
         **hermite_figures(free, cells),
@@ -169,7 +160,6 @@ def measure(row: MassRow, scene: Scene, scan: Scan) -> dict[str, float] | None:
         **contact_figures(frames),
         **depth_figures(frames),
         **part_figures(frames, bump),
-        **dict(zip(BY_PLACE, told, strict=True)),
     }
 
 

@@ -345,15 +345,15 @@ def report_sizes(rows: list[Row]) -> None:
 def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.fat_depth import head_profile
-    from tactile_bayes.size.log_quadratic import LogQuadratic
     from tactile_bayes.size.pooling import SizePriors, pool_maps
     from tactile_bayes.size.shape_draws import ShapeDraws
 
     path = size_calibration_path(DEFAULT)
     assert path is not None
     calibration = read_size_calibration(path)
-    assert isinstance(calibration, LogQuadratic)
+    assert isinstance(calibration, BodyCalibration)
     scenes = draw_mass(index, scans=3, seed=SEED) if bodies == "population" else draw_mass_like_trial(index, seed=SEED)
     lump, shapes, single = scenes[0].solid_lumps[0], [], []
     for tactile_map, found in _estimates(scenes, calibration):
@@ -363,7 +363,7 @@ def _size_mass(bodies: str, index: int) -> Row:
             continue
         one = found.map_posterior
         profile = head_profile(tactile_map.quality)
-        told = {"profile": profile, "by_place": found.by_place, "oblique": one.oblique, "irregular": one.irregular}
+        told = {"profile": profile, "oblique": one.oblique, "irregular": one.irregular}
         shapes.append(ShapeDraws.of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm, one.angle_rad, **told))
         single.append(_both(found.size))
     pooled = pool_maps(shapes, calibration=calibration, priors=SizePriors(), rng=np.random.default_rng([SEED, index]))

@@ -131,7 +131,7 @@ def main() -> None:
     parser.add_argument("--masses", type=int, default=150)
     parser.add_argument("--trial", type=int, default=25)
     parser.add_argument("--exams", type=int, default=2)
-    parser.add_argument("--form", default="gaussian-process")
+    parser.add_argument("--form", default="eq6-residual")
     parser.add_argument("--trial-seed", type=int, default=TRIAL_SEED)
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)

@@ -39,9 +39,9 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.size_calibration import size_table
 from tactile_bayes.posterior.estimate import calibration_for, estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.eq6 import Recipe, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration
-from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.posterior import push_sizes
 from tactile_bayes.size.shape_draws import ShapeDraws
@@ -137,12 +137,12 @@ def as_bump(scene: Scene, shown: Row) -> Scene:
 
 
 @cache
-def shipped() -> LogQuadratic:
+def shipped() -> BodyCalibration:
     """The calibration that `estimate` takes if nothing is said."""
     path = size_calibration_path("solid")
     assert path is not None
     calibration = read_size_calibration(path)
-    assert isinstance(calibration, LogQuadratic)
+    assert isinstance(calibration, BodyCalibration)
     return calibration
 
 
@@ -164,7 +164,7 @@ def sized(tactile_map: TactileMap, seed: int) -> Row:
     if posterior is None:
         return {"code": found.code}
     calibration = calibration_for(tactile_map, shipped())
-    assert isinstance(calibration, LogQuadratic)
+    assert isinstance(calibration, BodyCalibration)
     draws = ShapeDraws.of(posterior.amplitude, posterior.sigma_x_mm, posterior.sigma_y_mm, posterior.angle_rad)
     size = pooled_size([draws], calibration=calibration, priors=SizePriors(), rng=rng)
     low, median, high = np.nanquantile(size.max_size_mm, [0.025, 0.5, 0.975])
@@ -276,7 +276,7 @@ def without_depth(row: Row) -> Row:
     names = ("amplitude", "sigma_x_mm", "sigma_y_mm")
     draws = (float(row[name]) * np.exp(0.02 * rng.standard_normal(DRAWS)) for name in names)
     maps = [ShapeDraws.of(*draws, np.zeros(DRAWS))]
-    size = pooled_size(maps, calibration=replace(shipped(), with_fat=None), priors=SizePriors(), rng=rng)
+    size = pooled_size(maps, calibration=shipped().at_fat([None]), priors=SizePriors(), rng=rng)
     low, median, high = np.nanquantile(size.max_size_mm, [0.025, 0.5, 0.975])
     return {"median": median, "low": low, "high": high}
 

@@ -115,7 +115,7 @@ def _measured(scene: Scene) -> dict[str, Any]:
     centre = apply(frame, np.stack([posterior.x_mm, posterior.y_mm, np.zeros_like(posterior.x_mm)], axis=-1))
     centre = centre.reshape(-1, 3)[:, :2]
     drawn = {name: getattr(shape, name).astype(np.float32) for name in ("log_amplitude", "log_width", "q", "r")}
-    figures = {name: getattr(shape, name) for name in ("profile", "by_place") if getattr(shape, name) is not None}
+    figures = {} if shape.profile is None else {"profile": shape.profile}
     return {
         **drawn,
         **figures,

@@ -67,7 +67,7 @@ def bodies_in(folder: Path) -> Iterator[Body]:
 
 def _exam(found: dict[str, FloatArray], head: str) -> tuple[ShapeDraws, Place]:
     drawn = [found[head + name].astype(np.float64) for name in ("log_amplitude", "log_width", "q", "r")]
-    figures = {name: tuple(map(float, found[head + name])) for name in ("profile", "by_place") if head + name in found}
+    figures = {name: tuple(map(float, found[head + name])) for name in ("profile",) if head + name in found}
     labels = found[head + "labels"].astype(np.intp)
     shape = ShapeDraws(*drawn, turn_rad=float(found[head + "turn_rad"]), labels=labels, **figures)
     return shape, Place(found[head + "centre"], found[head + "centre_cov"])

@@ -34,18 +34,6 @@ FIT_RADIUS_MM: Final = 20.0
 # Figures of a map: how pressure is spread over the head where it feels no lump, see `mapping.head_profile`.
 HEAD_PROFILE: Final = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
 
-# Figures of a rise on a map: how the lump's bump in a frame depends on its place under the head, across (X) and along
-# (Y): its height and its width across in the middle of the head, their change with X^2, and its shift with X and Y, see
-# `mapping.bump_by_place`.
-BY_PLACE: Final = (
-    "by_place_height",
-    "by_place_height_x2",
-    "by_place_width",
-    "by_place_width_x2",
-    "by_place_shift_x",
-    "by_place_shift_y",
-)
-
 # Figures of a map: SD of a frame's place along the plane's axes and the sides of the array there, mm, and how many
 # frames with an error of their own felt a cell for each reading in it, see `mapping.pose_noise`.
 POSE_NOISE: Final = ("pose_noise_x_mm", "pose_noise_y_mm", "frame_side_x_mm", "frame_side_y_mm", "frames_per_reading")

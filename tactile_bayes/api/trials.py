@@ -125,7 +125,7 @@ def calibrate_size(
     table
         A row for each lump: d_mm, amplitude, sigma_x_mm...; or a table of `population`, a row for each exam.
     form
-        ``"eq6"`` as printed; ``"log-quadratic"`` or ``"gaussian-process"`` for a table of `population`.
+        ``"eq6"`` as printed; ``"eq6-residual"`` for a table of `population`.
     correct
         Name or path of a calibration over bodies that the table's lumps correct; the table may also list map files.
     fit
@@ -155,7 +155,8 @@ def calibrate_size(
         When a keyword's value cannot be one, or goes with another form.
     """
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_json import write_body_calibration, write_size_calibration
+    from tactile_bayes.files.size_json import write_size_calibration
+    from tactile_bayes.files.size_population_json import write_population
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.pipeline.site_correction import correct_size
     from tactile_bayes.pipeline.size_calibration import FORMS, is_population, learn_eq6, learn_population
@@ -186,7 +187,7 @@ def calibrate_size(
         )
         if target is not None:
             provenance = Provenance("calibrate size", settings, inputs)
-            write_body_calibration(target, over_bodies, provenance=provenance, force=force)
+            write_population(target, over_bodies, provenance=provenance, force=force)
         return over_bodies
     rows = read_table(source, "size_table.table.json")
     learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)

@@ -37,16 +37,23 @@ def command() -> None:
 )
 @click.option(
     "--form",
-    type=click.Choice(["eq6", "log-quadratic", "gaussian-process"]),
+    type=click.Choice(["eq6", "eq6-residual"]),
     default="eq6",
     show_default=True,
-    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; the others: of bodies only.",
+    help="eq6: as printed, from a table of lumps, or of bodies made by `population`; eq6-residual: with what Eq 6 "
+    "leaves of the sizes, of bodies only.",
 )
 @click.option(
     "--correct",
     metavar="CALIBRATION",
     help="Correct this calibration (solid, solid-mean, eq6 or a file learned over bodies) by the table's lumps instead "
     "of learning one.",
+)
+@click.option(
+    "--against",
+    metavar="TABLE.csv",
+    type=_FILE,
+    help="Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
 )
 @click.option(
     "--fit",
@@ -101,6 +108,7 @@ def size(
     output: Path,
     form: PopulationForm,
     correct: str | None,
+    against: Path | None,
     fit: EqSixFit,
     normalise: str | None,
     background: str | None,
@@ -111,7 +119,7 @@ def size(
     seed: int,
     force: bool,
 ) -> None:
-    """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or a quadratic in logarithms.
+    """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.
 
     TABLE.csv has a row for each lump: d_mm, amplitude, sigma_x_mm, and optionally sigma_y_mm, depth_ratio,
     stiffness_ratio and seat. With depth_ratio the rows at one diameter depth define Delta sigma as a ratio. How the
@@ -131,11 +139,10 @@ def size(
 
     From a table of `population`, which has a row for each exam of a body, every form tells apart what differs between
     bodies and between exams of one body. `population` made the maps: nothing is declared, and --normalise chooses among
-    a table's rows. From the pressure over the
-    head where it felt no lump it also learns how deep the fat is, and sizes that go with it. The log-quadratic form is
-    ln d as a quadratic in ln a and ln sigma, or a cubic with the depth of fat. The Gaussian process takes ln a,
-    ln sigma and that pressure profile, with a spread between bodies that is wide for deep, faint and soft lumps; it is
-    the form of the shipped `solid`. A map without the profile gets the log-quadratic.
+    a table's rows. From the pressure over the head where it felt no lump it also learns how deep the fat is: the
+    constants of Eq 6 depend on that, and for a map without that pressure sizes are averaged over the depths that go
+    with it. eq6-residual adds what Eq 6 leaves, a Gaussian process in ln a, ln sigma and the depth; it is the form of
+    the shipped `solid`. The spread between bodies is wide for deep, faint and soft lumps.
 
     --correct keeps a calibration and learns from 3 lumps or more, better 5 to 20, by how much sizes at this site
     differ from it: few lumps change it little, and the uncertainty of the correction goes into every size. TABLE.csv
@@ -145,6 +152,7 @@ def size(
     Example: tactile-bayes calibrate size phantoms.csv -o size.json
     """
     from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_size_calibration
@@ -162,8 +170,10 @@ def size(
         return
     if form != "eq6" or is_population(table):
         _refuse_declared(ctx)
-        click.echo(_over_bodies(table, output, form, normalise, force=force), nl=False)
+        click.echo(_over_bodies(table, output, form, normalise, against=against, force=force), nl=False)
         return
+    if against is not None:
+        raise UsageError("--against is for a table of `population`; leave it out")
     rows = read_table(table, "size_table.table.json")
     with progress_bar("effective draws") as progress:
         learned = learn_eq6(
@@ -187,7 +197,7 @@ def size(
 def _refuse_with_correct(ctx: click.Context) -> None:
     from tactile_bayes.errors import UsageError
 
-    for name in ("form", "fit", "least_stiffness_ratio", "figure"):
+    for name in ("form", "against", "fit", "least_stiffness_ratio", "figure"):
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
             raise UsageError(f"--{option} is for learning a calibration; leave it out with --correct")
@@ -216,16 +226,22 @@ def _refuse_declared(ctx: click.Context) -> None:
             raise UsageError(f"--{option} is for tables of lumps: a table of `population` fixes how its maps were made")
 
 
-def _over_bodies(table: Path, output: Path, form: PopulationForm, normalise: str | None, *, force: bool) -> str:
+def _over_bodies(
+    table: Path, output: Path, form: PopulationForm, normalise: str | None, *, against: Path | None, force: bool
+) -> str:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_json import write_body_calibration
+    from tactile_bayes.files.size_population_json import write_population
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.pipeline.size_calibration import learn_population
     from tactile_bayes.report.population_text import body_calibration_text
 
-    calibration, settings = learn_population(read_table(table, "population.table.json"), form, normalise)
-    provenance = Provenance("calibrate size", settings, hash_inputs(table=table))
-    write_body_calibration(output, calibration, provenance=provenance, force=force)
+    others = None if against is None else read_table(against, "population.table.json")
+    calibration, settings = learn_population(
+        read_table(table, "population.table.json"), form, normalise, against=others
+    )
+    inputs = hash_inputs(table=table) if against is None else hash_inputs(table=table, against=against)
+    provenance = Provenance("calibrate size", settings, inputs)
+    write_population(output, calibration, provenance=provenance, force=force)
     return body_calibration_text(calibration)
 
 

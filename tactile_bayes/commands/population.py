@@ -85,7 +85,7 @@ def command(
     Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
     pressure, strokes, head yaw, tilt, noise, tracker errors and latency. The solid model makes the scans; maps are
     built and fitted as `map` and `estimate` do it. A mass takes about two seconds. An interrupted run goes on where it
-    stopped. `calibrate size` learns Eq 6 from the table, or with --form gaussian-process a calibration of the default's
+    stopped. `calibrate size` learns Eq 6 from the table, or with --form eq6-residual a calibration of the default's
     kind. The table names its head: a calibration learned from it sizes maps of such a head only.
 
     Example: tactile-bayes population --head head.json --masses 100 --workers 4 -o population.csv

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.size.calibration import Calibration
-    from tactile_bayes.size.fat_depth import FatTerms
 
 _TABLES = (
     "trial.table.json",
@@ -197,8 +196,7 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
     from tactile_bayes.size.body_calibration import BodyCalibration
 
     if isinstance(calibration, BodyCalibration):
-        kept = ["form", "source", "recipe", "parameters", "centre", "mean", "domain", "fit", "provenance"]
-        kept += ["bodies"] if "bodies" in document else []
+        kept = ("form", "source", "bodies", "recipe", "centre", "constants", "domain", "fit", "provenance")
         return {
             "schema": document["schema"],
             "kind": "size calibration",
@@ -206,7 +204,10 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
             "units": {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"},
             **{name: document[name] for name in kept},
             "variance_taken_away_by_knowing": calibration.unknowns,
-            **_with_fat(calibration.with_fat),
+            "residual_points": 0 if calibration.residual is None else len(calibration.residual.points),
+            "fat_mm": None if calibration.depth is None else list(calibration.depth.fat_mm),
+            "other_sd": calibration.other_sd,
+            "other_source": calibration.other_source,
         }
     return {
         "schema": document["schema"],
@@ -223,28 +224,6 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
         },
         "provenance": document["provenance"],
     }
-
-
-def _with_fat(part: FatTerms | None) -> dict[str, Any]:
-    """Fits of the parts for maps that tell the depth of the fat, and the figures by place too."""
-    from tactile_bayes.size.fat_process import FatProcess
-
-    if part is None:
-        return {}
-    parts = {"with_depth_of_fat": part}
-    if isinstance(part, FatProcess) and part.with_places is not None:
-        parts["with_figures_by_place"] = part.with_places
-    return {name: {**one.fit, **_spread(one)} for name, one in parts.items()}
-
-
-def _spread(part: FatTerms) -> dict[str, float]:
-    """What a part knows of the spread between bodies and of maps besides its fit."""
-    from tactile_bayes.size.fat_process import FatProcess
-
-    found = {} if part.hidden is None else {"body_skewness": part.hidden.skewness}
-    if isinstance(part, FatProcess):
-        found |= {"other_sd": part.other_sd, "map_factor": part.map_factor}
-    return found
 
 
 def _table(path: Path, head: bytes) -> dict[str, Any]:

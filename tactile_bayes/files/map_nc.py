@@ -1,7 +1,6 @@
 """Tactile maps as netCDF by the CF conventions; equal maps give equal bytes.
 
-The cells' centres are the coordinate variables ``x`` and ``y`` (record 0089). The group ``frames`` of a scan's map
-holds some of its frames (record 0106).
+The cells' centres are the coordinate variables ``x`` and ``y`` (record 0089).
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
-from tactile_bayes.files.map_frames_nc import FRAMES_GROUP, frame_contents, read_frames
 from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
@@ -82,8 +80,6 @@ def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, fo
     """
     _check_lattice({"x_mm": tactile_map.x_mm, "y_mm": tactile_map.y_mm}, tactile_map.recipe.cell_mm)
     groups = {"/": Contents(_variables(tactile_map), _attributes(tactile_map, provenance))}
-    if tactile_map.frames is not None:
-        groups[FRAMES_GROUP] = frame_contents(tactile_map.frames)
     write_bytes(path, grouped_netcdf_bytes(groups), force=force)
 
 
@@ -134,7 +130,6 @@ def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ..
             head=header["head"],
             nipple_mm=header["nipple_mm"],
             findings=header["findings"],
-            frames=read_frames(file, way_out=_WAY_OUT),
         )
         return tactile_map, scans_of(header["provenance"])
 

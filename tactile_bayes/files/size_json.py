@@ -26,7 +26,6 @@ from tactile_bayes.size.eq6 import (
 )
 
 if TYPE_CHECKING:
-    from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.calibration import Calibration
 
 SCHEMA = "tactile-bayes/size-calibration/1"
@@ -89,16 +88,11 @@ def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
         When the document is not one, or a field breaks the schema.
     """
     form = document.get("form") if isinstance(document, dict) else None
-    if form in ("log-quadratic", "gaussian-process"):
-        from tactile_bayes.files import size_quadratic_json as quadratic
-
-        _check(document, quadratic.SCHEMA_FILE, path)
-        return quadratic.parse_log_quadratic(document, path=path)
-    if form == "eq6-population":
-        from tactile_bayes.files import size_population_eq6_json as population
+    if form == "population":
+        from tactile_bayes.files import size_population_json as population
 
         _check(document, population.SCHEMA_FILE, path)
-        return population.parse_population_eq6(document, path=path)
+        return population.parse_population(document, path=path)
     _check(document, SCHEMA_FILE, path)
     return _eq6(document, path=path)
 
@@ -107,23 +101,6 @@ def _check(document: Any, schema_file: str, path: Path) -> None:
     """Hold a file of somebody else's against its schema."""
     if not is_shipped(path):
         check_document(document, schema_file, path=path)
-
-
-def write_body_calibration(
-    path: Path, calibration: BodyCalibration, *, provenance: Provenance, force: bool = False
-) -> None:
-    """Write a calibration over a population of either form atomically."""
-    from tactile_bayes.files.size_population_eq6_json import write_population_eq6
-    from tactile_bayes.files.size_quadratic_json import write_log_quadratic
-    from tactile_bayes.size.log_quadratic import LogQuadratic
-    from tactile_bayes.size.population_eq6 import PopulationEq6
-
-    if isinstance(calibration, PopulationEq6):
-        write_population_eq6(path, calibration, provenance=provenance, force=force)
-    elif isinstance(calibration, LogQuadratic):
-        write_log_quadratic(path, calibration, provenance=provenance, force=force)
-    else:
-        raise TypeError(f"a calibration of another form: {type(calibration).__name__}")
 
 
 def _eq6(document: Any, *, path: Path) -> SizeCalibration:

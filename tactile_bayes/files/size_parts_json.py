@@ -1,4 +1,4 @@
-"""Parts shared by the documents of log-quadratic calibrations."""
+"""Parts of the documents of size calibrations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import BY_PLACE
 from tactile_bayes.size.hidden import HiddenTerms, RoundSpread
 
 
@@ -20,10 +19,8 @@ def hidden_document(hidden: HiddenTerms) -> dict[str, Any]:
         "covariance": numbers(hidden.covariance),
         "with_body": numbers(hidden.with_body),
         "body_variance": number(hidden.body_variance),
-        **({} if hidden.by_place is None else {"by_place": numbers(hidden.by_place)}),
         **({"inverted": list(hidden.inverted)} if hidden.inverted else {}),
         **({"most_sd": number(hidden.most_sd)} if np.isfinite(hidden.most_sd) else {}),
-        **({"skewness": number(hidden.skewness)} if hidden.skewness else {}),
     }
 
 
@@ -35,9 +32,6 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
     arrays = [array_of(document, name) for name in ("expected", "covariance", "with_body")]
     if [array.shape for array in arrays] != [(k, terms), (k, k), (k,)]:
         raise BadDataError("hidden has arrays of other sizes than its names", way_out="learn the calibration anew")
-    by_place = array_of(document, "by_place") if "by_place" in document else None
-    if by_place is not None and by_place.shape != (k, len(BY_PLACE)):
-        raise BadDataError(f"hidden.by_place is no ({k}, {len(BY_PLACE)})", way_out="learn the calibration anew")
     expected, covariance, with_body = arrays
     return HiddenTerms(
         names,
@@ -45,10 +39,8 @@ def parse_hidden(document: dict[str, Any] | None, *, terms: int) -> HiddenTerms 
         covariance,
         with_body,
         body_variance=float(document["body_variance"]),
-        by_place=by_place,
         inverted=tuple(document.get("inverted", ())),
         most_sd=float(document.get("most_sd", np.inf)),
-        skewness=float(document.get("skewness", 0.0)),
     )
 
 
@@ -59,8 +51,8 @@ def round_document(coefficients: FloatArray, spread: RoundSpread) -> dict[str, A
 
 
 def parse_round_spread(balls: dict[str, Any]) -> RoundSpread:
-    """Spread of balls' maps; files of earlier versions have no factor."""
-    return RoundSpread(float(balls["body_sd"]), float(balls["exam_sd"]), float(balls.get("map_factor", 1.0)))
+    """Spread of balls' maps."""
+    return RoundSpread(float(balls["body_sd"]), float(balls["exam_sd"]), float(balls["map_factor"]))
 
 
 def array_of(document: dict[str, Any], name: str) -> FloatArray:

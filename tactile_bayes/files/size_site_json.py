@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.files.size_parts_json import array_of, number, numbers
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.site_shift import PARAMETERS, SiteShift, with_site
+from tactile_bayes.size.site_shift import PARAMETERS, SiteShift
 
 SCHEMA = "tactile-bayes/site-calibration/1"
 SCHEMA_FILE = "size_site.schema.json"
@@ -52,7 +53,6 @@ def site_document(site: SiteShift) -> dict[str, Any]:
         "phantoms": site.phantoms,
         "maps": site.maps,
         "uses_fat": site.uses_fat,
-        "uses_places": site.uses_places,
         "fit": {name: number(value) for name, value in site.fit.items()},
         "cautions": list(site.cautions),
         "left_out": list(site.left_out),
@@ -85,11 +85,10 @@ def parse_site_calibration(document: dict[str, Any], base: object, *, path: Path
             maps=int(found["maps"]),
             base=found["base"],
             uses_fat=bool(found["uses_fat"]),
-            uses_places=bool(found.get("uses_places", True)),
             fit={name: float(value) for name, value in found["fit"].items()},
             cautions=tuple(found["cautions"]),
             left_out=tuple(found["left_out"]),
         )
     except BadDataError as error:
         raise error.at(path) from None
-    return with_site(base, site)
+    return replace(base, site=site)

@@ -1,4 +1,4 @@
-"""The normal distribution function and its inverse, without the slow import of scipy, and a skewed relative of it."""
+"""The normal distribution function and its inverse, without the slow import of scipy."""
 
 from __future__ import annotations
 
@@ -29,41 +29,6 @@ def normal_quantile(probability: FloatArray) -> FloatArray:
     return np.where(tail < 0.02425, np.where(p < 0.5, low, -low), middle)
 
 
-def skewed_score(z: FloatArray, skewness: FloatArray) -> FloatArray:
-    """Normal scores as those of a skewed distribution with mean 0 and SD 1, a log-normal that is shifted and scaled.
-
-    Parameters
-    ----------
-    z, skewness : (n,) arrays
-        Skewness below 0.001 is none: a positive one lengthens the upper tail.
-
-    Notes
-    -----
-    With w = exp(s^2), s the log's SD, the skewness is (w + 2) sqrt(w - 1); its root is in closed form (Aitchison &
-    Brown 1957, The Lognormal Distribution, sec. 2.4).
-    """
-    variance, excess = _log_normal(skewness)
-    found = np.expm1(np.sqrt(variance) * z - 0.5 * variance) / np.sqrt(excess)
-    return np.where(skewness > _LEAST_SKEWNESS, found, z)
-
-
-def normal_score(skewed: FloatArray, skewness: FloatArray) -> FloatArray:
-    """Inverse of `skewed_score`; below the distribution's lower end it is its lowest finite score."""
-    variance, excess = _log_normal(skewness)
-    above = np.maximum(skewed * np.sqrt(excess), _LEAST_SKEWNESS - 1.0)
-    found = (np.log1p(above) + 0.5 * variance) / np.sqrt(variance)
-    return np.where(skewness > _LEAST_SKEWNESS, found, skewed)
-
-
-def _log_normal(skewness: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variance s^2 of the logs of a log-normal with this skewness, and exp(s^2) - 1."""
-    half = 1.0 + 0.5 * np.maximum(skewness, _LEAST_SKEWNESS) ** 2
-    root = np.cbrt(half + np.sqrt(half**2 - 1.0))
-    excess = root + 1.0 / root - 2.0
-    return np.log1p(excess), excess
-
-
-_LEAST_SKEWNESS = 1e-3
 _A = (
     -39.69683028665376,
     220.9460984245205,

@@ -26,7 +26,6 @@ from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.pose_noise import pose_noise_figures
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.quality import cell_figures, frame_figures, plane_figures, stroke_figures
-from tactile_bayes.mapping.sampling import sample_frames
 from tactile_bayes.mapping.shared_frames import shared_frame_figures
 from tactile_bayes.mapping.source import Progress, no_progress, sources_of
 from tactile_bayes.mapping.stroke_lag import stroke_lag_figures
@@ -291,7 +290,6 @@ def _as_map(
         quality=quality,
         masked_taxels=_masked(selections),
         head=_head(scans),
-        frames=None if recipe.normalise == "none" else sample_frames(selections, plane),
         findings=by_weight(
             (*convention_findings(quality), *broken_assumptions(quality), *handling_findings(quality), *findings)
         ),

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.frame_sample import POOL_TAXELS
 from tactile_bayes.mapping.frames import SelectedFrames, chunks
 from tactile_bayes.mapping.project import Projection, Projector
 from tactile_bayes.mapping.readout import Readout
 
 POOL_S = 0.02
+POOL_TAXELS = 2
 # Neighbouring frames share errors over less than this.
 SHARED_S = 0.2
 # A stroke is a run in one direction over at least this far.

@@ -12,7 +12,6 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.head_shape import HeadShape
-from tactile_bayes.mapping.frame_sample import FrameSample
 from tactile_bayes.records import dataclass
 
 # A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
@@ -103,9 +102,6 @@ class TactileMap:
         Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
     head
         Shape of the head that made the scan; None for an imported grid and for files of earlier versions.
-    frames
-        Some of its frames; None for an imported grid, for a map in kPa, while a scan is going on, and for files of
-        earlier versions.
     nipple_mm : (3,) array or None
         The nipple in `plane`; None where it was not touched.
     findings
@@ -125,7 +121,6 @@ class TactileMap:
     quality: Mapping[str, float] = field(default_factory=dict)
     masked_taxels: tuple[str, ...] = ()
     head: HeadShape | None = None
-    frames: FrameSample | None = None
     nipple_mm: FloatArray | None = None
     findings: tuple[Finding, ...] = ()
 

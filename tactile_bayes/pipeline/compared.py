@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.size.change import JointSizes
     from tactile_bayes.size.comparison import Compared
-    from tactile_bayes.size.mass_calibration import MassCalibration
     from tactile_bayes.size.pooling import SizePriors
     from tactile_bayes.size.same_mass import Apart
     from tactile_bayes.size.shape_draws import ShapeDraws
@@ -186,7 +185,7 @@ def _sized(
     """Sizes of visits that are of one mass, or why there are none."""
     import numpy as np
 
-    from tactile_bayes.size.change import joint_sizes, visit_calibrations
+    from tactile_bayes.size.change import joint_sizes, visits_calibration
     from tactile_bayes.size.comparison import Compared
     from tactile_bayes.size.pooling import MOST_INVALID
 
@@ -195,9 +194,8 @@ def _sized(
         sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
         for maps in visits
     ]
-    by_visit = visit_calibrations(shapes, calibration)
-    fitted = [one.mass for one in by_visit]
-    far = _by_visit(shapes, fitted, lambda at, middle: at.too_far(*middle))
+    at_depth = visits_calibration(shapes, calibration)
+    far = _by_visit(shapes, at_depth.too_far)
     if far:
         return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
     priors = size_priors(settings)
@@ -210,42 +208,39 @@ def _sized(
     sizes = joint(None)
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
         return Compared("no_estimate", "too many draws have no positive size", "", apart)
-    outside = _by_visit(shapes, fitted, lambda at, middle: at.outside(*middle))
+    outside = _by_visit(shapes, at_depth.outside)
     findings = [
         *doubts,
         *(Finding("outside_calibration", f"outside the calibration's range: {text}") for text in outside),
         *_fat_apart(shapes, calibration),
-        *_sizes_apart(shapes, by_visit, priors),
+        *_sizes_apart(shapes, at_depth, priors),
     ]
     another = None if priors.another_exam is None else joint(priors.another_exam)
     return Compared("compared", "", "", apart, tuple(findings), sizes, another)
 
 
-def _by_visit(
-    shapes: Sequence[Sequence[ShapeDraws]],
-    fitted: Sequence[BodyCalibration],
-    texts: Callable[[BodyCalibration, tuple[float, float]], list[str]],
-) -> list[str]:
+def _by_visit(shapes: Sequence[Sequence[ShapeDraws]], texts: Callable[[float, float], list[str]]) -> list[str]:
     """What is to be said of the middles of the maps, once for each visit."""
     found = [
         f"visit {number}: {text}"
-        for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1)
+        for number, maps in enumerate(shapes, start=1)
         for one in maps
-        for text in texts(at, one.middle)
+        for text in texts(*one.middle)
     ]
     return list(dict.fromkeys(found))
 
 
 def _sizes_apart(
-    shapes: Sequence[Sequence[ShapeDraws]], by_visit: Sequence[MassCalibration], priors: SizePriors
+    shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration, priors: SizePriors
 ) -> list[Finding]:
     """Cautions where the maps of one visit are not of one size."""
     from tactile_bayes.report.pooled import disagreement
+    from tactile_bayes.size.map_sizes import log_sizes
     from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_size_of
 
     found = []
-    for number, (maps, at) in enumerate(zip(shapes, by_visit, strict=True), start=1):
-        chance = one_size_of(at.log_sizes(maps), priors.between_maps)
+    for number, maps in enumerate(shapes, start=1):
+        chance = one_size_of(log_sizes(calibration, maps), priors.between_maps)
         if chance < LEAST_PROBABILITY:
             found.append(disagreement("its maps show different sizes", chance).at(f"visit {number}"))
     return found
@@ -255,8 +250,8 @@ def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibrat
     """Caution where the maps differ too much in the depth of fat to be of one breast."""
     from tactile_bayes.report.pooled import fat_apart
 
-    fat = calibration.with_fat
-    depths = None if fat is None else fat.depths_apart([one.profile for maps in shapes for one in maps])
+    fat = calibration.depth
+    depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
     return [] if depths is None else [fat_apart(depths)]
 
 

@@ -165,7 +165,6 @@ def estimate_one(
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import SHIPPED, default_for
     from tactile_bayes.mapping.fine_cells import many_cells
-    from tactile_bayes.posterior.drawn import fitting_calibration
     from tactile_bayes.posterior.estimate import calibration_for, estimate_map
     from tactile_bayes.posterior.masses import with_masses
     from tactile_bayes.report.population_text import calibration_line
@@ -201,7 +200,7 @@ def estimate_one(
     if why_none is not None and estimate.status == "estimate":
         estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
     posterior = estimate.map_posterior
-    used = None if posterior is None else fitting_calibration(posterior, calibration, estimate.by_place)
+    used = None if posterior is None or calibration is None else calibration.fitting(*posterior.medians)
     if posterior is not None and used is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
         by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"
@@ -432,7 +431,6 @@ def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | N
         posterior.angle_rad,
         turn_rad=angle,
         profile=head_profile(tactile_map.quality),
-        by_place=estimate.by_place,
         labels=estimate.draws.replicates,
         oblique=posterior.oblique,
         irregular=posterior.irregular,

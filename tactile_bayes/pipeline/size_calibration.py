@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, assert_never
+from typing import TYPE_CHECKING, Any, Literal
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
     from tactile_bayes.size.learn.eq6_two_stage import OtherFit
 
 EqSixFit = Literal["joint", "two-stage"]
-PopulationForm = Literal["eq6", "log-quadratic", "gaussian-process"]
-FORMS: tuple[PopulationForm, ...] = ("eq6", "log-quadratic", "gaussian-process")
+PopulationForm = Literal["eq6", "eq6-residual"]
+FORMS: tuple[PopulationForm, ...] = ("eq6", "eq6-residual")
 """What can be learned from a table of `population`; only the first from a table of lumps."""
 
 
@@ -125,7 +124,7 @@ def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_rati
 
 
 def learn_population(
-    rows: Table, form: PopulationForm, normalise: str | None = None
+    rows: Table, form: PopulationForm, normalise: str | None = None, *, against: Table | None = None
 ) -> tuple[BodyCalibration, dict[str, Any]]:
     """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
 
@@ -135,6 +134,8 @@ def learn_population(
         One of `FORMS`.
     normalise
         Of the rows to learn from; may be left out where all are alike.
+    against
+        Lumps of another origin, in the same columns: they tell by how much such bodies depart.
 
     Raises
     ------
@@ -146,53 +147,37 @@ def learn_population(
     from dataclasses import replace
 
     from tactile_bayes.size.eq6 import Recipe
+    from tactile_bayes.size.learn import population as learning
+    from tactile_bayes.size.learn.left_out import learn_other_sd
     from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
     fit = measuring_options().fit
     way, columns = rows_of_one_way(rows, normalise)
+    settings: dict[str, Any] = {"form": form, "masses": len(set(columns["body"])), "bodies": table_bodies(columns)}
     try:
+        head = table_head(columns)
         recipe = Recipe(
-            way,
-            fit.background,
-            fit.radius_mm,
-            declared=False,
-            noise=fit.noise,
-            flat_field=False,
-            head=table_head(columns),
+            way, fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
         )
-        calibration = population_learner(form)(population_table(columns), recipe=recipe, source=_SOURCE)
+        found = learning.learn_population(
+            population_table(columns), recipe=recipe, source=_SOURCE, residual=form == "eq6-residual"
+        )
     except BadDataError as error:
         raise error.at(rows.path) from None
-    if form == "gaussian-process" and calibration.with_fat is None:
-        from tactile_bayes.size.learn.fat_depth import LEAST_BODIES
-
+    if form == "eq6-residual" and found.residual is None:
         raise BadDataError(
-            f"fewer than {LEAST_BODIES} bodies have a lump and a head profile: too few for a Gaussian process",
-            way_out="give a larger population, or --form log-quadratic",
+            f"fewer than {learning.LEAST_BODIES} bodies have a lump and a head profile: too few for a residual",
+            way_out="give a larger population, or --form eq6",
             path=str(rows.path),
         )
-    bodies = table_bodies(columns)
-    settings = {"form": form, "masses": len(set(columns["body"])), "bodies": bodies}
-    return replace(calibration, bodies=bodies), settings
-
-
-def population_learner(form: PopulationForm) -> Callable[..., BodyCalibration]:
-    """The function that learns a calibration of a form from a `PopulationTable` and a `Recipe`."""
-    match form:
-        case "eq6":
-            from tactile_bayes.size.learn.eq6_population import learn_population_eq6
-
-            return learn_population_eq6
-        case "log-quadratic":
-            from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
-
-            return learn_log_quadratic
-        case "gaussian-process":
-            from tactile_bayes.size.learn.fat_process import learn_fat_process
-            from tactile_bayes.size.learn.log_quadratic import learn_log_quadratic
-
-            return partial(learn_log_quadratic, learn_fat=learn_fat_process)
-    assert_never(form)
+    found = replace(found, bodies=settings["bodies"])
+    if against is not None:
+        _, others = rows_of_one_way(against, way)
+        other_table = population_table(others)
+        source = f"{len(set(other_table.body.tolist()))} lumps of {against.path.name}"
+        found = learn_other_sd(found, other_table, source=source)
+        settings["other_masses"] = len(set(other_table.body.tolist()))
+    return found, settings
 
 
 def is_population(source: Path | Sheet) -> bool:

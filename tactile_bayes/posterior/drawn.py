@@ -11,7 +11,6 @@ import numpy as np
 from tactile_bayes.abstention import Abstention
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
-from tactile_bayes.mapping.assumptions import uneven
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import shape_fault
 from tactile_bayes.posterior.assessment import Assessment, MapDraws
@@ -19,7 +18,6 @@ from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration import Calibration, draw_sizes
 from tactile_bayes.size.pooling import SizePriors
 from tactile_bayes.size.posterior import EXTREMES, SizePosterior
@@ -31,17 +29,13 @@ MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none.
-
-    `by_place` is the map's figures `presets.BY_PLACE` of the lump, None where it has none.
-    """
+    """Draws of one map with its size by `calibration`; `fault` and `too_far` say why there is none."""
 
     made: MapDraws
     size: SizePosterior | None
     fault: Abstention | None
     calibration: Calibration | None
     too_far: tuple[str, ...] = ()
-    by_place: tuple[float, ...] | None = None
 
 
 def draw_sized(
@@ -98,19 +92,10 @@ def _drawn(
     fault = shape_fault(
         posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=tactile_map.recipe.cell_mm, prior=options.prior
     )
-    told = None if _beside_another(made) or uneven(tactile_map.quality) else posterior.by_place(tactile_map)
-    if isinstance(calibration, BodyCalibration) and calibration.unlike_places(told):
-        posterior = replace(posterior, irregular=True)
-        made = replace(made, posterior=posterior)
-    calibration = fitting_calibration(posterior, calibration, told)
+    calibration = None if calibration is None else calibration.fitting(*posterior.medians)
     far = () if calibration is None else tuple(calibration.too_far(*posterior.medians))
     size = None if fault or far else _size(posterior, made.draws, calibration, options.size_priors, rng=rng)
-    return Drawn(made, size, fault, calibration, far, told)
-
-
-def _beside_another(made: MapDraws) -> bool:
-    """Whether a second lump or a rib stands in the lump's window: the frames feel both."""
-    return made.scene is not None and bool(made.scene.fit.scene.extra)
+    return Drawn(made, size, fault, calibration, far)
 
 
 def _size(
@@ -135,13 +120,3 @@ def _size(
         oblique=posterior.oblique,
         irregular=posterior.irregular,
     )
-
-
-def fitting_calibration(
-    posterior: MapPosterior, calibration: Calibration | None, by_place: tuple[float, ...] | None
-) -> Calibration | None:
-    """The calibration for the map's figures by place.
-
-    It is without its fat depth where no body of its table resembles the map at that depth.
-    """
-    return None if calibration is None else calibration.fitting(*posterior.medians).at_places([by_place])

@@ -34,7 +34,7 @@ from tactile_bayes.size.posterior import SizePosterior
 MOST_INVALID = 0.05
 OTHER_HEAD = (
     "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
-    "calibrate size population.csv --form gaussian-process -o size.json`, and give --size-calibration size.json"
+    "calibrate size population.csv --form eq6-residual -o size.json`, and give --size-calibration size.json"
 )
 """How to make a calibration for another head."""
 _IRREGULAR = Finding(
@@ -159,7 +159,6 @@ def _measured(
         left_out=_left_out(tactile_map, options, calibration, made.figures),
         scene=made.scene,
         sensitivity=_sensitivity(made.posterior, size, options),
-        by_place=found.by_place,
         bump=bump,
         findings=tuple(_findings(found, cell_mm=tactile_map.recipe.cell_mm)),
     )
@@ -247,8 +246,6 @@ def _diagnostics(found: Drawn) -> Diagnostics:
         sampler=made.draws.diagnostics,
         noise=made.figures,
         convergence=_convergence(made, found.size) if made.draws.method == "ensemble" else {},
-        by_place=found.by_place,
-        by_place_used=calibration is not None and calibration.knows_places,
     )
 
 

@@ -141,8 +141,7 @@ def _sized_at(
     found = _estimated(tactile_map, given, estimator)
     near = first.map_posterior is not None and _reaches(first, rise, options)
     if first.map_posterior is not None and near and not _stays(found, rise, first):
-        # frames felt both lumps, whatever is taken off the cells
-        less = _estimated(replace(without(tactile_map, first.map_posterior), frames=None), given, estimator)
+        less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
         found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
     if found.code in ("undetected", "coarse"):
         return None

@@ -79,7 +79,7 @@ class EstimateOptions:
         Wanted Monte-Carlo error of the ends of 95 % intervals, of sizes and widths alike, in posterior SDs; None for
         the method's default.
     size_priors
-        Spread between maps and shape of the lump; only a log-quadratic calibration uses them.
+        Spread between maps and shape of the lump; only a calibration over bodies uses them.
     scene
         One of `presets.SCENES`, under a noise field.
     accuracy_mm

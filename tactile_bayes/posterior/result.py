@@ -86,8 +86,6 @@ class Estimate:
         Under a noise field: what the window holds, and what was asked about it.
     sensitivity
         How far the answer leans on the prior of the widths.
-    by_place
-        Figures `presets.BY_PLACE` of the lump; None without an estimate, and where the map has none.
     other_rises
         Other rises that are lumps by the evidence, see `other_rises.other_rises`; empty where nobody has looked.
     bump
@@ -112,7 +110,6 @@ class Estimate:
     advice: str = ""
     scene: SceneChoice | None = None
     sensitivity: Sensitivity | None = None
-    by_place: tuple[float, ...] | None = None
     other_rises: tuple[Rise, ...] = ()
     bump: ModalBump | None = None
     masses: tuple[Mass, ...] = ()

@@ -56,7 +56,7 @@ def compare_document(
             _change(joint, compared.another, later, days=days, grown_by=grown_by, probability=probability)
             for later in range(1, len(visits))
         ]
-    used = None if joint is None else joint.calibrations[0]
+    used = None if joint is None else joint.calibration
     return {
         "schema": SCHEMA,
         "status": compared.status,
@@ -74,7 +74,6 @@ def compare_document(
         "between_map_sd": None if joint is None else nine_digits(joint.between_map_sd),
         **({} if repeatability is None else {"repeatability": repeatability.words()}),
         "fat_mm": None if used is None or used.fat_mm is None else nine_digits(used.fat_mm),
-        "by_place_used": None if used is None else used.knows_places,
         "left_out": [] if used is None else used.omissions(),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),

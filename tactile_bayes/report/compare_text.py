@@ -157,8 +157,7 @@ def _site_line(document: Mapping[str, Any]) -> list[str]:
 def _model_line(document: Mapping[str, Any]) -> str:
     spread = f"exams of a visit differ by {100 * document['between_map_sd']:.0f} %"
     depth = "" if document["fat_mm"] is None else f"; fat under the head {document['fat_mm']:.1f} mm deep at all visits"
-    place = "; how the lump feels under each part of the head is used" if document["by_place_used"] else ""
-    return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}{place}."
+    return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}."
 
 
 def _signed(percent: float) -> str:

@@ -88,7 +88,6 @@ def pooled_document(
         "variance_share": None if size is None else {k: nine_digits(v) for k, v in size.variance_share.items()},
         "figures": {} if size is None else {name: nine_digits(value) for name, value in size.figures.items()},
         "left_out": _omitted(used, documents),
-        "by_place_used": used.knows_places,
         "fat_mm": None if used.fat_mm is None else nine_digits(used.fat_mm),
         "unknowns": {name: nine_digits(share) for name, share in used.unknowns.items()},
         "site": None if used.site is None else site_words(used.site),
@@ -311,5 +310,5 @@ def _map_line(one: Mapping[str, Any]) -> str:
 
 
 def _unknowns(document: Mapping[str, Any]) -> str:
-    text = fat_text(document["fat_mm"], by_place=document["by_place_used"]) + unknowns_text(document["unknowns"])
+    text = fat_text(document["fat_mm"]) + unknowns_text(document["unknowns"])
     return text[0].upper() + text[1:] + "."

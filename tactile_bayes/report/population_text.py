@@ -9,10 +9,6 @@ import numpy as np
 from tactile_bayes.presets import HELD, RESEARCH_USE
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.size.fat_depth import FatTerms
-from tactile_bayes.size.fat_process import FatProcess
-from tactile_bayes.size.log_quadratic import QUADRATIC
-from tactile_bayes.size.population_eq6 import PopulationEq6
 
 UNKNOWN_NAMES = {
     "depth_mm": "depth",
@@ -35,13 +31,13 @@ BODY_NAMES = {
 
 
 def body_calibration_text(calibration: BodyCalibration) -> str:
-    """Coefficients, spreads, what the unknowns cost, and the errors on masses left out."""
+    """Constants, spreads, what the unknowns cost, and the errors on masses left out."""
     fit = calibration.fit
-    body_sd, slope, exam_sd = calibration.mean[calibration.coefficients :]
     lines = [
-        *(_eq6_lines(calibration) if isinstance(calibration, PopulationEq6) else _quadratic_lines(calibration)),
-        f"between bodies, SD of ln d {np.exp(body_sd):.3f} (times e^({slope:+.2f} u)), "
-        f"between exams of a body {np.exp(exam_sd):.3f}",
+        *_eq6_lines(calibration),
+        f"between bodies, SD of ln d {fit.get('body_sd', float('nan')):.3f} (median; it changes with amplitude, width "
+        f"and depth), between exams of a body {fit.get('exam_sd', float('nan')):.3f}",
+        *_other_lines(calibration),
         unknowns_text(calibration.unknowns),
         f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; {_left_out_text(fit)}",
     ]
@@ -51,35 +47,45 @@ def body_calibration_text(calibration: BodyCalibration) -> str:
     lines += _bodies_lines(calibration.bodies)
     lines.append(f"recipe: {calibration.recipe}")
     lines.append(f"for maps made with {calibration.recipe.map_command}")
-    if calibration.with_fat is not None:
-        lines += _fat_lines(calibration, calibration.with_fat)
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
 def _bodies_lines(bodies: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Ranges of the bodies in one line; none where a file of an earlier version does not name them."""
+    """Ranges of the bodies in one line; none where nobody named them."""
     parts = [f"{BODY_NAMES.get(name, name)} {low:.3g} to {high:.3g}" for name, (low, high) in bodies.items()]
     return [f"bodies: {', '.join(parts)}"] if parts else []
 
 
-def _quadratic_lines(calibration: BodyCalibration) -> list[str]:
-    """The coefficients of the quadratic."""
-    (alpha, p), sd = calibration.centre, np.sqrt(np.diag(calibration.covariance))
-    terms = ("", "u", "v", "u^2", "u v", "v^2")
-    assert len(terms) == len(QUADRATIC)
-    return [
-        f"ln d in mm, posterior mean +- SD, with u = ln a {-alpha:+.3f}, v = ln sigma {-p:+.3f} (geometric mean width)",
-        *(f"{term or 'constant':>10} {calibration.mean[i]:8.3f} +- {sd[i]:.3f}" for i, term in enumerate(terms)),
-    ]
+def _eq6_lines(calibration: BodyCalibration) -> list[str]:
+    """The constants of Eq 6, by the depth of the fat where maps tell it, and its residual."""
+    alpha, p, _ = calibration.centre
+    sigma = f"sigma the geometric mean width, here {np.exp(p):.2g} mm"
+    if calibration.depth is None:
+        sd = np.sqrt(np.diag(calibration.covariance))
+        return [
+            f"Eq 6: d = m sigma / (e a^f) + b, {sigma}: {constants_text(calibration.constants())}",
+            f"posterior SD: m/e {100 * sd[0]:.1f} %, f {sd[1]:.3f}, b {sd[2]:.2f} mm; u = ln a {-alpha:+.3f}",
+        ]
+    low, high = calibration.depth.fat_mm
+    depths = [one for one in (6.0, 12.0, 24.0) if low <= one <= high]
+    lines = [f"Eq 6: d = m sigma / (e a^f) + b, {sigma}; m, e and f change with the depth of the fat and with sigma"]
+    lines += [f"  fat {one:.3g} mm: {constants_text(calibration.constants(fat_mm=one))}" for one in depths]
+    lines.append(f"the pressure over the head tells the depth of the fat to {100 * calibration.depth.log_sd:.1f} %")
+    if calibration.residual is not None:
+        count = len(calibration.residual.points)
+        lines.append(f"what Eq 6 leaves: a Gaussian process in ln a, ln sigma and ln of the depth, of {count} points")
+    return lines
 
 
-def _eq6_lines(calibration: PopulationEq6) -> list[str]:
-    """The constants of Eq 6."""
-    (alpha, _), sd = calibration.centre, np.sqrt(np.diag(calibration.covariance))
-    constants = constants_text(calibration.constants())
+def _other_lines(calibration: BodyCalibration) -> list[str]:
+    """By how much bodies of another origin depart; none where nothing told it."""
+    fit = calibration.fit
+    if not calibration.other_source:
+        return []
     return [
-        f"Eq 6: d = m sigma / (e a^f) + b, sigma the geometric mean width: {constants}",
-        f"posterior SD: m/e {100 * sd[0]:.1f} %, f {sd[1]:.3f}, b {sd[2]:.2f} mm; u = ln a {-alpha:+.3f}",
+        f"bodies of another origin: SD of ln d {calibration.other_sd:.3f} more (below {fit['other_sd_most']:.3f} with "
+        f"95 % probability), by {calibration.other_source}: mean absolute error {fit['other_mae_percent']:.1f} %, bias "
+        f"{fit['other_bias_percent']:+.1f} %, SD of standardised errors {fit['other_standard_sd']:.2f}"
     ]
 
 
@@ -99,45 +105,23 @@ def _left_out_text(fit: Mapping[str, float]) -> str:
     )
 
 
-def _fat_lines(calibration: BodyCalibration, fat: FatTerms) -> list[str]:
-    """What knowing the depth of the fat, from the pressure over the head, does to all that."""
-    low, high = fat.fat_mm
-    how = "a cubic in u, v and its log"
-    if isinstance(calibration, PopulationEq6):
-        how = "m and f by its logarithm and v"
-    elif isinstance(fat, FatProcess):
-        how = "a Gaussian process in u, v and the pressure profile; ln SD between bodies a quadratic"
-    lines = [
-        f"for maps that give the depth of the fat, {low:.3g} to {high:.3g} mm, "
-        f"to {100 * fat.depth.log_sd:.1f} %: {how}",
-        f"between bodies, SD of ln d {fat.fit.get('body_sd', float('nan')):.3f}, "
-        f"between exams of a body {fat.fit.get('exam_sd', float('nan')):.3f}; {_left_out_text(fat.fit)}",
-    ]
-    if isinstance(fat, FatProcess) and fat.with_places is not None:
-        lines.append(f"for maps that also keep frames with the lump: {_left_out_text(fat.with_places.fit)}")
-    return lines
-
-
 def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) -> str:
     """Which calibration gave the size of a map with this mean width, and what it cannot know."""
     line = f"Sizes by the {name}"
     if isinstance(calibration, BodyCalibration):
         head = "" if calibration.recipe.head is None else f"; for a head of {calibration.recipe.head}"
         line += f" ({calibration.source}{head}); "
-        if isinstance(calibration, PopulationEq6):
-            line += f"Eq 6 for this map: {constants_text(calibration.constants(sigma_mm))}; "
-        line += (
-            f"{fat_text(calibration.fat_mm, by_place=calibration.knows_places)}{unknowns_text(calibration.unknowns)}"
-        )
+        beside = "" if calibration.residual is None else " and its residual"
+        line += f"Eq 6 for this map: {constants_text(calibration.constants(sigma_mm))}{beside}; "
+        line += f"{fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
     return line
 
 
-def fat_text(fat_mm: float | None, *, by_place: bool) -> str:
+def fat_text(fat_mm: float | None) -> str:
     """What the frames told for the sizes, as the beginning of `unknowns_text`; empty where nothing of it is used."""
     if fat_mm is None:
         return ""
-    more = "how the lump feels under each part of the head is used; " if by_place else ""
-    return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; {more}"
+    return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; "
 
 
 def unknowns_text(unknowns: Mapping[str, float]) -> str:

@@ -1,7 +1,7 @@
 """The kinds of size calibration, and the step in which they differ: from map draws to sizes.
 
 One is learned from a study or phantoms (`eq6`), one over a population of bodies (`body_calibration`). Both have
-`at_fat`, `fitting`, `at_places`, `outside`, `too_far` and `omissions`; whoever uses a calibration needs no other.
+`at_fat`, `fitting`, `outside`, `too_far` and `omissions`; whoever uses a calibration needs no other.
 """
 
 from __future__ import annotations

@@ -21,8 +21,7 @@ from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.elongation import Elongation, ShapePrior
-from tactile_bayes.size.mass_calibration import MassCalibration
+from tactile_bayes.size.map_sizes import log_sizes, lump_shape, map_terms
 from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors
 from tactile_bayes.size.shape_draws import ShapeDraws, matched_draws
 from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, SharedBody
@@ -95,8 +94,8 @@ class JointSizes:
         Spread between exams of a visit, root mean square.
     correlation : (v, v) array
         Of B between the visits.
-    calibrations
-        Of each visit: at its figures by place.
+    calibration
+        At the depth of fat that all maps tell.
     """
 
     log_size: FloatArray
@@ -105,7 +104,7 @@ class JointSizes:
     replicates: Labels
     between_map_sd: float
     correlation: FloatArray
-    calibrations: tuple[BodyCalibration, ...]
+    calibration: BodyCalibration
 
     def change(self, earlier: int, later: int) -> Change:
         """Change from one visit to another."""
@@ -157,53 +156,37 @@ def joint_sizes(
         When there are fewer than two visits, more than `MOST_VISITS`, or one has no map.
     """
     _check(visits)
-    by_visit = visit_calibrations(visits, calibration)
-    fitted = [one.mass for one in by_visit]
-    between = between or priors.between_maps or fitted[0].between_exams
+    calibration = visits_calibration(visits, calibration)
+    between = between or priors.between_maps or calibration.between_exams
     flat = [one for maps in visits for one in maps]
     used, replicates = matched_draws(flat, number, rng)
     parts, start = [], 0
-    for maps, at in zip(visits, by_visit, strict=True):
-        parts.append(_Visit.of(used[start : start + len(maps)], at))
+    for maps in visits:
+        parts.append(_Visit.of(used[start : start + len(maps)], calibration))
         start += len(maps)
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = paired_points(middle, replicates, DIMENSIONS, rng)
     tau = _shared_tau(between, parts, points[:, 0])
-    half = _lump_shape(visits, by_visit, priors.shape).at(points[:, 2:5])
+    oval, _ = lump_shape(calibration, flat, log_sizes(calibration, flat), priors.shape)
+    half = oval.at(points[:, 2:5])
     found = [one.weighted(tau) for one in parts]
     if law is None:
-        law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
+        law = SHARED_WITHOUT_DEPTH if calibration.fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in found]))
-    covariance = _covariance(found, fitted, correlation, normal_quantile(points[:, 1]))
+    covariance = _covariance(found, calibration, correlation, normal_quantile(points[:, 1]))
     mean = np.stack([one.mean for one in found]) + np.hypot(half[:, 0], half[:, 1])
     drawn = _drawn(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
-    return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fitted))
+    return JointSizes(drawn, mean, covariance, replicates, spread, correlation, calibration)
 
 
-def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[MassCalibration]:
-    """The calibration at the depth of fat that all maps tell, and at each map's own figures by place.
-
-    It is one body, so its fat is as deep at each visit. Where a visit has no usable figures by place none are used:
-    what the maps hide would be something else with them than without.
-    """
-    calibration = calibration.at_fat([one.profile for maps in visits for one in maps])
-    for maps in visits:
-        for one in maps:
-            calibration = calibration.fitting(*one.middle)
-    by_place = [[one.by_place for one in maps] for maps in visits]
-    fitted = [MassCalibration.of(calibration, figures) for figures in by_place]
-    without = [one.mass for one in fitted if not one.mass.knows_places]
-    return [MassCalibration.of(without[0], figures) for figures in by_place] if without else fitted
-
-
-def _lump_shape(
-    visits: Sequence[Sequence[ShapeDraws]], by_visit: Sequence[MassCalibration], prior: ShapePrior
-) -> Elongation:
-    """Form of the lump, the same at all visits, by the balls of the first visit's calibration."""
+def visits_calibration(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> BodyCalibration:
+    """The calibration at the depth of fat that all maps tell: it is one body, so its fat is as deep at each visit."""
     flat = [one for maps in visits for one in maps]
-    all_maps = MassCalibration(by_visit[0].mass, tuple(at for one in by_visit for at in one.maps))
-    return all_maps.elongation(flat, all_maps.log_sizes(flat), prior)[0]
+    calibration = calibration.at_fat([one.profile for one in flat])
+    for one in flat:
+        calibration = calibration.fitting(*one.middle)
+    return calibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,9 +211,9 @@ class _Visit:
     terms: FloatArray
 
     @classmethod
-    def of(cls, maps: Sequence[ShapeDraws], calibration: MassCalibration) -> _Visit:
-        by_map = np.stack(calibration.log_sizes(maps))
-        return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), calibration.terms(maps))
+    def of(cls, maps: Sequence[ShapeDraws], calibration: BodyCalibration) -> _Visit:
+        by_map, terms = np.stack(log_sizes(calibration, maps)), map_terms(calibration, maps)
+        return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), terms)
 
     def weighted(self, tau: FloatArray) -> _Weighted:
         """Average the maps with the weights that (n,) spreads between exams give them."""
@@ -264,17 +247,14 @@ def _shared_tau(between: BetweenMaps, parts: Sequence[_Visit], points: FloatArra
 
 
 def _covariance(
-    parts: Sequence[_Weighted], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
+    parts: Sequence[_Weighted], calibration: BodyCalibration, correlation: FloatArray, score: FloatArray
 ) -> FloatArray:
     """(n, v, v) covariance of ln d at the visits given each draw of the maps."""
-    k, site = fitted[0].coefficients, fitted[0].site
-    bodies = np.stack([
-        at.body_and_error(one.terms, one.log_amplitude, one.log_width, score)[0]
-        for one, at in zip(parts, fitted, strict=True)
-    ], axis=1)  # fmt: skip
+    k, site = calibration.coefficients, calibration.site
+    bodies = np.stack([calibration.body_sd(one.log_amplitude, one.log_width, score) for one in parts], axis=1)
     terms = np.stack([one.terms for one in parts], axis=1)
     found = bodies[:, :, None] * correlation * bodies[:, None, :]
-    found = found + (terms @ fitted[0].covariance[:k, :k]) @ np.swapaxes(terms, 1, 2)
+    found = found + (terms @ calibration.covariance[:k, :k]) @ np.swapaxes(terms, 1, 2)
     exams = np.stack([one.exam_variance for one in parts], axis=1)
     found[:, range(len(parts)), range(len(parts))] += exams
     if site is not None:

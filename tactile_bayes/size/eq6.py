@@ -241,16 +241,6 @@ class SizeCalibration:
         del profiles
         return self
 
-    @property
-    def knows_places(self) -> bool:
-        """Whether it is for one mass's figures by place: never."""
-        return False
-
-    def at_places(self, by_place: Sequence[tuple[float, ...] | None]) -> SizeCalibration:
-        """Return the calibration unchanged: Eq 6 knows amplitude and width alone."""
-        del by_place
-        return self
-
     def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> SizeCalibration:
         """Return the calibration unchanged: it is the same for all maps."""
         del amplitude, sigma_x_mm, sigma_y_mm

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.polynomials import monomials, powers
 
 LOGGED = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
 """Properties that vary and enter by their logarithm, but for those that enter by their inverse."""
 INVERTED = ("stiffness_ratio",)
-"""Properties by whose inverse a size goes: 50 times as stiff as fat and 100 times are both nearly rigid.
-
-Files of earlier versions have them by the logarithm; each file says what it has.
-"""
-SKEWED_BY = "stiffness_ratio"
-"""The property that makes B skewed: its inverse is, of lumps whose stiffness is spread evenly by its logarithm."""
-MOST_SKEWNESS = 1.0
+"""Properties by whose inverse a size goes: 50 times as stiff as fat and 100 times are both nearly rigid."""
 MOST_SHARE = 0.9
 """Share of B's variance that all properties together tell at most.
 
@@ -58,17 +50,13 @@ class RoundLumps:
     Parameters
     ----------
     coefficients : (c,) array
-        Of the first c of 1, u, v, u2, uv and v2 in q0.
+        Of a calibration's features in q0.
     spread
         About q0.
     """
 
     coefficients: FloatArray
     spread: RoundSpread
-
-    def excess(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """(...,) q0 of maps."""
-        return np.asarray(monomials((u, v), powers(2)[: len(self.coefficients)]) @ self.coefficients)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,14 +75,10 @@ class HiddenTerms:
         Covariance with B.
     body_variance
         Of B, in the units that `with_body` has it in: 1 where these are the SD(B) of each body's place.
-    by_place : (k, 6) array
-        Coefficients of the standardised `presets.BY_PLACE` in what is expected; None where these take no part.
     inverted
         Those that enter by their inverse.
     most_sd
         SD(B) beyond which these properties explain no more of B: of faint and deep lumps it is the map that is unlike.
-    skewness
-        Of B: its third central moment over the cube of SD(B). It goes with `SKEWED_BY`.
     """
 
     names: tuple[str, ...]
@@ -102,10 +86,8 @@ class HiddenTerms:
     covariance: FloatArray
     with_body: FloatArray
     body_variance: float
-    by_place: FloatArray | None = None
     inverted: tuple[str, ...] = ()
     most_sd: float = float("inf")
-    skewness: float = 0.0
 
     def share(self, *names: str) -> float:
         """Share of B's variance removed by knowing these properties, at most `MOST_SHARE`."""
@@ -125,24 +107,6 @@ class HiddenTerms:
         at = self.names.index(name)
         off = self._entered(name, value) - features @ self.expected[at]
         return float(abs(off) / np.sqrt(self.covariance[at, at]))
-
-    def skewness_left(self, known: Mapping[str, float], left: FloatArray) -> FloatArray:
-        """(n,) skewness of what is left of B, given (n,) the share of its variance that is left."""
-        if SKEWED_BY in known:
-            return np.zeros_like(left)
-        return np.asarray(np.minimum(self.skewness * np.maximum(left, 1.0 - MOST_SHARE) ** -1.5, MOST_SKEWNESS))
-
-    def at_depth(self, contraction: FloatArray) -> HiddenTerms:
-        """The terms at one depth of fat, by the matrix that takes what is linear in the features to that depth."""
-        return replace(self, expected=self.expected @ contraction.T)
-
-    def at_places(self, figures: FloatArray) -> HiddenTerms:
-        """The terms for one mass's (6,) standardised figures by place, at one depth of fat."""
-        if self.by_place is None:
-            return self
-        expected = self.expected.copy()
-        expected[:, 0] += self.by_place @ figures  # of the feature 1
-        return replace(self, expected=expected, by_place=None)
 
     def _entered(self, name: str, value: float) -> float:
         if name in self.inverted:

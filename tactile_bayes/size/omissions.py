@@ -27,11 +27,6 @@ def fat_depth(why: str, *, other_sd: float = 0.0) -> str:
     return f"{left_out}; for such a body the interval allows {100 * other_sd:.0f} % (SD) more" if other_sd else left_out
 
 
-def by_place(why: str) -> str:
-    """The figures by place as a source left out, where maps do not give them."""
-    return f"how the lump feels under each part of the head, which would narrow the size: {why}"
-
-
 def bodies(ranges: Mapping[str, tuple[float, float]]) -> str:
     """Bodies unlike those that a calibration was learned over as a source left out; these by their columns."""
     words = {

@@ -23,19 +23,16 @@ from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.calibration_range import extrapolated
 from tactile_bayes.size.elongation import OVAL_SD, ShapePrior
-from tactile_bayes.size.mass_calibration import MassCalibration
+from tactile_bayes.size.map_sizes import log_sizes, lump_shape, map_terms
 from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_size_probability, spread_tested
 from tactile_bayes.size.posterior import SizePosterior, shares
 from tactile_bayes.size.shape_draws import ShapeDraws, matched_draws
 from tactile_bayes.size.site_shift import site_variance
-from tactile_bayes.size.supposed import BodyLeft, known_body, suppositions
+from tactile_bayes.size.supposed import known_body, suppositions
 
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
-"""Of the points: ln d given all else, tau, the spread of B, oval or round, and the two components of an oval.
-
-Where B is skewed, its score is one more.
-"""
+"""Of the points: ln d given all else, tau, the spread of B, oval or round, and the two components of an oval."""
 _SCORE = 2
 """Coordinate of the spread of B."""
 MOST_INVALID = 0.05
@@ -102,19 +99,18 @@ def pooled_size(
     Notes
     -----
     Given tau and B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau, the spread of
-    B, its skewed score and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
+    B and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the
     maps in order of their log size; the draws then get the quantiles of the mixture of all these normals.
     """
-    fitted = MassCalibration.of(calibration.at_fat([one.profile for one in maps]), [one.by_place for one in maps])
-    calibration = fitted.mass
+    calibration = calibration.at_fat([one.profile for one in maps])
     used, replicates = matched_draws(maps, number, rng)
-    log_size = fitted.log_sizes(maps)
-    by_map = np.stack(log_size if used is maps else fitted.log_sizes(used))
+    log_size = log_sizes(calibration, maps)
+    by_map = np.stack(log_size if used is maps else log_sizes(calibration, used))
     centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
-    oval, shown = fitted.elongation(maps, log_size, priors.shape)
-    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS + calibration.is_skewed, rng)
-    terms = fitted.terms(used)
-    half = oval.at(points[:, 3:DIMENSIONS])
+    oval, shown = lump_shape(calibration, maps, log_size, priors.shape)
+    points = paired_points(by_map.mean(axis=0), replicates, DIMENSIONS, rng)
+    terms = map_terms(calibration, used)
+    half = oval.at(points[:, 3:])
     figures = {
         "oval_probability": oval.probability,
         "oval_half_log_ratio": oval.magnitude,
@@ -125,8 +121,10 @@ def pooled_size(
     of_body = None
     if len(used) == 1:
         only = used[0]
-        of_body = calibration.body_and_error(
-            terms[0], only.log_amplitude, only.log_width, normal_quantile(points[:, _SCORE])
+        score = normal_quantile(points[:, _SCORE])
+        of_body = (
+            calibration.body_sd(only.log_amplitude, only.log_width, score),
+            calibration.coefficient_variance(terms[0]),
         )
     pool = _Pool(
         used, by_map, terms, centre, noise, points, half, replicates, calibration, priors.known, form_sd, of_body
@@ -158,13 +156,13 @@ class _Pool:
         The calibration's terms.
     centre, noise : (k,) arrays
         Its mean and variance.
-    points : (n, `DIMENSIONS`) or (n, `DIMENSIONS` + 1) array
+    points : (n, `DIMENSIONS`) array
     half : (n, 2) array
         Half log axis ratio of the lump, in two components.
     form_sd
         SD of ln d because the lump's outline is irregular.
     of_body
-        `BodyCalibration.body_and_error` of the only map, which no spread between maps moves; None of several.
+        SD(B) and the coefficients' variance of the only map, which no spread between maps moves; None of several.
     """
 
     maps: Sequence[ShapeDraws]
@@ -178,20 +176,19 @@ class _Pool:
     calibration: BodyCalibration
     known: Mapping[str, float]
     form_sd: float
-    of_body: tuple[FloatArray, FloatArray, FloatArray] | None
+    of_body: tuple[FloatArray, FloatArray] | None
 
     def size(self, between: BetweenMaps, figures: Mapping[str, float]) -> SizePosterior:
         """Sizes under a prior of the spread between maps."""
         tau = between.at(self.points[:, 1], self.centre, self.noise)
         weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
         weight /= weight.sum(axis=0)
-        z, score, body = normal_quantile(self.points[:, [0, _SCORE, -1]].T)
-        known, own, variances = self._left_open(tau=tau, weight=weight, score=score)
+        z, score = normal_quantile(self.points[:, [0, _SCORE]].T)
+        known, variances = self._left_open(tau=tau, weight=weight, score=score)
         map_part = np.sum(weight * self.by_map, axis=0)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
-        mean = map_part + known + own.drawn(body) + longer
-        left = np.maximum(sum(variances.values()) - own.skewed_variance, 0.0)
-        sd = np.sqrt(left + (OVAL_SD * longer) ** 2)
+        mean = map_part + known + longer
+        sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
         log_largest, log_smallest = self._evened(mean, sd, z, longer)
         wide = self.half[:, 0] >= 0
         share = {"map": float(np.nanvar(map_part)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
@@ -207,8 +204,8 @@ class _Pool:
 
     def _left_open(
         self, *, tau: FloatArray, weight: FloatArray, score: FloatArray
-    ) -> tuple[FloatArray, BodyLeft, dict[str, FloatArray]]:
-        """Distribution of ln d given each draw of the maps: its mean, what is left of B, and all variances by source.
+    ) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Distribution of ln d given each draw of the maps: its mean, and its variances by source.
 
         Parameters
         ----------
@@ -222,16 +219,16 @@ class _Pool:
         middle_a, middle_width = np.sum(weight * log_a, axis=0), np.sum(weight * log_width, axis=0)
         if self.of_body is None:
             terms = np.einsum("kn,knt->nt", weight, self.terms)
-            body_sd, shift, error = self.calibration.body_and_error(terms, middle_a, middle_width, score)
+            body_sd = self.calibration.body_sd(middle_a, middle_width, score)
+            error = self.calibration.coefficient_variance(terms)
         else:
-            body_sd, shift, error = self.of_body
+            body_sd, error = self.of_body
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
         other_sd = self.calibration.other_sd
         own_sd = self.calibration.own_sd(body_sd)
         left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
         return (
-            left.expected + shift,
-            left,
+            left.expected,
             {
                 "between_maps": np.sum(weight**2, axis=0) * tau**2,
                 "calibration": error,
@@ -310,17 +307,16 @@ def pool_maps(
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
     used, found = [shape for shape, _ in in_order], [i for _, i in in_order]
     profiles = [one.profile for one in used]
-    fat_apart_mm = None if calibration.with_fat is None else calibration.with_fat.depths_apart(profiles)
+    fat_apart_mm = None if calibration.depth is None else calibration.depth.apart(profiles)
     at_depth = calibration.at_fat(profiles)
     middles = [one.middle for one in used]
     for middle in middles:  # one map that does not go with the depth is enough: it is the same body
         at_depth = at_depth.fitting(*middle)
-    fitted = MassCalibration.of(at_depth, [one.by_place for one in used])
     named = sorted(zip(found, middles, strict=True))
-    far = [f"map {i + 1}: {text}" for i, middle in named for text in fitted.mass.too_far(*middle)]
+    far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.too_far(*middle)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
-    sizes = fitted.log_sizes(used)
+    sizes = log_sizes(at_depth, used)
     centres = {i: float(np.nanmean(one)) for i, one in zip(found, sizes, strict=True)}
     centre, noise = np.array(list(centres.values())), np.array([np.nanvar(one) for one in sizes])
     chances = _one_size(centre, noise, priors)
@@ -328,20 +324,20 @@ def pool_maps(
         far_off = outlying_maps(centre, noise, priors.spread_of_others)
         apart = tuple(sorted(found[i] for i in far_off))
         return PooledEstimate(
-            DISAGREE, "the maps show different sizes", None, centres, apart, (), fitted.mass, fat_apart_mm, **chances
+            DISAGREE, "the maps show different sizes", None, centres, apart, (), at_depth, fat_apart_mm, **chances
         )
     size = pooled_size(used, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
-    outside = [f"map {i + 1}: {text}" for i, middle in named for text in fitted.mass.outside(*middle)]
-    outside += fitted.mass.beyond_lumps(size.median_mm)
+    outside = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle)]
+    outside += at_depth.beyond_lumps(size.median_mm)
     reason = "" if len(found) == len(shapes) else f"a lump was found on {len(found)} of {len(shapes)} maps"
     outlying = tuple(sorted(found[i] for i in size.outliers))
     if len(used) > 1:
         weights = {f"weight_{sorted(found).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(found)}
         size = replace(size, figures={**size.figures, **weights})
     return PooledEstimate(
-        "estimate", reason, size, centres, outlying, tuple(outside), fitted.mass, fat_apart_mm, **chances
+        "estimate", reason, size, centres, outlying, tuple(outside), at_depth, fat_apart_mm, **chances
     )
 
 

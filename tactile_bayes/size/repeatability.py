@@ -12,7 +12,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.mass_calibration import corrected_log_size
+from tactile_bayes.size.map_sizes import corrected_log_size
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.posterior import SizePosterior
 from tactile_bayes.size.shape_draws import ShapeDraws
@@ -82,9 +82,8 @@ def _percent(share: float) -> str:
 
 
 def for_shape(calibration: BodyCalibration, shape: ShapeDraws) -> BodyCalibration:
-    """The calibration at a single map's depth of fat and figures by place."""
-    at_depth = calibration.at_fat([shape.profile]).fitting(*shape.middle)
-    return at_depth.at_places([shape.by_place])
+    """The calibration at a single map's depth of fat."""
+    return calibration.at_fat([shape.profile]).fitting(*shape.middle)
 
 
 def log_size_alone(calibration: BodyCalibration, shape: ShapeDraws) -> tuple[float, float]:

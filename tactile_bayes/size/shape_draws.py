@@ -28,8 +28,8 @@ class ShapeDraws:
         Mean and SD of r where the draws have none, as `MapPosterior`'s.
     irregular
         Whether the map is that of an irregular lump.
-    profile, by_place
-        `presets.HEAD_PROFILE` and `presets.BY_PLACE` of the map; None where it has none.
+    profile
+        `presets.HEAD_PROFILE` of the map; None where it has none.
     labels
         Of the draws' independent replicates, as `ParameterDraws.labels`.
     """
@@ -40,7 +40,6 @@ class ShapeDraws:
     r: FloatArray
     turn_rad: float = 0.0
     profile: tuple[float, ...] | None = None
-    by_place: tuple[float, ...] | None = None
     labels: Labels | None = None
     oblique: tuple[float, float] | None = None
     irregular: bool = False
@@ -65,7 +64,6 @@ class ShapeDraws:
         *,
         turn_rad: float = 0.0,
         profile: tuple[float, ...] | None = None,
-        by_place: tuple[float, ...] | None = None,
         labels: Labels | None = None,
         oblique: tuple[float, float] | None = None,
         irregular: bool = False,
@@ -77,7 +75,7 @@ class ShapeDraws:
         angle = angle_rad.ravel()
         p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
         q, r = half * np.cos(2 * angle), half * np.sin(2 * angle)
-        return cls(log_a, p, q, r, turn_rad, profile, by_place, labels, oblique, irregular)
+        return cls(log_a, p, q, r, turn_rad, profile, labels, oblique, irregular)
 
     @property
     def middle(self) -> tuple[float, float]:

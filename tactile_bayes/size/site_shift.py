@@ -11,8 +11,7 @@ the simulation that the calibration was learned from; `size.learn.site_shift` le
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, replace
-from typing import TYPE_CHECKING
+from dataclasses import field
 
 import numpy as np
 
@@ -21,9 +20,6 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
-
-if TYPE_CHECKING:
-    from tactile_bayes.size.body_calibration import BodyCalibration
 
 PARAMETERS = ("c0", "c1")
 NO_PROFILE = "the phantoms that correct the calibration have no pressure profile of the head"
@@ -45,8 +41,6 @@ class SiteShift:
         Name of the calibration that is corrected.
     uses_fat
         Whether the phantoms were sized with the depth of fat; if not, no size with this correction is.
-    uses_places
-        The same of the figures by place.
     fit
         Figures of the fit: ``log_width`` (mean p of the phantoms), ``spread_factor``, ``sd_before`` and ``sd_after``.
     cautions
@@ -62,7 +56,6 @@ class SiteShift:
     maps: int
     base: str = ""
     uses_fat: bool = True
-    uses_places: bool = True
     fit: Mapping[str, float] = field(default_factory=dict)
     cautions: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
@@ -109,13 +102,3 @@ def site_log_shift(site: SiteShift | None, log_width: FloatArray) -> FloatArray:
 def site_variance(site: SiteShift | None, log_width: FloatArray) -> dict[str, FloatArray]:
     """(...,) what a site's uncertainty adds to the variance of ln d, by source; empty without a correction."""
     return {} if site is None else {"site": site.variance(log_width)}
-
-
-def with_site(calibration: BodyCalibration, site: SiteShift) -> BodyCalibration:
-    """The calibration with a correction; without the depth of fat or figures by place if the phantoms had none."""
-    fat = calibration.with_fat
-    if fat is None:
-        return replace(calibration, site=site)
-    if not site.uses_fat:
-        return replace(calibration, site=site, with_fat=None, fat_note=NO_PROFILE)
-    return replace(calibration, site=site, with_fat=fat if site.uses_places else fat.without_places())

@@ -14,7 +14,6 @@ import numpy as np
 
 from tactile_bayes.errors import UsageError, check_number, meant
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.normal import normal_score, skewed_score
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.body_calibration import BodyCalibration
 
@@ -27,7 +26,7 @@ SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
 """A property and its value by name: lumps of 8 to 15 and 50 to 100 times the stiffness of fat, centred on the gland's
 surface and resting on it."""
 LIKELY_SDS: Final = 2.5
-"""A value farther than this from what the map leads one to expect is not supposed: figures by place tell the seat."""
+"""A value farther than this from what the map leads one to expect is not supposed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +39,7 @@ class Supposition:
         The property, by the names of `HiddenTerms`, and its value.
     log_shift
         By which the median of ln d moves.
-    sds, skewness
+    sds
         Of ln d without and with it.
     """
 
@@ -48,7 +47,6 @@ class Supposition:
     value: float
     log_shift: float
     sds: tuple[float, float]
-    skewness: tuple[float, float]
 
     @property
     def sd_ratio(self) -> float:
@@ -62,16 +60,7 @@ class Supposition:
 
     def moved(self, size_mm: float, *, median_mm: float) -> float:
         """Size where one of a distribution with this median comes to lie: the median itself, or an interval's end."""
-        (before, after), (skewed, left) = self.sds, self.skewness
-        above = np.log(size_mm / median_mm) / before if before > 0 else 0.0
-        score = normal_score(np.array(above + _median_score(skewed)), np.array(skewed))
-        moved = after * (skewed_score(score, np.array(left)) - _median_score(left))
-        return float(median_mm * np.exp(self.log_shift + moved))
-
-
-def _median_score(skewness: float) -> float:
-    """Median of a skewed distribution with mean 0 and SD 1."""
-    return float(skewed_score(np.zeros(()), np.array(skewness)))
+        return float(median_mm * np.exp(self.log_shift) * (size_mm / median_mm) ** self.sd_ratio)
 
 
 def suppositions(
@@ -87,7 +76,7 @@ def suppositions(
         Of ln d as it is.
     """
     at = np.array([middle[0]]), np.array([middle[1]])
-    body_sd = calibration.body_and_error(calibration.terms(*at), *at, np.zeros(1))[0]
+    body_sd = calibration.body_sd(*at, np.zeros(1))
     own_sd = calibration.own_sd(body_sd)
     names, found = () if calibration.hidden is None else calibration.hidden.names, {}
     before = known_body(calibration, known, *at, own_sd)
@@ -106,14 +95,8 @@ def _supposition(name: str, value: float, before: BodyLeft, left: BodyLeft, *, v
     """What one more known property does to a size whose logarithm has this variance without it."""
     gone = float((before.variance - left.variance)[0])
     variances = variance, float(np.clip(variance - gone, 0.0, variance))
-    skewness = [
-        float((one.skewness * one.variance**1.5)[0]) / whole**1.5 if whole > 0 else 0.0
-        for one, whole in zip((before, left), variances, strict=True)
-    ]
     sds = float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
-    shift = float((left.expected - before.expected)[0])
-    shift += sds[1] * _median_score(skewness[1]) - sds[0] * _median_score(skewness[0])
-    return Supposition(name, value, shift, sds, (skewness[0], skewness[1]))
+    return Supposition(name, value, float((left.expected - before.expected)[0]), sds)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,21 +105,11 @@ class BodyLeft:
 
     Parameters
     ----------
-    expected, variance, skewness : (n,) arrays
+    expected, variance : (n,) arrays
     """
 
     expected: FloatArray
     variance: FloatArray
-    skewness: FloatArray
-
-    @property
-    def skewed_variance(self) -> FloatArray:
-        """(n,) its variance where it is skewed; 0 where it is a normal, as the rest of ln d is."""
-        return np.where(self.skewness > 0.0, self.variance, 0.0)
-
-    def drawn(self, score: FloatArray) -> FloatArray:
-        """(n,) B about its mean at (n,) normal scores, where it is skewed."""
-        return np.asarray(np.sqrt(self.skewed_variance) * skewed_score(score, self.skewness))
 
 
 def known_body(
@@ -160,8 +133,7 @@ def known_body(
     """
     hidden, none = calibration.hidden, np.zeros(len(log_width))
     if not known:
-        skewness = none if hidden is None else hidden.skewness_left({}, none + 1.0)
-        return BodyLeft(none, own_sd**2, skewness)
+        return BodyLeft(none, own_sd**2)
     names = () if hidden is None else hidden.names
     for name, value in known.items():
         if name not in names:
@@ -171,5 +143,4 @@ def known_body(
     expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
     explained_sd = np.minimum(own_sd, hidden.most_sd)
     left = own_sd**2 - hidden.share(*known) * explained_sd**2
-    skewness = hidden.skewness_left(known, np.divide(left, own_sd**2, out=none + 1.0, where=own_sd > 0))
-    return BodyLeft(expected * explained_sd, left, skewness)
+    return BodyLeft(expected * explained_sd, left)

@@ -17,7 +17,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.presets import BY_PLACE, DEFAULT_NORMALISE, HEAD_PROFILE
+from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
 from tactile_bayes.scan import Scan
 from tactile_bayes.size.hidden import LOGGED
 from tactile_bayes.size.learn.regression import PopulationTable
@@ -58,9 +58,6 @@ class MassRow:
     head_profile_x2, head_profile_y2, head_profile_y4
         How pressure was spread over the head where it felt no lump, see `mapping.head_profile`; None where it always
         felt one.
-    by_place_height ... by_place_shift_y
-        How the bump depended on the lump's place under the head, see `mapping.bump_by_place`; None where too few frames
-        had the lump near the head.
     normalise
         How the map's frames were, see `MapRecipe`.
     head_rows, head_columns, head_pitch_mm, head_radius_mm, head_shoulder_mm, head_rim_mm
@@ -90,12 +87,6 @@ class MassRow:
     head_profile_x2: float | None = None
     head_profile_y2: float | None = None
     head_profile_y4: float | None = None
-    by_place_height: float | None = None
-    by_place_height_x2: float | None = None
-    by_place_width: float | None = None
-    by_place_width_x2: float | None = None
-    by_place_shift_x: float | None = None
-    by_place_shift_y: float | None = None
     normalise: str = "mean"
     head_rows: int | None = None
     head_columns: int | None = None
@@ -168,14 +159,12 @@ def _measured(tactile_map: TactileMap) -> dict[str, Any]:
     shape = shape[:, np.isfinite(shape).all(axis=0)]
     mean, covariance = shape.mean(axis=1), np.cov(shape)
     upper = covariance[np.triu_indices(3)]
-    felt = posterior.by_place(tactile_map) or (None,) * len(BY_PLACE)
     return {
         "detected": True,
         "amplitude": float(np.exp(mean[0])),
         "sigma_x_mm": float(np.exp(mean[1] + mean[2])),
         "sigma_y_mm": float(np.exp(mean[1] - mean[2])),
         **{name: float(value) for name, value in zip(SHAPE_COVARIANCE, upper, strict=True)},
-        **dict(zip(BY_PLACE, felt, strict=True)),
     }
 
 
@@ -216,7 +205,7 @@ def table_bodies(columns: Mapping[str, Sequence[float]]) -> dict[str, tuple[floa
 def population_table(columns: Mapping[str, Sequence[float | None]]) -> PopulationTable:
     """Detected rows of a table with the fields of `MassRow`, in the form for learning.
 
-    A row without a profile of the head, or without the figures by the lump's place, has NaN for them.
+    A row without a profile of the head has NaN for it.
     """
     kept = [i for i, found in enumerate(columns["detected"]) if found]
 
@@ -229,7 +218,7 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
     sigma_x, sigma_y = np.log(column("sigma_x_mm")), np.log(column("sigma_y_mm"))
     varied = {name: column(name) for name in UNKNOWNS if name in columns}
     varied = {"depth_mm": column("depth_ratio") * column("d_mm"), **varied}
-    profile, by_place = (_figures(columns, kept, names) for names in (HEAD_PROFILE, BY_PLACE))
+    profile = _figures(columns, kept, HEAD_PROFILE)
     boundary = (column("depth_ratio") + column("seat") / 2) * column("d_mm")
     return PopulationTable(
         body=np.array([columns["body"][i] for i in kept]),
@@ -240,7 +229,6 @@ def population_table(columns: Mapping[str, Sequence[float | None]]) -> Populatio
         covariance=covariance,
         unknowns={name: np.log(varied[name]) if name in LOGGED else varied[name] for name in UNKNOWNS},
         profile=profile,
-        by_place=by_place,
         log_fat=None if profile is None else np.log(boundary),
     )
 

@@ -46,8 +46,8 @@ from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII
 from tactile_bayes.presets import Method
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.elongation import ShapePrior
-from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.shape_draws import ShapeDraws
 
@@ -136,7 +136,7 @@ def settings(method: str, seed: int, *, size: str = "", cosines: int | None = No
 
 
 def ranks_of_map(
-    index: int, *, method: Method, seed: int, calibration: LogQuadratic | None = None, cosines: int | None = None
+    index: int, *, method: Method, seed: int, calibration: BodyCalibration | None = None, cosines: int | None = None
 ) -> MapRanks:
     """Draw a map from the prior, estimate it and rank its truth; seed and index fix all random numbers.
 
@@ -201,7 +201,7 @@ def other_rises(maps: list[MapRanks]) -> OtherRises:
 
 
 def _ranks_in(
-    posterior: MapPosterior, truth: Truth, rng: np.random.Generator, calibration: LogQuadratic | None
+    posterior: MapPosterior, truth: Truth, rng: np.random.Generator, calibration: BodyCalibration | None
 ) -> tuple[int, ...]:
     """Ranks of a truth in a subset of the joint draws, the same subset for every parameter."""
     number = posterior.x_mm.size
@@ -216,7 +216,7 @@ def _ranks_in(
     return (*ranks, int(np.sum(sizes < _sizes(true, calibration, rng)[0])))
 
 
-def _sizes(bumps: Mapping[str, FloatArray], calibration: LogQuadratic, rng: np.random.Generator) -> FloatArray:
+def _sizes(bumps: Mapping[str, FloatArray], calibration: BodyCalibration, rng: np.random.Generator) -> FloatArray:
     """(n,) sizes in mm, one per bump; without a rise there is none, which ranks as small."""
     a, sigma_x, sigma_y = (bumps[name] for name in PARAMETERS[:3])
     draws = ShapeDraws.of(a, sigma_x, sigma_y, np.zeros_like(a))

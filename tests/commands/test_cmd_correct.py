@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ import tactile_bayes as tb
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.fat_process import FatProcess
 
 DEMO = Path(tb.__file__).parent / "demo"
 RECIPE = {"normalise": "gain", "background": "free", "fit_radius_mm": 20, "noise": "field"}
@@ -71,12 +69,8 @@ def test_the_report_tells_the_shift_and_what_is_odd(folder: Path) -> None:
 
 
 def test_estimate_adds_the_shift_and_says_by_what(folder: Path) -> None:
-    """The shift is on top of sizes without figures by place: phantoms given by their bumps have none."""
     words = ("estimate", "demo.nc", "--method", "laplace", "--json", "--size-calibration")
-    base = solid()
-    assert isinstance(base.with_fat, FatProcess)
-    without_places = replace(base, with_fat=base.with_fat.without_places())
-    plain = tb.estimate(folder / "demo.nc", method="laplace", size_calibration=without_places).answer.document
+    plain = tb.estimate(folder / "demo.nc", method="laplace", size_calibration="solid").answer.document
     done = json.loads(run_here(*words, "phantoms.json", cwd=folder).stdout)
     site = body_calibration(folder / "phantoms.json").site
     assert site is not None
@@ -115,7 +109,7 @@ def test_show_describes_the_correction_and_its_base(folder: Path) -> None:
     assert found["correction"]["phantoms"] == 12
     low, high = found["correction"]["percent_interval"]
     assert low < found["correction"]["percent"] < high
-    assert found["base"]["form"] == "gaussian-process"
+    assert found["base"]["form"] == "population"
     assert "correction" in run_here("show", "phantoms.json", cwd=folder).stdout
 
 
@@ -130,7 +124,7 @@ def test_python_gives_what_the_file_holds(folder: Path) -> None:
     assert one.max_size_mm is not None and two.max_size_mm is not None  # noqa: PT018
     assert one.max_size_mm.median == pytest.approx(two.max_size_mm.median, rel=1e-6)
     with pytest.raises(TypeError, match="leave them out"):
-        tb.calibrate_size(table(), correct="solid", form="log-quadratic")
+        tb.calibrate_size(table(), correct="solid", form="eq6-residual")
 
 
 def test_map_files_are_estimated_and_keep_the_depth_of_fat(folder: Path) -> None:

@@ -59,8 +59,7 @@ def test_each_shipped_calibration_opens_and_says_what_it_was_made_of(name: str) 
     assert path is not None
     document = json.loads(path.read_text())
     read_size_calibration(path)  # trusted: what comes with the program is held against its schema here
-    schemas = {"gaussian-process": "size_quadratic", "log-quadratic": "size_quadratic"}
-    schemas |= {"eq6-population": "size_population_eq6", "eq6": "size_calibration"}
+    schemas = {"population": "size_population", "eq6": "size_calibration"}
     check_document(document, f"{schemas[document['form']]}.schema.json", path=path)
     assert document["provenance"]["command"].startswith("calibrate size")
     assert document["provenance"]["inputs"]

@@ -82,11 +82,10 @@ def test_a_posterior_tells_its_method_draws_and_origin(folder: Path) -> None:
 def test_a_calibration_of_the_program_is_known_by_its_name_and_tells_all_its_parts(tmp_path: Path) -> None:
     found = json.loads(run_here("show", "solid", "--json", cwd=tmp_path).stdout)
     stored = json.loads((Path(tactile_bayes.__file__).parent / "calibrations" / "solid.json").read_text())
-    assert found["with_depth_of_fat"]["body_skewness"] == stored["fat_process"]["hidden"]["skewness"]
-    by_place, place = found["with_figures_by_place"], stored["fat_process"]["with_places"]
-    assert by_place["body_skewness"] == place["hidden"]["skewness"] > 0
-    assert by_place["other_sd"] == place["other_sd"] > 0
-    assert 0 < by_place["map_factor"] == place["map_factor"] < 1 < found["with_depth_of_fat"]["map_factor"]
+    assert found["constants"] == stored["constants"]
+    assert found["residual_points"] == len(stored["residual"]["points"]) == 100
+    assert found["fat_mm"] == stored["depth"]["fat_mm"]
+    assert found["other_source"] == stored["spread"]["other_source"] == "16 lumps of other_simulator.csv"
 
 
 def test_a_file_goes_before_a_calibration_of_its_name(tmp_path: Path) -> None:

@@ -195,9 +195,8 @@ def test_a_key_of_a_few_parts_is_no_long_one() -> None:
 
 @pytest.mark.parametrize(
     "place",
-    [("covariance",), ("hidden", "expected"), ("hidden", "covariance"), ("fat_process", "hidden", "expected"),
-     ("fat_process", "covariance_factor"), ("fat_process", "kernel", "points"),
-     ("fat_process", "depth", "information_inverse")],
+    [("eq6", "covariance"), ("hidden", "expected"), ("hidden", "covariance"), ("spread", "covariance"),
+     ("residual", "covariance_factor"), ("residual", "points"), ("depth", "information_inverse")],
     ids=".".join,
 )  # fmt: skip
 def test_a_calibration_with_a_short_row_is_one_line(place: tuple[str, ...], tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import ElementCalibration, Scan
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.fat_depth import head_profile
-from tactile_bayes.size.log_quadratic import LogQuadratic
 
 TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
 """By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""
@@ -52,11 +52,11 @@ def response(coefficients: np.ndarray, *, rows: int = 16, columns: int = 26) -> 
     return legendre.leggrid2d(x, y, coefficients)
 
 
-def shipped() -> LogQuadratic:
+def shipped() -> BodyCalibration:
     path = size_calibration_path(DEFAULT)
     assert path is not None
     calibration = read_size_calibration(path)
-    assert isinstance(calibration, LogQuadratic)
+    assert isinstance(calibration, BodyCalibration)
     return calibration
 
 

@@ -9,16 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plain_calibration import plain_calibration
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.between_maps import BetweenMaps
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.change import JointSizes, joint_sizes
 from tactile_bayes.size.elongation import ShapePrior
-from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import RoundLumps, RoundSpread
-from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, STRANGERS, SharedBody
@@ -30,31 +29,19 @@ ROUND = SizePriors(shape=ShapePrior(oval_probability=1e-9), another_exam=None)
 WHOLE = SharedBody(0.0, 1e6)
 
 
-def calibration(*, slope_variance: float = 1e-6) -> LogQuadratic:
-    """ln d = 2.5 + 0.3 u + v; the coefficient of v may be uncertain."""
-    covariance = np.eye(9) * 1e-6
-    covariance[2, 2] = slope_variance
-    return LogQuadratic(
-        centre=(-1.0, 1.5),
-        mean=np.array([2.5, 0.3, 1.0, 0.0, 0.0, 0.0, np.log(BODY_SD), 0.0, np.log(EXAM_SD)]),
-        covariance=covariance,
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
-        information_inverse=np.eye(6) * 1e-2,
-        most_leverage=1.0,
-        domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
-        recipe=Recipe("mean", "free", 20.0, False, "field"),
-    )
+def calibration(*, amplitude_variance: float = 1e-6) -> BodyCalibration:
+    return plain_calibration(body_sd=BODY_SD, exam_sd=EXAM_SD, amplitude_variance=amplitude_variance)
 
 
-def shape(log_size: float, *, seed: int = 0) -> ShapeDraws:
+def shape(log_size: float, *, seed: int = 0, u: float = 0.0) -> ShapeDraws:
     """Draws of a map whose size by the calibration is as given."""
     rng = np.random.default_rng(seed)
-    v = log_size - 2.5 + NOISE * rng.standard_normal(1000)
+    v = log_size - 2.5 - 0.3 * u + NOISE * rng.standard_normal(1000)
     q, r = (value + 0.01 * rng.standard_normal(1000) for value in (0.05, 0.0))
-    return ShapeDraws(np.full(1000, -1.0), v + 1.5, q, r)
+    return ShapeDraws(np.full(1000, -1.0 + u), v + 1.5, q, r)
 
 
-def joint(*visits: list[ShapeDraws], law: SharedBody = WHOLE, use: LogQuadratic | None = None, tau: float = EXAM_SD):
+def joint(*visits: list[ShapeDraws], law: SharedBody = WHOLE, use: BodyCalibration | None = None, tau: float = EXAM_SD):
     between = BetweenMaps(tau, 0.0)
     return joint_sizes(
         visits, calibration=use or calibration(), priors=ROUND, rng=np.random.default_rng(3), between=between, law=law
@@ -106,9 +93,9 @@ def test_visits_in_the_other_order_give_the_opposite_change():
 
 @pytest.mark.parametrize("growth", [0.0, 0.4])
 def test_an_uncertain_coefficient_matters_by_what_changes_of_its_term(growth):
-    """The term of v is v itself: two maps that differ by 0.4 in it differ by 0.4 times the coefficient's error."""
-    use = calibration(slope_variance=0.05**2)
-    change = joint([shape(2.6)], [shape(2.6 + growth, seed=1)], use=use).change(0, 1)
+    """The term of f is -u: two maps that differ by 0.4 in u differ by 0.4 times the coefficient's error."""
+    use = calibration(amplitude_variance=0.05**2)
+    change = joint([shape(2.6)], [shape(2.6 + growth, seed=1, u=growth)], use=use).change(0, 1)
     expected = 2 * (EXAM_SD**2 + NOISE**2) + (0.05 * growth) ** 2
     assert change.log_sd == pytest.approx(np.sqrt(expected), rel=0.05)
 
@@ -235,7 +222,7 @@ def test_the_law_is_that_of_what_the_maps_hide(profile, law):
     visits = [[replace(shape(p, seed=1), profile=profile)] for p in (2.5, 2.55)]
     shipped, rng = read_size_calibration(path), np.random.default_rng(1)
     found = joint_sizes(visits, calibration=shipped, priors=ROUND, rng=rng, number=512)
-    assert (found.calibrations[0].fat_mm is None) == (profile is None)
+    assert (found.calibration.fat_mm is None) == (profile is None)
     shared = law.correlation(np.array([float(np.nanmean(one)) for one in found.log_size]))
     assert found.correlation[0, 1] == pytest.approx(shared[0, 1], rel=0.05)
 

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plain_calibration import plain_calibration
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.elongation import (
     OVAL_SD,
     SHOWN,
@@ -19,29 +21,15 @@ from tactile_bayes.size.elongation import (
     shown_share,
     turn_matrix,
 )
-from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
-from tactile_bayes.size.log_quadratic import LogQuadratic
+from tactile_bayes.size.hidden import HiddenTerms
 from tactile_bayes.size.pooling import IRREGULAR_SD, SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.shape_draws import ShapeDraws
 
 BODY_SD = 0.08
 
 
-def calibration(*, body_sd: float = BODY_SD, hidden: HiddenTerms | None = None) -> LogQuadratic:
-    """ln d = 2.5 + 0.3 u + v, with coefficients known to 1e-3."""
-    mean = np.array([2.5, 0.3, 1.0, 0.0, 0.0, 0.0, np.log(body_sd), 0.0, np.log(0.02)])
-    return LogQuadratic(
-        centre=(-1.0, 1.5),
-        mean=mean,
-        covariance=np.eye(9) * 1e-6,
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
-        information_inverse=np.eye(6) * 1e-2,
-        most_leverage=1.0,
-        domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
-        recipe=Recipe("mean", "free", 20.0, False, "field"),
-        hidden=hidden,
-    )
+def calibration(*, body_sd: float = BODY_SD, hidden: HiddenTerms | None = None) -> BodyCalibration:
+    return plain_calibration(body_sd=body_sd, hidden=hidden)
 
 
 def shape(log_size: float, *, noise: float = 0.01, q: float = 0.05, r: float = 0.0, seed: int = 0, turn: float = 0.0):
@@ -53,7 +41,7 @@ def shape(log_size: float, *, noise: float = 0.01, q: float = 0.05, r: float = 0
     return ShapeDraws(np.full(n, -1.0), v + 1.5, q_draws, r_draws, turn)
 
 
-def pooled(maps, *, priors: SizePriors | None = None, use: LogQuadratic | None = None, seed: int = 3):
+def pooled(maps, *, priors: SizePriors | None = None, use: BodyCalibration | None = None, seed: int = 3):
     return pooled_size(
         maps, calibration=use or calibration(), priors=priors or SizePriors(), rng=np.random.default_rng(seed),
         number=20_000,

@@ -1,4 +1,4 @@
-"""Eq 6 over a population of bodies, against tables made from known constants, and what it refuses."""
+"""A calibration over a population of bodies, against tables made from known constants, and what it refuses."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ import pytest
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.size_json import read_size_calibration, write_body_calibration
+from tactile_bayes.files.size_json import read_size_calibration
+from tactile_bayes.files.size_population_json import write_population
 from tactile_bayes.head_shape import DEFAULT_HEAD
+from tactile_bayes.size.body_calibration import UNLIKE_SD, BodyCalibration
 from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.learn.eq6_population import learn_population_eq6
+from tactile_bayes.size.learn.left_out import learn_other_sd, sized
+from tactile_bayes.size.learn.population import learn_population
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
-from tactile_bayes.size.population_eq6 import PopulationEq6
 from tactile_bayes.size.shape_draws import ShapeDraws
 
 RECIPE = Recipe("gain", "free", 20.0, False, "field", False)
@@ -57,14 +59,19 @@ def table(bodies: int = 250, *, seed: int = 1, fat: bool = True, fat_matters: bo
     )
 
 
-@pytest.fixture(scope="module")
-def learned() -> PopulationEq6:
-    return learn_population_eq6(table(), recipe=RECIPE)
+def learn_eq6(full: PopulationTable, *, recipe: Recipe = RECIPE) -> BodyCalibration:
+    """Eq 6 alone: the table's law has nothing else."""
+    return learn_population(full, recipe=recipe, residual=False)
 
 
 @pytest.fixture(scope="module")
-def plain() -> PopulationEq6:
-    return learn_population_eq6(table(400, fat=False, fat_matters=False), recipe=RECIPE)
+def learned() -> BodyCalibration:
+    return learn_eq6(table(), recipe=RECIPE)
+
+
+@pytest.fixture(scope="module")
+def plain() -> BodyCalibration:
+    return learn_eq6(table(400, fat=False, fat_matters=False), recipe=RECIPE)
 
 
 def profile(w: float) -> tuple[float, ...]:
@@ -83,9 +90,9 @@ def test_the_constants_of_the_paper_are_found(plain) -> None:
     assert sd[2] < 0.8
 
 
-def test_the_printed_constants_give_the_size(learned) -> None:
+def test_the_printed_constants_give_the_size(learned, plain) -> None:
     """Eq 6 with the constants as printed is the calibration's own size, at each depth and width."""
-    for one in (learned, learned.at_fat([profile(0.5)])):
+    for one in (plain, learned.at_fat([profile(0.5)])):
         for a, sigma in ((0.2, 3.0), (0.8, 6.0)):
             c = one.constants(sigma)
             by_hand = c["m"] * sigma / (c["e"] * a ** c["f"]) + c["b_mm"]
@@ -98,10 +105,26 @@ def test_sizes_follow_the_depth_of_fat(learned) -> None:
         at = learned.at_fat([profile(w)])
         assert at.fat_mm == pytest.approx(np.exp(LOG_FAT + w), rel=1e-3)
         np.testing.assert_allclose(at.log_size(np.log(a), np.log(sigma)), np.log(eq6(a, sigma, w)), atol=0.06)
-    bare = learned.at_fat([None])
+    fit = learned.fit
+    assert fit["body_sd"] == pytest.approx(np.hypot(BODY_SD, 0.12 / np.sqrt(12)), rel=0.2)
+    assert fit["exam_sd"] == pytest.approx(EXAM_SD, rel=0.3)
+    assert fit["left_out_held_percent"] == pytest.approx(90, abs=5)
+
+
+def test_without_a_profile_sizes_are_averaged_over_the_depths_that_go_with_the_map(learned) -> None:
+    """The size is the mean over bodies of any depth, and their spread is part of SD(B)."""
+    bare, here = learned.at_fat([None]), (np.array([-1.0]), np.array([1.5]))
     assert bare.fat_mm is None
-    assert np.abs(bare.log_size(np.log(a), np.log(sigma)) - np.log(eq6(a, sigma, 0.5))).max() > 0.15
-    assert np.exp(learned.mean[-3]) > 2 * np.exp(at.mean[-3])
+    assert "no pressure profile" in bare.fat_note
+    w = np.random.default_rng(4).normal(0.0, 0.4, 20_000)
+    sizes = np.log(eq6(np.exp(-1.0), np.exp(1.5), w))
+    assert bare.log_size(*here)[0] == pytest.approx(sizes.mean(), abs=0.08)
+    own = learned.at_fat([profile(0.0)]).body_sd(*here, np.zeros(1))[0]
+    assert bare.body_sd(*here, np.zeros(1))[0] == pytest.approx(np.hypot(own, sizes.std()), rel=0.1)
+    new = table(150, seed=8)
+    told, silent = sized(learned, new), sized(learned, replace(new, profile=None))
+    assert silent.error.std() > 2 * told.error.std()
+    assert np.mean(np.abs(silent.error) < 1.96 * np.sqrt(silent.variance)) == pytest.approx(0.95, abs=0.04)
 
 
 def test_the_depth_of_other_bodies_is_worth_nothing() -> None:
@@ -109,10 +132,66 @@ def test_the_depth_of_other_bodies_is_worth_nothing() -> None:
     full = table(200)
     order = np.random.default_rng(3).permutation(200)
     rows = (2 * order[:, None] + np.arange(2)).ravel()
-    shuffled = learn_population_eq6(
-        replace(full, profile=full.profile[rows], log_fat=full.log_fat[rows]), recipe=RECIPE
-    )
-    assert shuffled.with_fat.fit["left_out_sd"] > 0.95 * shuffled.fit["left_out_sd"]
+    shuffled = learn_eq6(replace(full, profile=full.profile[rows], log_fat=full.log_fat[rows]))
+    assert shuffled.fit["left_out_sd"] > 0.95 * learn_eq6(replace(full, profile=None)).fit["left_out_sd"]
+
+
+def test_what_eq6_leaves_is_learned_and_a_law_without_it_has_none() -> None:
+    """A ripple in ln a that Eq 6 does not follow; the control has none."""
+    full, new = table(300), table(150, seed=5)
+
+    def rippled(one: PopulationTable) -> PopulationTable:
+        return replace(one, d_mm=one.d_mm * np.exp(0.2 * np.sin(2.0 * one.log_amplitude)))
+
+    with_it, alone = (learn_population(rippled(full), recipe=RECIPE, residual=one) for one in (True, False))
+    errors = [sized(one, rippled(new)).error.std() for one in (with_it, alone)]
+    assert errors[0] < 0.7 * errors[1]
+    assert with_it.constants() == pytest.approx(alone.constants())
+    plain = learn_population(full, recipe=RECIPE)
+    assert sized(plain, new).error.std() == pytest.approx(sized(learn_eq6(full), new).error.std(), rel=0.05)
+    # far from all bodies it is Eq 6 alone
+    at = (np.array([-40.0]), np.array([1.5]))
+    far = with_it.at_fat([profile(0.0)]), alone.at_fat([profile(0.0)])
+    assert far[0].log_size(*at) == pytest.approx(far[1].log_size(*at))
+
+
+@pytest.mark.parametrize("more", [0.0, 0.15])
+def test_lumps_of_another_origin_tell_how_far_such_sizes_are_off(learned, more: float) -> None:
+    """Within the interval that the fit states; lumps of the same origin add nothing."""
+    new = table(40, seed=6)
+    off = more * np.random.default_rng(7).standard_normal(40)
+    others = replace(new, d_mm=new.d_mm * np.exp(off[new.body.astype(int)]))
+    found = learn_other_sd(learned, others, source="others")
+    assert found.other_sd == pytest.approx(more, abs=0.05)
+    assert found.other_sd <= found.fit["other_sd_most"] < more + 0.12
+    assert found.fit["other_standard_sd"] == pytest.approx(1.0, abs=0.15)
+    assert found.other_source == "others"
+
+
+def test_a_profile_unlike_the_tables_leaves_room_for_another_kind_of_body(learned) -> None:
+    """And a map without a profile does not: it says nothing of the body."""
+    unlike, without = learned.at_fat([(30.0, 0.0, 0.0)]), learned.at_fat([None])
+    assert unlike.fat_mm is without.fat_mm is None
+    assert (unlike.other_sd, without.other_sd) == (UNLIKE_SD, 0.0)
+    here = np.array([-1.0]), np.array([1.5]), np.zeros(1)
+    assert unlike.body_sd(*here) == pytest.approx(np.hypot(without.body_sd(*here), UNLIKE_SD))
+    assert "allows 10 % (SD) more" in " ".join(unlike.omissions())
+    assert "allows" not in " ".join(without.omissions())
+    assert unlike.at_fat([profile(0.0)]) is unlike
+
+
+def test_a_map_unlike_the_tables_at_its_depth_is_sized_at_any_depth(learned) -> None:
+    at = learned.at_fat([profile(0.0)])
+    far = at.fitting(np.exp(8.0), np.exp(4.0))
+    assert (far.fat_mm, far.other_sd) == (None, UNLIKE_SD)
+    assert at.fitting(np.exp(-1.0), np.exp(1.5)) is at
+
+
+def test_maps_of_a_mass_share_their_depth_of_fat(learned) -> None:
+    between = learned.at_fat([profile(-0.2), profile(0.2), None, (30.0, 0.0, 0.0)])
+    assert between.fat_mm == pytest.approx(np.exp(LOG_FAT), rel=0.02)
+    assert learned.depth.apart([profile(0.1), profile(0.1)]) is None
+    assert learned.depth.apart([profile(-0.5), profile(0.5)]) == pytest.approx(np.exp([2.1, 3.1]), rel=0.05)
 
 
 def test_terms_are_derivatives_by_the_coefficients(learned) -> None:
@@ -132,23 +211,23 @@ def test_terms_are_derivatives_by_the_coefficients(learned) -> None:
 def test_errors_of_bodies_left_out_are_those_of_refitting() -> None:
     """Closed form on the tangent against learning anew without each tenth of the bodies."""
     full = table(120, fat=False, fat_matters=False)
-    closed = learn_population_eq6(full, recipe=RECIPE).fit["left_out_mae_percent"]
+    closed = learn_eq6(full, recipe=RECIPE).fit["left_out_mae_percent"]
     errors = []
     for fold in range(10):
         out = full.body % 10 == fold
-        one = learn_population_eq6(full.rows(~out), recipe=RECIPE)
+        one = learn_eq6(full.rows(~out), recipe=RECIPE)
         log_size = one.log_size(full.log_amplitude[out], full.log_width[out])
         errors.append(np.abs(np.expm1(log_size.reshape(-1, 2).mean(axis=1) - np.log(full.d_mm[out][::2]))))
     assert closed == pytest.approx(100 * np.mean(np.concatenate(errors)), rel=0.1)
 
 
-def coverage(calibration: PopulationEq6, *, shrink: float = 1.0) -> float:
+def coverage(calibration: BodyCalibration, *, shrink: float = 1.0) -> float:
     """Share of 60 new bodies in their 90 % interval, by the spread between bodies times `shrink`."""
     new, held = table(60, seed=9), 0
     for i in range(0, len(new), 2):
         at = calibration.at_fat([tuple(new.profile[i])])
         mean = at.mean.copy()
-        mean[-3] += np.log(shrink)
+        mean[at.coefficients] += np.log(shrink)
         shape = (np.full(128, one[i]) for one in (new.log_amplitude, new.log_width, new.half_log_ratio))
         draws = ShapeDraws(*shape, np.zeros(128))
         size = pooled_size(
@@ -190,22 +269,22 @@ def test_a_map_beyond_the_table_is_told(learned, amplitude, sigma, words) -> Non
 
 
 def test_a_negative_size_is_none(learned) -> None:
-    low = replace(learned, mean=np.concatenate([learned.mean[:2], [-50.0], learned.mean[3:]]))
+    low = replace(learned, mean=np.where(np.arange(len(learned.mean)) == 12, -50.0, learned.mean))
     assert np.isnan(low.log_size(np.array(-1.0), np.array(1.0)))
 
 
 def test_a_table_without_depths_has_e_one_by_convention() -> None:
     bare = replace(table(60, fat=False), unknowns={})
-    assert learn_population_eq6(bare, recipe=RECIPE).constants()["e"] == 1.0
+    assert learn_eq6(bare, recipe=RECIPE).constants()["e"] == 1.0
     with pytest.raises(BadDataError, match="at least 20"):
-        learn_population_eq6(table(12, fat=False), recipe=RECIPE)
+        learn_eq6(table(12, fat=False), recipe=RECIPE)
 
 
 def test_a_file_holds_what_was_learned(learned, tmp_path: Path) -> None:
     path = tmp_path / "eq6.json"
-    write_body_calibration(path, learned, provenance=Provenance("calibrate size", {}, {}))
+    write_population(path, learned, provenance=Provenance("calibrate size", {}, {}))
     back = read_size_calibration(path)
-    assert isinstance(back, PopulationEq6)
+    assert isinstance(back, BodyCalibration)
     assert back.constants() == pytest.approx(learned.constants(), rel=1e-7)
     one, other = back.at_fat([profile(0.3)]), learned.at_fat([profile(0.3)])
     np.testing.assert_allclose(one.mean, other.mean, rtol=1e-7)
@@ -217,15 +296,16 @@ def test_a_file_holds_what_was_learned(learned, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"mean": [0.0] * 5}, "mean"),
+        ({"eq6": {"powers": [], "mean": [0.0] * 5, "covariance": [], "log_amplitude_one_deep": 0.0}}, "mean"),
         ({"most_leverage": 0}, "most_leverage"),
-        ({"parameters": ["m"]}, "parameters"),
+        ({"surplus": 1}, "surplus"),
+        ({"depth": None}, "mean is no finite array"),
         ({"form": "eq7"}, "residual_correlation"),
     ],
 )
 def test_a_broken_file_is_refused(learned, tmp_path: Path, change, words) -> None:
     path = tmp_path / "eq6.json"
-    write_body_calibration(path, learned, provenance=Provenance("calibrate size", {}, {}))
+    write_population(path, learned, provenance=Provenance("calibrate size", {}, {}))
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(BadDataError, match=words):
         read_size_calibration(path)

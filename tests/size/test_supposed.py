@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from test_pooling import BODY_SD, calibration, pooled, shape
 
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.hidden import HiddenTerms
-from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import SizePriors
 
 
-def knowing(*, inverted: tuple[str, ...] = ()) -> LogQuadratic:
+def knowing(*, inverted: tuple[str, ...] = ()) -> BodyCalibration:
     """A calibration whose B goes with stiffness and seat, which go with each other."""
     expected = np.zeros((2, 6))
     expected[:, 0] = 0.05 if inverted else np.log(30.0), 0.6

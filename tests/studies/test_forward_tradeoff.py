@@ -24,9 +24,9 @@ from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document, tradeoff_text
+from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
-from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.studies.forward_tradeoff import (
@@ -144,7 +144,7 @@ def test_eq_6_is_learned_axis_by_axis_and_says_what_it_leaves() -> None:
 
 
 @functools.cache
-def shipped(name: str) -> SizeCalibration | LogQuadratic:
+def shipped(name: str) -> SizeCalibration | BodyCalibration:
     path = size_calibration_path(name)
     assert path is not None
     return read_size_calibration(path)
@@ -153,7 +153,7 @@ def shipped(name: str) -> SizeCalibration | LogQuadratic:
 def test_a_quadratic_gives_the_median_of_what_estimate_draws() -> None:
     """Draws of a map that says a and the widths exactly, through all that `estimate` adds: a round lump's median."""
     quadratic = shipped("solid-mean")
-    assert isinstance(quadratic, LogQuadratic)
+    assert isinstance(quadratic, BodyCalibration)
     a, x, y = 0.3, 5.2, 4.0
     rule = calibrated_rule(quadratic, name="solid.json")
     (size,) = rule.sizes(a, x, y)

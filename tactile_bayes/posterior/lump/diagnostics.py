@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import field
 
-from tactile_bayes.presets import BY_PLACE
 from tactile_bayes.records import dataclass
 
 
@@ -57,8 +56,6 @@ class Diagnostics:
         Cells in the fit window, and the share of it that they cover.
     fat_mm
         Depth of fat that the size is for; None where the map does not give it.
-    by_place, by_place_used
-        Figures `presets.BY_PLACE` of the lump, None where the map has none; whether the size is by them.
     method, sampler
         The method that drew, and its own figures.
     noise
@@ -83,8 +80,6 @@ class Diagnostics:
     size_calibration: str = ""
     repeatability: str = ""
     convergence: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    by_place: tuple[float, ...] | None = None
-    by_place_used: bool = False
 
     def as_dict(self) -> dict[str, object]:
         """The diagnostics as plain data."""
@@ -97,8 +92,6 @@ class Diagnostics:
             "cells": self.cells,
             "covered_share": self.covered_share,
             "fat_mm": self.fat_mm,
-            "by_place": None if self.by_place is None else dict(zip(BY_PLACE, self.by_place, strict=True)),
-            "by_place_used": self.by_place_used,
             **self.sampler,
             **self.noise.as_dict(),
             "method": self.method,

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.bump_by_place import Bump, by_place
-from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.records import dataclass
 
 
@@ -20,7 +18,7 @@ class MapPosterior:
         Mean and SD of r, the half log axis ratio 45 degrees from the map's x axis, where the draws have none and it was
         measured beside them; None otherwise.
     irregular
-        Whether the bump is less regular than a ball's, see `correlated.outline` and `BodyCalibration.unlike_places`.
+        Whether the bump is less regular than a ball's, see `correlated.outline`.
     """
 
     amplitude: FloatArray
@@ -39,13 +37,3 @@ class MapPosterior:
         """Posterior medians of amplitude, sigma_x_mm and sigma_y_mm."""
         amplitude, x, y = (float(np.median(v)) for v in (self.amplitude, self.sigma_x_mm, self.sigma_y_mm))
         return amplitude, x, y
-
-    def by_place(self, tactile_map: TactileMap) -> tuple[float, ...] | None:
-        """The map's figures `presets.BY_PLACE` of the bump at the posterior medians; None where it has none."""
-        if tactile_map.frames is None or tactile_map.head is None:
-            return None
-        amplitude, one, two = self.medians
-        x, y, angle = (float(np.median(values)) for values in (self.x_mm, self.y_mm, self.angle_rad))
-        along_x = float(np.hypot(one * np.cos(angle), two * np.sin(angle)))
-        along_y = float(np.hypot(one * np.sin(angle), two * np.cos(angle)))
-        return by_place(tactile_map.frames, tactile_map.head, Bump(amplitude, x, y, along_x, along_y))

@@ -11,7 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import LEAST_HARD_RATIO
 from tactile_bayes.size.eq6 import AxisCalibration, LeftOutErrors
 from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode, width_changes
-from tactile_bayes.size.log_quadratic import quadratic_terms
+from tactile_bayes.size.polynomials import monomials, powers
 
 LEAST_GEOMETRIES = 8
 """A quadratic has six coefficients, and one geometry is missing from each fit."""
@@ -120,7 +120,7 @@ def _eq6(table: SizeTable, sigma_mm: FloatArray, fit: FitAxis) -> _Predict:
 
 def _quadratic(table: SizeTable, sigma_mm: FloatArray) -> _Predict:
     u, v = np.log(table.amplitude), np.log(sigma_mm)
-    terms = quadratic_terms(u - u.mean(), v - v.mean())
+    terms = monomials((u - u.mean(), v - v.mean()), powers(2))
 
     def predict(kept: _Rows) -> FloatArray:
         coefficients = np.linalg.lstsq(terms[kept], np.log(table.d_mm[kept]), rcond=None)[0]

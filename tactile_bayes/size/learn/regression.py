@@ -5,32 +5,25 @@ For the means over the exams of body j, with what the maps themselves leave open
 .. math:: \ln d_j = \bar x_j^T\beta + B_j + \bar E_j, \quad B_j \sim N(0, s_j^2),\;
           \bar E_j \sim N(0, (t^2 + \bar m_j) / n_j).
 
-t comes from how the exams of one body differ in :math:`x^T\beta`, and so does a factor of m where one is sought. That
-difference says nothing of beta: a body has one diameter, so within it a regression of d on the map has slope 0 (errors
-in variables). Coefficients, spread between bodies and spread between exams are so told apart, and a patient's map adds
-its own m and nothing twice.
+t comes from how the exams of one body differ in :math:`x^T\beta`. That difference says nothing of beta: a body has one
+diameter, so within it a regression of d on the map has slope 0 (errors in variables). Coefficients, spread between
+bodies and spread between exams are so told apart, and a patient's map adds its own m and nothing twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import ndtri
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.laplace import mode_and_covariance
-from tactile_bayes.presets import HELD
 
 LEAST_BODIES = 20
-Terms = Callable[[FloatArray, FloatArray], FloatArray]
-"""Takes (n,) ln a and p of a table's rows to (n, k) terms."""
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
-_MAP_FACTOR_SD = 1.0
-"""Width of the prior on the log of kappa, about 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,8 +44,6 @@ class PopulationTable:
         `presets.HEAD_PROFILE` of each map, NaN for a map without; None where no map has it.
     log_fat : (n,) array
         ln of the depth of the fat-gland boundary in mm; None with `profile`.
-    by_place : (n, 6) array
-        `presets.BY_PLACE` of each map, NaN for a map without; None where no map has them.
     """
 
     body: np.ndarray[tuple[int], np.dtype[np.generic]]
@@ -64,7 +55,6 @@ class PopulationTable:
     unknowns: Mapping[str, FloatArray] = field(default_factory=dict)
     profile: FloatArray | None = None
     log_fat: FloatArray | None = None
-    by_place: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.d_mm)
@@ -81,7 +71,6 @@ class PopulationTable:
             {name: values[keep] for name, values in self.unknowns.items()},
             None if self.profile is None else self.profile[keep],
             None if self.log_fat is None else self.log_fat[keep],
-            None if self.by_place is None else self.by_place[keep],
         )
 
 
@@ -93,13 +82,10 @@ class ExamSpread:
     ----------
     log_sd, variance
         Posterior mean and variance of ln t, t beyond the maps' own noise.
-    map_factor
-        Kappa: how many times a map's own variance of ln d counts.
     """
 
     log_sd: float
     variance: float
-    map_factor: float = 1.0
 
     @property
     def sd(self) -> float:
@@ -129,15 +115,6 @@ class BodyRegression:
     mean_terms: FloatArray
     mean_log_d: FloatArray
     mean_u: FloatArray
-
-    @classmethod
-    def of(cls, table: PopulationTable, terms_of: Terms) -> BodyRegression:
-        """The regression of a table on the terms of its ln a and p."""
-        terms = terms_of(table.log_amplitude, table.log_width)
-        nothing = np.zeros((2, len(table)))
-        by_terms = cls.linear(table, terms, u=terms[:, 1], constant=nothing[0], slope=nothing)
-        slope = _slopes(table, terms_of) @ by_terms.least_squares()
-        return replace(by_terms, map_variance=_map_variance(table, slope))
 
     @classmethod
     def linear(
@@ -174,27 +151,19 @@ class BodyRegression:
         """(k,) ordinary least-squares coefficients from the bodies' means."""
         return np.asarray(np.linalg.lstsq(self.mean_terms, self.mean_log_d, rcond=None)[0])
 
-    def exam_spread(self, coefficients: FloatArray, map_factors: FloatArray | None = None) -> ExamSpread:
-        """Spread of sizes between exams of a body beyond their maps' own noise.
+    def exam_spread(self, size: FloatArray) -> ExamSpread:
+        """Spread of sizes between exams of a body beyond their maps' own noise, by t on a grid.
 
-        Squares of a body's exams about their mean are :math:`(t^2 + \\kappa m) \\chi^2`, m the mean variance of its
-        maps: a clear lump, whose maps have little noise, tells more of t than a faint one, and both together tell
-        kappa. Without bodies examined twice, the priors.
+        Squares of a body's exams about their mean are :math:`(t^2 + m) \\chi^2`, m the mean variance of its maps.
+        Without bodies examined twice, the prior.
 
         Parameters
         ----------
-        map_factors : (f,) array
-            Kappa is the most probable of these; None takes 1 as known.
+        size : (n,) array
+            ln d by each map.
         """
-        tried = [self._exam_spread(coefficients, one) for one in (np.ones(1) if map_factors is None else map_factors)]
-        return max(tried, key=lambda one: one[1])[0]
-
-    def _exam_spread(self, coefficients: FloatArray, map_factor: float) -> tuple[ExamSpread, float]:
-        """For one kappa, by t on a grid, with its log evidence."""
-        k = self.terms.shape[1]
-        size = self.terms @ coefficients[:k] + self.constant
         square = np.bincount(self.group, (size - self.mean(size)[self.group]) ** 2)
-        freedom, noise = self.exams - 1.0, map_factor * self.mean(self.map_variance)
+        freedom, noise = self.exams - 1.0, self.mean(self.map_variance)
         centre, width = _PRIOR[2]
         log_t = centre + width * np.linspace(-4.0, 4.0, 401)
         variance = np.exp(2.0 * log_t)[:, None] + noise
@@ -202,12 +171,11 @@ class BodyRegression:
         log_p -= 0.5 * ((log_t - centre) / width) ** 2
         p = np.exp(log_p - log_p.max())
         mean = float(p @ log_t / p.sum())
-        found = ExamSpread(mean, float(p @ (log_t - mean) ** 2 / p.sum()), float(map_factor))
-        return found, float(log_p.max() + np.log(p.sum()) - 0.5 * (np.log(map_factor) / _MAP_FACTOR_SD) ** 2)
+        return ExamSpread(mean, float(p @ (log_t - mean) ** 2 / p.sum()))
 
     def log_density(self, theta: FloatArray) -> FloatArray:
         """(m,) log posterior of (m, k + 2) coefficients, ln(sd between bodies) and its slope."""
-        exam = self.exam_spread(self.least_squares()).sd ** 2
+        exam = self.exam_spread(self.terms @ self.least_squares() + self.constant).sd ** 2
         residual = self.mean_log_d - theta[:, :-2] @ self.mean_terms.T
         variance = np.exp(2 * (theta[:, -2:-1] + theta[:, -1:] * self.mean_u))
         variance = variance + (exam + self.mean(self.map_variance)) / self.exams
@@ -215,22 +183,8 @@ class BodyRegression:
         prior = -0.5 * np.sum(((theta[:, -2:] - _PRIOR[:2, 0]) / _PRIOR[:2, 1]) ** 2, axis=1)
         return np.asarray(total + prior)
 
-    def bodies_left_out(self, mode: FloatArray) -> dict[str, FloatArray]:
-        """``body``, ``body_sd`` and ``variance`` of `hidden.hidden_terms`, (groups,) arrays."""
-        return {
-            "body": -left_out_errors(self.mean_terms, self.mean_log_d),
-            "body_sd": np.exp(mode[-3] + mode[-2] * self.mean_u),
-            "variance": self.left_out_variance(mode),
-        }
-
-    def left_out_variance(self, mode: FloatArray) -> FloatArray:
-        """(groups,) variance of ln d of each body left out, by the learned spreads."""
-        spread = np.exp(2 * (mode[-3] + mode[-2] * self.mean_u))
-        spread = spread + (np.exp(2 * mode[-1]) + self.mean(self.map_variance)) / self.exams
-        return np.asarray(spread / (1.0 - leverages(self.mean_terms)[1]))
-
     def posterior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of k coefficients, ln(sd between bodies), its slope, ln(sd between exams), as normal.
+        """Mean and covariance of the k coefficients, as normal, with a spread of bodies that changes with ln a.
 
         Raises
         ------
@@ -242,10 +196,7 @@ class BodyRegression:
         errors = np.sqrt(left * np.diag(np.linalg.inv(self.mean_terms.T @ self.mean_terms)))
         start, scale = np.append(b, _PRIOR[:2, 0]), np.append(errors, [0.1, 0.05])
         mode, covariance, _ = mode_and_covariance(self.log_density, start, scale=scale)
-        exam = self.exam_spread(mode)
-        covariance = np.pad(covariance, (0, 1))
-        covariance[-1, -1] = exam.variance
-        return np.append(mode, exam.log_sd), covariance
+        return mode[:-2], covariance[:-2, :-2]
 
 
 def leverages(features: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -257,21 +208,6 @@ def leverages(features: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
     """(n,) variance of ln d by the maps' own posteriors, for (2, n) slopes by ln a and p."""
     return np.asarray(np.einsum("in,nij,jn->n", slope, table.covariance[:, :2, :2], slope))
-
-
-def _slopes(table: PopulationTable, terms_of: Terms) -> FloatArray:
-    """(2, n, k) derivatives of the terms by ln a and p, by central differences."""
-    a, p, h = table.log_amplitude, table.log_width, 1e-4
-    by_a = (terms_of(a + h, p) - terms_of(a - h, p)) / (2 * h)
-    by_p = (terms_of(a, p + h) - terms_of(a, p - h)) / (2 * h)
-    return np.stack([by_a, by_p])
-
-
-def figures(table: PopulationTable, data: BodyRegression, mode: FloatArray) -> dict[str, float]:
-    """Number of rows, spreads, and errors cross-validated by body."""
-    error = left_out_errors(data.mean_terms, data.mean_log_d)
-    spreads = {"body_sd": float(np.exp(mode[-3])), "exam_sd": float(np.exp(mode[-1]))}
-    return error_figures(table, data, spreads, error, held(data, mode, error))
 
 
 def error_figures(
@@ -297,11 +233,6 @@ def error_figures(
         "left_out_bias_percent": float(100 * np.mean(np.expm1(error))),
         "left_out_held_percent": 100 * share_held,
     }
-
-
-def held(data: BodyRegression, mode: FloatArray, error: FloatArray) -> float:
-    """Share of held-out bodies whose size lies in the interval of probability `HELD`, by the learned spreads."""
-    return float(np.mean(np.abs(error) <= ndtri(0.5 + HELD / 2) * np.sqrt(data.left_out_variance(mode))))
 
 
 def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:

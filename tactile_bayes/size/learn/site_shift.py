@@ -15,6 +15,7 @@ as a normal of its mean and covariance.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,9 +24,9 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.learn.site_cautions import cautions_of, no_depth
-from tactile_bayes.size.mass_calibration import MassCalibration
+from tactile_bayes.size.map_sizes import log_sizes
 from tactile_bayes.size.shape_draws import ShapeDraws
-from tactile_bayes.size.site_shift import SiteShift, with_site
+from tactile_bayes.size.site_shift import SiteShift
 
 LEAST_PHANTOMS = 3
 SHARED = ("seat", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
@@ -208,7 +209,6 @@ def correct_calibration(
         maps=sum(row.maps for _, row in rows),
         base=base,
         uses_fat=uses_fat,
-        uses_places=2 * sum(row.uses_places for _, row in rows) > len(rows),
         fit=_figures(data, found, calibration.centre[1]),
         cautions=(
             *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
@@ -216,7 +216,7 @@ def correct_calibration(
         ),
         left_out=tuple(out),
     )
-    return with_site(calibration, site)
+    return replace(calibration, site=site)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +228,6 @@ class _Phantom:
     common: float
     maps: int
     uses_fat: bool
-    uses_places: bool
 
 
 def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phantom | str:
@@ -239,19 +238,16 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     for one in maps:
         used = used.fitting(*one.shape.middle)
     shapes = [one.shape for one in maps]
-    fitted = MassCalibration.of(used, [one.by_place for one in shapes])
-    used = fitted.mass
     for one in maps:
         note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
         if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
             return "; ".join(outside)
-    log_size = fitted.log_sizes(shapes)
+    log_size = log_sizes(used, shapes)
     log_a, log_width = (
         np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
     )
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
-    terms = fitted.mass.terms(log_a, log_width)
-    body_sd = used.body_and_error(terms, log_a, log_width, np.zeros(len(maps)))[0].mean()
+    body_sd = used.body_sd(log_a, log_width, np.zeros(len(maps))).mean()
     own_sd = float(used.own_sd(body_sd))
     expected, alone, together = _known(used, maps[0].known, (float(log_a.mean()), float(log_width.mean())), own_sd)
     n = len(maps)
@@ -264,8 +260,7 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
         map_variance=noise,
         common=float(np.sqrt(together)),
         maps=n,
-        uses_fat=used.fat_mm is not None or calibration.with_fat is None,
-        uses_places=not used.places_note,
+        uses_fat=used.fat_mm is not None or calibration.depth is None,
     )
 
 

@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.size_fat_json import _round_coefficients
-from tactile_bayes.files.size_parts_json import parse_round_spread
-from tactile_bayes.size.fat_depth import ROUND
-from tactile_bayes.size.hidden import RoundLumps, RoundSpread
+from tactile_bayes.size.hidden import RoundSpread
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.learn.round_lumps import learn_round
 from tactile_bayes.size.polynomials import monomials, powers
@@ -48,23 +44,3 @@ def test_maps_of_one_mass_average_what_each_is_off_and_not_the_bodys():
     spread = RoundSpread(0.01, 0.02, 3.0)
     assert spread.variance(np.array(0.0), maps=4) == pytest.approx(0.01**2 + 0.02**2 / 4)
     assert spread.variance(np.array(1e-4)) == pytest.approx(0.01**2 + 0.02**2 + 3e-4)
-
-
-def test_three_coefficients_of_an_earlier_file_are_a_plane():
-    plane = RoundLumps(np.array([0.05, -0.03, 0.01]), RoundSpread(0.04, 0.03))
-    u, v = np.array([0.5, -1.0]), np.array([0.2, 0.3])
-    np.testing.assert_allclose(plane.excess(u, v), 0.05 - 0.03 * u + 0.01 * v)
-    assert len(ROUND) == 10
-
-
-def test_files_of_earlier_versions_are_read_as_they_were():
-    powers_then = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]]
-    balls = {"coefficients": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], "body_sd": 0.04, "exam_sd": 0.03}
-    read = dict(zip(ROUND, _round_coefficients({"round_powers": powers_then, "round_lumps": balls}), strict=True))
-    expected = {tuple(power): value for power, value in zip(powers_then, balls["coefficients"], strict=True)}
-    assert read == {power: expected.get(power, 0.0) for power in ROUND}
-    assert parse_round_spread(balls) == RoundSpread(0.04, 0.03, 1.0)
-    with pytest.raises(BadDataError, match="5 coefficients of 6 terms"):
-        _round_coefficients(
-            {"round_powers": powers_then, "round_lumps": {**balls, "coefficients": [1.0, 2.0, 3.0, 4.0, 5.0]}}
-        )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plain_calibration import CENTRE, plain_calibration
 from scipy.integrate import quad
 from scipy.stats import binom, multivariate_normal
 
@@ -18,8 +19,7 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.body_calibration import BodyCalibration
 from tactile_bayes.size.elongation import ShapePrior
-from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
+from tactile_bayes.size.hidden import HiddenTerms
 from tactile_bayes.size.learn.site_shift import (
     LACK,
     PhantomMap,
@@ -28,27 +28,14 @@ from tactile_bayes.size.learn.site_shift import (
     correct_calibration,
     shift_posterior,
 )
-from tactile_bayes.size.log_quadratic import LogQuadratic
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.shape_draws import ShapeDraws
-from tactile_bayes.size.site_shift import with_site
 
-BODY_SD, EXAM_SD, CENTRE = 0.10, 0.03, (-1.0, 1.5)
+BODY_SD, EXAM_SD = 0.10, 0.03
 
 
-def calibration(*, hidden: HiddenTerms | None = None) -> LogQuadratic:
-    """ln d = 2.5 + 0.3 u + v, with coefficients known to 1e-3."""
-    return LogQuadratic(
-        centre=CENTRE,
-        mean=np.array([2.5, 0.3, 1.0, 0.0, 0.0, 0.0, np.log(BODY_SD), 0.0, np.log(EXAM_SD)]),
-        covariance=np.eye(9) * 1e-6,
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
-        information_inverse=np.eye(6) * 1e-2,
-        most_leverage=1.0,
-        domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
-        recipe=Recipe("gain", "free", 20.0, False, "field"),
-        hidden=hidden,
-    )
+def calibration(*, hidden: HiddenTerms | None = None) -> BodyCalibration:
+    return plain_calibration(body_sd=BODY_SD, exam_sd=EXAM_SD, hidden=hidden, normalise="gain")
 
 
 def depths_tell_all_but(left: float) -> HiddenTerms:
@@ -315,7 +302,7 @@ def test_two_sets_of_an_independent_model_give_one_shift_where_their_design_is_s
     sets = [shift(seat, stated=True) for seat in ("centred", "resting")]
     apart = abs(sets[0][0] - sets[1][0]) / np.sqrt(sets[0][1] + sets[1][1])
     assert apart < 1.96  # 7 to 8 % of a size: the stiffest lumps, in the seats at both ends of the range (record 0118)
-    assert all(abs(one) < 0.18 and left < 0.14 for one, _, left in sets)  # +6 and +10 %, Eq 6 +12 and +17 %
+    assert all(abs(one) < 0.21 and left < 0.18 for one, _, left in sets)  # +15 and +20 %, Eq 6 +14 and +21 %
     # the control: without depth and seat the sets' design is taken for scatter
     assert all(shift(seat, stated=False)[2] > 0.2 for seat in ("centred", "resting"))
 
@@ -330,12 +317,11 @@ def test_a_correction_is_kept_by_every_copy_that_a_calibration_makes_of_itself()
         assert path is not None
         use = read_size_calibration(path)
         assert isinstance(use, BodyCalibration)
-        assert use.with_fat is not None
-        profile = tuple(float(value) for value in use.with_fat.depth.centre)
-        at = with_site(use, site).at_fat([profile])
+        assert use.depth is not None
+        profile = tuple(float(value) for value in use.depth.centre)
+        at = replace(use, site=site).at_fat([profile])
         assert at.fat_mm is not None
         assert at.site is site
-        assert at.any_depth is not None
-        assert at.any_depth.site is site
-        silent = with_site(use, replace(site, uses_fat=False)).at_fat([profile])
+        assert at.fitting(1e4, 100.0).site is site
+        silent = replace(use, site=replace(site, uses_fat=False)).at_fat([profile])
         assert silent.fat_mm is None

@@ -1,0 +1,33 @@
+"""A calibration over bodies in closed form: ln d = 2.5 + 0.3 u + v, by Eq 6 with b 0 and without a depth of fat."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
+
+CENTRE = (-1.0, 1.5, 0.0)
+
+
+def plain_calibration(
+    *,
+    body_sd: float,
+    exam_sd: float = 0.02,
+    hidden: HiddenTerms | None = None,
+    amplitude_variance: float = 1e-6,
+    normalise: str = "mean",
+) -> BodyCalibration:
+    """Coefficients known to 1e-3; the variance of f, the slope by ln a, may be larger."""
+    return BodyCalibration(
+        centre=CENTRE,
+        mean=np.array([2.5, -0.3, 0.0, np.log(body_sd), 0.0, 0.0, 0.0, 0.0, 0.0, np.log(exam_sd)]),
+        covariance=np.diag([1e-6, amplitude_variance, *np.full(8, 1e-6)]),
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
+        information_inverse=np.eye(6) * 1e-2,
+        most_leverage=1.0,
+        domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
+        recipe=Recipe(normalise, "free", 20.0, False, "field"),
+        hidden=hidden,
+    )
