@@ -64,8 +64,6 @@ def test_frames_that_come_less_often_make_a_map_from_any_start(every, start):
     frames = PressureFrames(whole.frames.time_s[start::every], whole.frames.counts[start::every].copy())
     thinned = build_map(replace(whole, frames=frames))
     assert {"stroke_lag_mm", "stroke_lag_sd_mm"} <= set(thinned.quality)
-    assert thinned.frames is not None
-    assert len(thinned.frames) == thinned.frame_count
 
 
 @pytest.mark.slow

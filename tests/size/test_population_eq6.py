@@ -300,7 +300,7 @@ def test_a_file_holds_what_was_learned(learned, tmp_path: Path) -> None:
         ({"most_leverage": 0}, "most_leverage"),
         ({"surplus": 1}, "surplus"),
         ({"depth": None}, "mean is no finite array"),
-        ({"form": "eq7"}, "residual_correlation"),
+        ({"form": "eq7"}, "size_calibration.schema.json"),
     ],
 )
 def test_a_broken_file_is_refused(learned, tmp_path: Path, change, words) -> None:
