@@ -185,7 +185,7 @@ def _sized(
     """Sizes of visits that are of one mass, or why there are none."""
     import numpy as np
 
-    from tactile_bayes.size.change import joint_sizes, visits_calibration
+    from tactile_bayes.size.change import joint_sizes, visit_calibrations
     from tactile_bayes.size.comparison import Compared
     from tactile_bayes.size.pooling import MOST_INVALID
 
@@ -194,8 +194,8 @@ def _sized(
         sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
         for maps in visits
     ]
-    at_depth = visits_calibration(shapes, calibration)
-    far = _by_visit(shapes, at_depth.too_far)
+    fitted = visit_calibrations(shapes, calibration)
+    far = _by_visit(shapes, [one.too_far for one in fitted])
     if far:
         return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
     priors = size_priors(settings)
@@ -208,30 +208,32 @@ def _sized(
     sizes = joint(None)
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
         return Compared("no_estimate", "too many draws have no positive size", "", apart)
-    outside = _by_visit(shapes, at_depth.outside)
+    outside = _by_visit(shapes, [one.outside for one in fitted])
     findings = [
         *doubts,
         *(Finding("outside_calibration", f"outside the calibration's range: {text}") for text in outside),
         *_fat_apart(shapes, calibration),
-        *_sizes_apart(shapes, at_depth, priors),
+        *_sizes_apart(shapes, fitted, priors),
     ]
     another = None if priors.another_exam is None else joint(priors.another_exam)
     return Compared("compared", "", "", apart, tuple(findings), sizes, another)
 
 
-def _by_visit(shapes: Sequence[Sequence[ShapeDraws]], texts: Callable[[float, float], list[str]]) -> list[str]:
+def _by_visit(
+    shapes: Sequence[Sequence[ShapeDraws]], texts: Sequence[Callable[[float, float], list[str]]]
+) -> list[str]:
     """What is to be said of the middles of the maps, once for each visit."""
     found = [
         f"visit {number}: {text}"
-        for number, maps in enumerate(shapes, start=1)
+        for number, (maps, texts_of) in enumerate(zip(shapes, texts, strict=True), start=1)
         for one in maps
-        for text in texts(*one.middle)
+        for text in texts_of(*one.middle)
     ]
     return list(dict.fromkeys(found))
 
 
 def _sizes_apart(
-    shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration, priors: SizePriors
+    shapes: Sequence[Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], priors: SizePriors
 ) -> list[Finding]:
     """Cautions where the maps of one visit are not of one size."""
     from tactile_bayes.report.pooled import disagreement
@@ -239,8 +241,8 @@ def _sizes_apart(
     from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_size_of
 
     found = []
-    for number, maps in enumerate(shapes, start=1):
-        chance = one_size_of(log_sizes(calibration, maps), priors.between_maps)
+    for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
+        chance = one_size_of(log_sizes(at, maps), priors.between_maps)
         if chance < LEAST_PROBABILITY:
             found.append(disagreement("its maps show different sizes", chance).at(f"visit {number}"))
     return found

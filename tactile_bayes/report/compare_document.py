@@ -56,7 +56,7 @@ def compare_document(
             _change(joint, compared.another, later, days=days, grown_by=grown_by, probability=probability)
             for later in range(1, len(visits))
         ]
-    used = None if joint is None else joint.calibration
+    used = None if joint is None else joint.calibrations[0]
     return {
         "schema": SCHEMA,
         "status": compared.status,
@@ -73,7 +73,6 @@ def compare_document(
         "trend": None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
         "between_map_sd": None if joint is None else nine_digits(joint.between_map_sd),
         **({} if repeatability is None else {"repeatability": repeatability.words()}),
-        "fat_mm": None if used is None or used.fat_mm is None else nine_digits(used.fat_mm),
         "left_out": [] if used is None else used.omissions(),
         "research_use": RESEARCH_USE,
         "provenance": provenance.as_dict(),
@@ -89,10 +88,12 @@ def _visit(
     day: float | None,
     probability: float,
 ) -> dict[str, Any]:
+    fat_mm = None if joint is None else joint.calibrations[index].fat_mm
     return {
         "visit": index + 1,
         "day": day,
         "max_size_mm": None if joint is None else joint.size_mm(index, probability).as_dict(),
+        "fat_mm": None if fat_mm is None else nine_digits(fat_mm),
         "maps": [
             {"map": name, **{key: one.get(key) for key in ("status", "reason", "detected_probability")}}
             for name, one in zip(names, documents, strict=True)

@@ -156,7 +156,8 @@ def _site_line(document: Mapping[str, Any]) -> list[str]:
 
 def _model_line(document: Mapping[str, Any]) -> str:
     spread = f"exams of a visit differ by {100 * document['between_map_sd']:.0f} %"
-    depth = "" if document["fat_mm"] is None else f"; fat under the head {document['fat_mm']:.1f} mm deep at all visits"
+    told = [one["fat_mm"] for one in document["visits"]]
+    depth = "" if None in told else f"; fat under the head {', '.join(f'{one:.1f}' for one in told)} mm deep by visit"
     return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}."
 
 

@@ -94,8 +94,8 @@ class JointSizes:
         Spread between exams of a visit, root mean square.
     correlation : (v, v) array
         Of B between the visits.
-    calibration
-        At the depth of fat that all maps tell.
+    calibrations
+        Of each visit: at the depth of fat that its maps tell.
     """
 
     log_size: FloatArray
@@ -104,7 +104,7 @@ class JointSizes:
     replicates: Labels
     between_map_sd: float
     correlation: FloatArray
-    calibration: BodyCalibration
+    calibrations: tuple[BodyCalibration, ...]
 
     def change(self, earlier: int, later: int) -> Change:
         """Change from one visit to another."""
@@ -142,7 +142,7 @@ def joint_sizes(
     visits
         Maps of each visit on which the lump was found, at least one each.
     calibration
-        For any depth of fat; that at the depth that all maps tell is used.
+        For any depth of fat; that at the depth that each visit's maps tell is used.
     priors
         Of the lump's shape and of the spread between the exams of a visit; properties that somebody knows take no part.
     between
@@ -156,37 +156,46 @@ def joint_sizes(
         When there are fewer than two visits, more than `MOST_VISITS`, or one has no map.
     """
     _check(visits)
-    calibration = visits_calibration(visits, calibration)
+    fitted = visit_calibrations(visits, calibration)
     between = between or priors.between_maps or calibration.between_exams
     flat = [one for maps in visits for one in maps]
     used, replicates = matched_draws(flat, number, rng)
     parts, start = [], 0
-    for maps in visits:
-        parts.append(_Visit.of(used[start : start + len(maps)], calibration))
+    for maps, at in zip(visits, fitted, strict=True):
+        parts.append(_Visit.of(used[start : start + len(maps)], at))
         start += len(maps)
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = paired_points(middle, replicates, DIMENSIONS, rng)
     tau = _shared_tau(between, parts, points[:, 0])
-    oval, _ = lump_shape(calibration, flat, log_sizes(calibration, flat), priors.shape)
+    sizes = [one for maps, at in zip(visits, fitted, strict=True) for one in log_sizes(at, maps)]
+    oval, _ = lump_shape(fitted[0], flat, sizes, priors.shape)
     half = oval.at(points[:, 2:5])
     found = [one.weighted(tau) for one in parts]
     if law is None:
-        law = SHARED_WITHOUT_DEPTH if calibration.fat_mm is None else SHARED_BODY
+        law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in found]))
-    covariance = _covariance(found, calibration, correlation, normal_quantile(points[:, 1]))
+    covariance = _covariance(found, fitted, correlation, normal_quantile(points[:, 1]))
     mean = np.stack([one.mean for one in found]) + np.hypot(half[:, 0], half[:, 1])
     drawn = _drawn(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
-    return JointSizes(drawn, mean, covariance, replicates, spread, correlation, calibration)
+    return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fitted))
 
 
-def visits_calibration(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> BodyCalibration:
-    """The calibration at the depth of fat that all maps tell: it is one body, so its fat is as deep at each visit."""
-    flat = [one for maps in visits for one in maps]
-    calibration = calibration.at_fat([one.profile for one in flat])
-    for one in flat:
-        calibration = calibration.fitting(*one.middle)
-    return calibration
+def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[BodyCalibration]:
+    """The calibration at the depth of fat that each visit's maps tell.
+
+    Posture changes that depth by some per cent, and the lump's own with it: at one depth for all visits that would
+    count as a change of size. Where a visit tells none, none is used: what the maps hide would be something else with
+    it than without.
+    """
+    fitted = []
+    for maps in visits:
+        at_depth = calibration.at_fat([one.profile for one in maps])
+        for one in maps:
+            at_depth = at_depth.fitting(*one.middle)
+        fitted.append(at_depth)
+    without = [one for one in fitted if one.fat_mm is None]
+    return [without[0]] * len(fitted) if without else fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,14 +256,16 @@ def _shared_tau(between: BetweenMaps, parts: Sequence[_Visit], points: FloatArra
 
 
 def _covariance(
-    parts: Sequence[_Weighted], calibration: BodyCalibration, correlation: FloatArray, score: FloatArray
+    parts: Sequence[_Weighted], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
 ) -> FloatArray:
     """(n, v, v) covariance of ln d at the visits given each draw of the maps."""
-    k, site = calibration.coefficients, calibration.site
-    bodies = np.stack([calibration.body_sd(one.log_amplitude, one.log_width, score) for one in parts], axis=1)
+    k, site = fitted[0].coefficients, fitted[0].site
+    bodies = np.stack(
+        [at.body_sd(one.log_amplitude, one.log_width, score) for one, at in zip(parts, fitted, strict=True)], axis=1
+    )
     terms = np.stack([one.terms for one in parts], axis=1)
     found = bodies[:, :, None] * correlation * bodies[:, None, :]
-    found = found + (terms @ calibration.covariance[:k, :k]) @ np.swapaxes(terms, 1, 2)
+    found = found + (terms @ fitted[0].covariance[:k, :k]) @ np.swapaxes(terms, 1, 2)
     exams = np.stack([one.exam_variance for one in parts], axis=1)
     found[:, range(len(parts)), range(len(parts))] += exams
     if site is not None:

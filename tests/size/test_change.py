@@ -16,7 +16,7 @@ from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.between_maps import BetweenMaps
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.change import JointSizes, joint_sizes
+from tactile_bayes.size.change import JointSizes, joint_sizes, visit_calibrations
 from tactile_bayes.size.elongation import ShapePrior
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.shape_draws import ShapeDraws
@@ -222,9 +222,21 @@ def test_the_law_is_that_of_what_the_maps_hide(profile, law):
     visits = [[replace(shape(p, seed=1), profile=profile)] for p in (2.5, 2.55)]
     shipped, rng = read_size_calibration(path), np.random.default_rng(1)
     found = joint_sizes(visits, calibration=shipped, priors=ROUND, rng=rng, number=512)
-    assert (found.calibration.fat_mm is None) == (profile is None)
+    assert (found.calibrations[0].fat_mm is None) == (profile is None)
     shared = law.correlation(np.array([float(np.nanmean(one)) for one in found.log_size]))
     assert found.correlation[0, 1] == pytest.approx(shared[0, 1], rel=0.05)
+
+
+def test_each_visit_is_sized_at_the_depth_of_fat_that_its_own_maps_tell():
+    """Posture changes that depth; where one visit tells none, none has one."""
+    path = size_calibration_path("solid")
+    assert path is not None
+    shipped = read_size_calibration(path)
+    deeper, shallower, none = ([replace(shape(2.5), profile=one)] for one in ((0.0,) * 3, (0.03, 0.0, 0.0), None))
+    first, later = visit_calibrations([deeper, shallower], shipped)
+    assert first.fat_mm != pytest.approx(later.fat_mm, rel=0.002)
+    assert first.fat_mm == visit_calibrations([deeper, deeper], shipped)[1].fat_mm
+    assert [one.fat_mm for one in visit_calibrations([deeper, none], shipped)] == [None, None]
 
 
 def test_a_law_with_impossible_values_is_refused():
