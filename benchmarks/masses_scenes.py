@@ -22,11 +22,22 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 
-Kind = Literal["two", "one", "empty", "faint", "ribbed"]
+Kind = Literal["two", "one", "empty", "faint", "ribbed", "near", "single"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-NUMBER: Final[dict[Kind, int]] = {"two": 100, "one": 200, "empty": 12, "faint": 12, "ribbed": 12}
+NUMBER: Final[dict[Kind, int]] = {
+    "two": 100,
+    "one": 200,
+    "empty": 12,
+    "faint": 12,
+    "ribbed": 12,
+    "near": 100,
+    "single": 100,
+}
 """Exams of each kind."""
 SEED: Final = 20261124
+JUDGED: Final[dict[Kind, int]] = {"single": 1, "near": 2}
+"""Kinds of record 0126, of another seed, with their numbers in it: looked at once, when its rules were fixed."""
+JUDGED_SEED: Final = 20281126
 APART_MM: Final = (20.0, 40.0)
 LEAST_GAP_MM: Final = 4.0
 """Tissue between the two lumps, at least."""
@@ -57,8 +68,13 @@ def draw(kind: Kind, index: int) -> Exam:
     if kind == "one":
         return Exam(kind, index, draw_mass(index, scans=1, seed=SEED)[0])
     rng = np.random.default_rng([SEED, KINDS.index(kind), index])
+    if kind in JUDGED:
+        rng = np.random.default_rng([JUDGED_SEED, JUDGED[kind], index])
     body, lumps, ribs = _DRAWN[kind](rng, index)
-    scene = draw_exam(_WIDE if kind == "two" else _EXAM, rng)
+    wide = kind == "two" or (kind == "single" and rng.uniform() < 0.5)
+    scene = draw_exam(_WIDE if wide else _EXAM, rng)
+    if kind in JUDGED:
+        scene = replace(scene, frame_rate_hz=50.0)
     shift = rng.uniform(*_EXAM.off_centre_mm, size=2)
     moved = tuple(replace(one, x_mm=one.x_mm + shift[0], y_mm=one.y_mm + shift[1]) for one in lumps)
     seed = int(rng.integers(1 << 30))
@@ -82,6 +98,29 @@ def _two(rng: np.random.Generator, index: int) -> Drawn:
     return body, (replace(first, seat=None, x_mm=-x, y_mm=-y), replace(second, x_mm=x, y_mm=y)), ()
 
 
+def _near(rng: np.random.Generator, index: int) -> Drawn:
+    """Two lumps 16 to 40 mm apart, about as deep, the second 55 to 100 % as large."""
+    del index
+    body, first = draw_body(BodyPrior(d_mm=(8.0, 24.0), depth_ratio=(0.6, 1.5), stiffness_ratio=(8.0, 100.0)), rng)
+    d = rng.uniform(0.55, 1.0) * first.d_mm
+    depth = float(np.clip(rng.uniform(0.7, 1.3) * first.depth_mm, 0.56 * d, 1.7 * d))
+    least = max(16.0, (first.d_mm + d) / 2 + 1.0)
+    away, turn = rng.uniform(least, max(40.0, least)), rng.uniform(0.0, 2 * np.pi)
+    alike = rng.uniform() < 0.5
+    stiffness = first.stiffness_ratio if alike else float(np.exp(rng.uniform(*np.log([8.0, 100.0]))))
+    second = SolidLump(d_mm=d, depth_ratio=depth / d, stiffness_ratio=stiffness)
+    fat = first.depth_mm + (first.seat or 0.0) * first.vertical_mm / 2
+    body = replace(body, fat_mm=fat, thickness_mm=max(body.thickness_mm, depth + 0.6 * d + 4.0))
+    x, y = away / 2 * np.cos(turn), away / 2 * np.sin(turn)
+    return body, (replace(first, seat=None, x_mm=-x, y_mm=-y), replace(second, x_mm=x, y_mm=y)), ()
+
+
+def _single(rng: np.random.Generator, index: int) -> Drawn:
+    del index
+    body, lump = draw_body(BodyPrior(d_mm=(9.0, 22.0), depth_ratio=(0.6, 1.3), stiffness_ratio=(8.0, 100.0)), rng)
+    return body, (lump,), ()
+
+
 def _empty(rng: np.random.Generator, index: int) -> Drawn:
     del index
     body, first = draw_body(BodyPrior(), rng)
@@ -103,7 +142,7 @@ def _ribbed(rng: np.random.Generator, index: int) -> Drawn:
     return body, (replace(lump, seat=None),) if index % 2 else (), ribs
 
 
-_DRAWN: Final = {"two": _two, "empty": _empty, "faint": _faint, "ribbed": _ribbed}
+_DRAWN: Final = {"two": _two, "empty": _empty, "faint": _faint, "ribbed": _ribbed, "near": _near, "single": _single}
 
 
 def exams(*kinds: Kind, most: int | None = None) -> Iterator[Exam]:
