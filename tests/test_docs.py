@@ -212,7 +212,6 @@ def test_the_formats_page_has_the_arrays_of_a_scan():
     ("heading", "file", "group"),
     [
         ("Maps (`.nc`)", "map.nc", "/"),
-        ("Frames of a map (`.nc`)", "map.nc", "frames"),
         ("Posteriors (`.nc`)", "posterior.nc", "posterior"),
     ],
 )

@@ -81,14 +81,6 @@ def _few_strokes(quality: Mapping[str, float]) -> Finding | None:
     return Finding("few_strokes", text)
 
 
-def uneven(quality: Mapping[str, float]) -> bool:
-    """Whether the head's pressure profile changes over the map; parameters as above.
-
-    Then the frames tell the layers' tilt and not only the lump's place, so that figures by place mislead.
-    """
-    return _uneven(quality) is not None
-
-
 def _lag(quality: Mapping[str, float]) -> Finding | None:
     lag = _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM)
     if lag is None:

@@ -107,7 +107,7 @@ def test_an_existing_calibration_is_left_alone_without_force(tmp_path: Path) -> 
 def test_the_figure_is_drawn_from_the_tables_own_lumps_and_only_for_eq_6(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(rows(12))
     words = ("calibrate", "size", "t.csv", "-o", "size.json", "--figure", "fig.png")
-    refused = run_here(*words, "--form", "log-quadratic", cwd=tmp_path)
+    refused = run_here(*words, "--form", "eq6-residual", cwd=tmp_path)
     assert refused.returncode == 2
     assert "--figure is for tables of lumps" in refused.stderr
     done = run_here(*words, cwd=tmp_path)

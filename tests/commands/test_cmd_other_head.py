@@ -61,10 +61,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_table(place / "flat.csv", lambda _: FLAT)
     write_table(place / "old.csv", lambda _: None)
     write_table(place / "mixed.csv", lambda body: FLAT if body < 20 else FINGER)
-    for form in ("log-quadratic", "eq6"):
-        done = run_here("calibrate", "size", "flat.csv", "--form", form, "-o", f"{form}.json", cwd=place)
-        assert done.returncode == 0, done.stderr
-        assert "head 12 x 12 taxels, 2 mm apart, flat, rim 3 mm" in done.stdout
+    done = run_here("calibrate", "size", "flat.csv", "-o", "eq6.json", cwd=place)
+    assert done.returncode == 0, done.stderr
+    assert "head 12 x 12 taxels, 2 mm apart, flat, rim 3 mm" in done.stdout
     return place
 
 
@@ -99,28 +98,27 @@ def test_a_map_with_a_head_that_is_none_is_refused(folder: Path, tmp_path: Path,
     assert "attribute head" in done.stderr
 
 
-@pytest.mark.parametrize("form", ["log-quadratic", "eq6"])
-def test_a_calibration_knows_its_head_and_bodies_from_the_table(folder: Path, form: str) -> None:
-    found = read_size_calibration(folder / f"{form}.json")
+def test_a_calibration_knows_its_head_and_bodies_from_the_table(folder: Path) -> None:
+    found = read_size_calibration(folder / "eq6.json")
     assert found.recipe.head == replace(shape_of(FLAT), rim_mm=3.0)
     assert found.bodies["fat_kpa"] == (5.0, 5.0)
     assert 0 <= found.bodies["seat"][0] < found.bodies["seat"][1] <= 1.2
-    shown = run_here("show", f"{form}.json", cwd=folder).stdout
+    shown = run_here("show", "eq6.json", cwd=folder).stdout
     assert "12 x 12 taxels, 2 mm apart, flat" in shown
     assert "thickness_mm" in shown
 
 
 def test_tables_and_calibrations_of_earlier_versions_are_of_the_papers_head(folder: Path, tmp_path: Path) -> None:
-    run_here("calibrate", "size", folder / "old.csv", "--form", "log-quadratic", "-o", "old.json", cwd=tmp_path)
+    run_here("calibrate", "size", folder / "old.csv", "-o", "old.json", cwd=tmp_path)
     assert read_size_calibration(tmp_path / "old.json").recipe.head == replace(DEFAULT_HEAD, rim_mm=3.0)
     document = json.loads((tmp_path / "old.json").read_text())
-    del document["recipe"]["head"], document["bodies"]
+    del document["recipe"]["head"]
     (tmp_path / "older.json").write_text(json.dumps(document))
     assert read_size_calibration(tmp_path / "older.json").recipe.head == DEFAULT_HEAD
 
 
 def test_a_table_of_two_heads_teaches_nothing(folder: Path, tmp_path: Path) -> None:
-    done = run_here("calibrate", "size", folder / "mixed.csv", "--form", "log-quadratic", "-o", "m.json", cwd=tmp_path)
+    done = run_here("calibrate", "size", folder / "mixed.csv", "-o", "m.json", cwd=tmp_path)
     assert done.returncode == 3
     assert "several heads" in done.stderr
     assert not (tmp_path / "m.json").exists()
@@ -128,7 +126,7 @@ def test_a_table_of_two_heads_teaches_nothing(folder: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("name", "calibration"),
-    [("flat", "solid"), ("finger", "solid"), ("flat", "eq6"), ("paper", "log-quadratic.json"), ("paper", "eq6.json")],
+    [("flat", "solid"), ("finger", "solid"), ("flat", "eq6"), ("paper", "eq6.json")],
 )
 def test_a_calibration_for_another_head_is_refused_with_the_way_to_the_right_one(
     folder: Path, name: str, calibration: str
@@ -142,7 +140,7 @@ def test_a_calibration_for_another_head_is_refused_with_the_way_to_the_right_one
     assert ("give --size-calibration solid or eq6, which are for this head" in done.stderr) == (name == "paper")
 
 
-@pytest.mark.parametrize(("name", "calibration"), [("flat", "log-quadratic.json"), ("paper", "solid")])
+@pytest.mark.parametrize(("name", "calibration"), [("flat", "eq6.json"), ("paper", "solid")])
 def test_a_calibration_for_this_head_gives_a_size(folder: Path, name: str, calibration: str) -> None:
     done = run_here("estimate", f"{name}.nc", "--size-calibration", calibration, *FAST, "--json", cwd=folder)
     assert done.returncode == 0, done.stderr

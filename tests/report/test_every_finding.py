@@ -281,7 +281,7 @@ PRINTERS = {
     # of trials, calibrations, devices and studies
     "api/trials", "commands/calibrate_array", "commands/compare_model", "commands/head", "commands/plan",
     "commands/population", "commands/simulate", "commands/study", "commands/tables", "commands/tradeoff_forward",
-    "files/repeatability_json", "files/size_json", "files/size_population_eq6_json", "files/size_quadratic_json",
+    "files/repeatability_json", "files/size_json", "files/size_population_json",
     "files/size_site_json", "pipeline/trial", "presets", "report/calibration_text", "report/eq6_figure",
     "report/head_figure", "report/head_text", "report/ladder_document", "report/ladder_figure", "report/ladder_text",
     "report/model_figure", "report/model_text", "report/population_text", "report/repeatability_text",

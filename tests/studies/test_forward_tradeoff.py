@@ -169,7 +169,7 @@ def test_a_quadratic_gives_the_median_of_what_estimate_draws() -> None:
 
 
 def test_each_form_says_what_it_leaves_and_where_it_ends() -> None:
-    for name, words in (("solid-mean", "the log-quadratic of file.json"), ("plane-strain", "Eq 6 of file.json")):
+    for name, words in (("solid-mean", "Eq 6 and its residual of file.json"), ("plane-strain", "Eq 6 of file.json")):
         rule = calibrated_rule(shipped(name), name="file.json")
         assert rule.source == words
         assert 0.05 < rule.scatter < 0.4
@@ -255,7 +255,7 @@ def test_the_command_measures_draws_and_advises(run_cli: Run, tmp_path: Path) ->
     done = run_cli("tradeoff", "forward", "--figure", "t.png", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "solid: fineness 2" in done.stdout
-    assert "sizes by the log-quadratic of solid_mean.json" in done.stdout
+    assert "sizes by Eq 6 and its residual of solid_mean.json" in done.stdout
     assert "sizes by Eq 6 of plane_strain.json" in done.stdout
     assert "plane-strain: fineness 1" in done.stdout  # elements of 1.5 mm are enough for 0.5 % in this lump's size
     assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")
