@@ -105,8 +105,8 @@ def estimates(folder: Path, size: dict | None) -> Path:
     )  # fmt: skip
     made = {"schema": "tactile-bayes/estimate/1", "status": "estimate" if size else "no_estimate", "reason": "",
             "verdict": "sound" if size else "no_answer", "findings": [],
-            "max_size_mm": size, **quantity, "diagnostics": {}, "candidates": [], "masses": [], "left_out": [], "prior": {},
-            "research_use": "x", "provenance": {}}  # fmt: skip
+            "max_size_mm": size, **quantity, "diagnostics": {}, "candidates": [], "masses": [], "left_out": [],
+            "prior": {}, "research_use": "x", "provenance": {}}  # fmt: skip
     path = folder / "estimate.json"
     path.write_text(json.dumps(made))
     return path
