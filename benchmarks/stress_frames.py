@@ -84,10 +84,13 @@ class Physics:
     gland_stiffening: float = 0.0
 
 
-def stressed_scan(scene: Scene, physics: Physics) -> Scan:
-    """Scan of a scene with one lump and a body, by the changed physics; its noise is that of `simulate`."""
+def stressed_scan(scene: Scene, physics: Physics, *, empty: bool = False) -> Scan:
+    """Scan of a scene with one lump and a body, by the changed physics; its noise is that of `simulate`.
+
+    `empty` leaves the lump out; its place and depth still say where the layers are.
+    """
     time = frame_times(scene)
-    pressure, depth = stressed_frames(scene, time, physics)
+    pressure, depth = stressed_frames(scene, time, physics, empty=empty)
     done = record(
         scene,
         felt=lambda at: pressure[np.searchsorted(time, at)],
@@ -116,18 +119,26 @@ def on_sphere(scene: Scene, scan: Scan, radius_mm: float) -> Scan:
     return replace(scan, poses=TrackerPoses(scan.poses.time_s, position, quaternion))
 
 
-def stressed_frames(scene: Scene, time_s: FloatArray, physics: Physics) -> tuple[FloatArray, FloatArray]:
+def stressed_frames(
+    scene: Scene, time_s: FloatArray, physics: Physics, *, empty: bool = False
+) -> tuple[FloatArray, FloatArray]:
     """Pressures (n, rows, columns) and depths (n,) as `solid_frames` returns them, by the changed physics."""
     rotation, origin = head_positions(scene, time_s)
     level = level_kpa(scene.background, time_s)
     way = np.tanh(np.gradient(origin[:, 0], time_s) / _SLOW_MM_S)
     model = _Model.of(scene, physics, level)
+    if empty:
+        model = replace(model, stages=[(head, _nothing(lump)) for head, lump in model.stages])
     pressure = np.empty((len(time_s), scene.head.rows, scene.head.columns))
     depth, before = np.empty(len(time_s)), None
     for i in range(len(time_s)):
         frame = model.frame(rotation[i], origin[i], kpa=float(level[i]), way=float(way[i]), before=before)
         pressure[i], depth[i], before = frame.pressure_kpa, frame.depth_mm, frame
     return pressure, depth
+
+
+def _nothing(lump: PlacedLump) -> PlacedLump:
+    return replace(lump, perturbation=replace(lump.perturbation, table=0.0 * lump.perturbation.table))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

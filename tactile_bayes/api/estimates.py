@@ -72,9 +72,8 @@ class SizeEstimate(SizedExam):
 
     @property
     def detected_probability(self) -> float | None:
-        """Posterior probability that the map shows a lump; None where nothing could be tested."""
-        detection = self.outcome.estimate.detection
-        return None if detection is None else detection.probability
+        """Probability that the lump, or the likeliest rise, is one where half of the exams hold one; None untested."""
+        return self.outcome.estimate.probability
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -84,7 +83,7 @@ class SizeEstimate(SizedExam):
     def _rows(self) -> Iterator[tuple[str, str]]:
         yield from super()._rows()
         if self.detected_probability is not None:
-            yield "probability of a lump", f"{self.detected_probability:.3f}"
+            yield "probability of a lump", f"{self.detected_probability:.2f}"
 
     @property
     def amplitude(self) -> Draws | None:

@@ -195,7 +195,7 @@ class MassEstimate(Sized):
 
     def _rows(self) -> Iterator[tuple[str, str]]:
         yield from super()._rows()
-        yield "probability of a lump", f"{self.detected_probability:.3f}"
+        yield "probability of a lump", f"{self.detected_probability:.2f}"
 
     @property
     def centre_mm(self) -> tuple[float, float]:
@@ -204,7 +204,7 @@ class MassEstimate(Sized):
 
     @property
     def detected_probability(self) -> float:
-        """Posterior probability that it is a lump."""
+        """Probability that it is a lump, where half of the exams hold one."""
         return self.mass.probability
 
     @property

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactile_bayes.abstention import NO_LUMP
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256
@@ -85,7 +86,7 @@ class SizedMass:
         """Whether the mass has a size, and if not, whether a lump was detected."""
         if self.largest is not None:
             return SIZED
-        return NOT_DETECTED if self.code in ("undetected", "empty") else NOT_SIZED
+        return NOT_DETECTED if self.code in NO_LUMP else NOT_SIZED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tactile_bayes.abstention import NO_LUMP
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError
 from tactile_bayes.findings import Finding, by_weight, findings_in
 from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from tactile_bayes.size.pooling import SizePriors
     from tactile_bayes.size.shape_draws import ShapeDraws
 
+NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
 
@@ -198,7 +200,12 @@ def estimate_one(
     estimate = with_masses(tactile_map, estimated(tactile_map, options), options, estimated)
     estimate = _with_place(estimate, tactile_map, scans, probability=settings.interval)
     if why_none is not None and estimate.status == "estimate":
-        estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice)
+        estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice, on_paper=NO_CALIBRATION_ON_PAPER)
+    if estimate.code in NO_LUMP and tactile_map.covered.any():
+        from tactile_bayes.posterior.smallest_lump import smallest_lumps
+
+        fat_mm = None if calibration is None else calibration.fat_mm
+        estimate = replace(estimate, smallest=smallest_lumps(tactile_map, fat_mm=fat_mm))
     posterior = estimate.map_posterior
     used = None if posterior is None or calibration is None else calibration.fitting(*posterior.medians)
     if posterior is not None and used is not None and estimate.size is not None:

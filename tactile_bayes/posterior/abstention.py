@@ -13,7 +13,8 @@ from tactile_bayes.mapping.orientation import orientation_of
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.cells import covered_share, map_ends, on_map, trusted, window_cells
-from tactile_bayes.posterior.white.detection import Detection
+from tactile_bayes.posterior.lump_probability import LIKELY, Weighed
+from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.white.fit import (
     AT_RIM,
     LEAST_COVERED_SHARE,
@@ -24,6 +25,14 @@ from tactile_bayes.posterior.white.fit import (
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 FEEL_AGAIN = "if a lump is felt, go over the place again, more slowly or with more lines, and map all scans together"
+FEEL_AGAIN_ON_PAPER = "if a lump is felt, scan its place again, more slowly or with more strokes"
+FEEL_A_RIB = "feel whether it is a rib; if a lump is felt, name its place with --centre-mm X Y"
+FEEL_A_RIB_ON_PAPER = "feel at the cross on the picture whether it is a rib; if a lump is felt, scan its place again"
+SMALLER_CELLS_ON_PAPER = "have the scan mapped again with smaller cells"
+LARGER_WINDOW = "fit a larger window (fit_radius_mm in --settings FILE.toml) with a calibration learned so"
+LARGER_WINDOW_ON_PAPER = "nothing by this exam: the rise is wider than the program measures"
+MORE_LINES = "scan again, more slowly or with more lines, and map all scans together"
+MORE_LINES_ON_PAPER = "scan the place again, more slowly or with more strokes"
 NEEDED_IN_WIDTHS = 2.0
 """Widths of the bump beyond its centre that strokes should reach, so that its flank shows on every side."""
 WIDE_IN_RADII = 0.4
@@ -73,20 +82,17 @@ def no_verdict(cell_mm: float) -> Abstention | None:
     if cell_mm <= COARSEST_MM:
         return None
     reason = f"the map cannot show whether there is a lump: its cells of {cell_mm:g} mm are too large"
-    return Abstention("coarse", reason, "map the scan again with smaller cells (they have 1 mm by default)")
+    advice = "map the scan again with smaller cells (they have 1 mm by default)"
+    return Abstention("coarse", reason, advice, SMALLER_CELLS_ON_PAPER)
 
 
 def chance_text(probability: float) -> str:
     """Format a probability with no more digits than it is worth."""
-    return "below 0.001" if probability < 0.001 else f"{probability:.2g}"
+    return "below 0.01" if probability < 0.01 else "above 0.99" if probability > 0.99 else f"{probability:.2f}"
 
 
 def no_bump(
-    tactile_map: TactileMap,
-    candidates: Sequence[Candidate],
-    likeliest: tuple[Candidate, Detection] | None,
-    *,
-    where: str,
+    tactile_map: TactileMap, candidates: Sequence[Candidate], likeliest: Weighed | None, *, where: str
 ) -> Abstention:
     """Reason when no candidate can be measured: no lump, or one that the map covers too poorly.
 
@@ -97,52 +103,52 @@ def no_bump(
     where
         What was searched, see `searched`.
     """
-    first, chance = candidates[0], ""
-    if likeliest is not None:
-        if likeliest[1].probability >= 0.5:
-            return _unmeasured(tactile_map, *likeliest)
-        chance = f" (probability of one {chance_text(likeliest[1].probability)})"
-    reason = f"no lump found {where}{chance}: {first.fault}"
-    if len(candidates) > 1:
-        rises = f"none of {len(candidates)} rises can be one; the highest, {_place(first)}"
-        reason = f"no lump found {where}{chance}: {rises}: {first.fault}"
+    candidate = None if likeliest is None else likeliest.candidate
+    if candidate is not None and likeliest is not None and likeliest.probability >= LIKELY:
+        reason = f"the rise {_place(candidate)} cannot be measured: {candidate.fault}"
+        return _for_fault(tactile_map, candidate, reason)
+    first = candidates[0]
     if likeliest is None and "covered cells" in first.fault:
         short = missing_strokes(tactile_map, first.centre_mm, reach_mm=10.0)
-        return Abstention("window", reason, extend_advice(short) or "cover the place with more strokes")
-    return Abstention("undetected", reason, FEEL_AGAIN)
-
-
-def _unmeasured(tactile_map: TactileMap, candidate: Candidate, detection: Detection) -> Abstention:
-    """Reason for a candidate that is a lump by the evidence and yet has no size."""
-    chance = f"probability of a lump {detection.probability:.2g}"
-    code, advice = fault_code(tactile_map, candidate)
-    reason = f"the rise {_place(candidate)} ({chance}) cannot be measured: {candidate.fault}"
-    return Abstention(code, reason, advice)
+        advice = extend_advice(short) or "cover the place with more strokes"
+        return Abstention("window", f"no lump found {where}: {first.fault}", advice, advice, first.centre_mm)
+    if candidate is not None and likeliest is not None and likeliest.detection.log_bayes_factor > 0:
+        why = _for_fault(tactile_map, candidate, f"no lump found {where}: what rises {_place(candidate)} is a ridge")
+        if why.code == "ridge":
+            return why
+    rises = f"none of the {len(candidates)} places that rise is one" if len(candidates) > 1 else first.fault
+    return Abstention("undetected", f"no lump found {where}: {rises}", FEEL_AGAIN, FEEL_AGAIN_ON_PAPER)
 
 
 def _place(candidate: Candidate) -> str:
     return f"near ({candidate.centre_mm[0]:.1f}, {candidate.centre_mm[1]:.1f}) mm"
 
 
-def fault_code(tactile_map: TactileMap, candidate: Candidate) -> tuple[str, str]:
-    """Code of a candidate's fault, and a remedy."""
-    fit = candidate.fit
+def _for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str) -> Abstention:
+    """The reason with the code and the remedies of a candidate's fault."""
+    fit, at = candidate.fit, candidate.centre_mm
     if fit is None:
-        short = missing_strokes(tactile_map, candidate.centre_mm, reach_mm=10.0)
-        return ("window", extend_advice(short)) if short else ("undetected", "")
+        advice = extend_advice(missing_strokes(tactile_map, at, reach_mm=10.0))
+        return Abstention("window" if advice else "undetected", reason, advice, advice, at)
     sigma_x, sigma_y, _ = fit.widths()
     wide, narrow = max(sigma_x, sigma_y), min(sigma_x, sigma_y)
     if not fit.theta[0] > 0:
-        return "undetected", ""
+        return Abstention("undetected", reason, about_mm=at)
+    if wide / max(narrow, 1e-9) > MOST_AXIS_RATIO:
+        return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
     if narrow < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
-        return "unresolved", f"map again with --cell-mm {max(0.1, narrow / 0.75):.1g} or press more lightly"
+        return _coarse(reason, narrow, at)
     centre = (float(fit.theta[1]), float(fit.theta[2]))
-    short = missing_strokes(tactile_map, centre, reach_mm=NEEDED_IN_WIDTHS * wide)
-    if wide / narrow > MOST_AXIS_RATIO:
-        return "unresolved", "feel whether it is a rib; name the lump's place with --centre-mm"
-    return "window", extend_advice(
-        short
-    ) or "fit a larger window (fit_radius_mm in --settings FILE.toml) with a calibration learned so"
+    extend = extend_advice(missing_strokes(tactile_map, centre, reach_mm=NEEDED_IN_WIDTHS * wide))
+    if extend:
+        return Abstention("window", reason, extend, extend, at)
+    return Abstention("window", reason, LARGER_WINDOW, LARGER_WINDOW_ON_PAPER, at)
+
+
+def _coarse(reason: str, narrow_mm: float, at: tuple[float, float] | None = None) -> Abstention:
+    """The reason, with the remedies for a rise that the cells do not resolve."""
+    advice = f"map again with --cell-mm {max(0.1, narrow_mm / 0.75):.1g}"
+    return Abstention("unresolved", reason, advice, SMALLER_CELLS_ON_PAPER, at)
 
 
 def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:
@@ -216,13 +222,20 @@ def extend_advice(short: dict[str, float]) -> str:
     return f"extend the strokes {' and '.join(parts[:2])}" if parts else ""
 
 
-def undetected(detection: Detection, least: float, *, where: str) -> Abstention:
+def undetected(weighed: Weighed, *, where: str) -> Abstention:
     """Reason when noise, or a rib-like ridge, explains the map as well as a lump."""
-    figures = f"(probability of one {chance_text(detection.probability)}, needed {least:g})"
+    at, detection = weighed.centre_mm, weighed.detection
     if detection.ridge:
-        reason = f"no lump found {where} {figures}: {detection.ridge}, explains what rises"
-        return Abstention("undetected", reason, "feel whether it is a rib; name a lump's place with --centre-mm")
-    return Abstention("undetected", f"no lump found {where} {figures}", FEEL_AGAIN)
+        reason = f"no lump found {where}: what rises near ({at[0]:.1f}, {at[1]:.1f}) mm is rather {detection.ridge}"
+        return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
+    if detection.probability < DETECTED:
+        reason = f"no lump found {where}: errors of the map explain what rises as well as a lump does"
+        return Abstention("undetected", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER)
+    rise = f"no lump found {where}: what rises near ({at[0]:.1f}, {at[1]:.1f}) mm is"
+    if weighed.axis_ratio > MOST_AXIS_RATIO:
+        return Abstention("ridge", f"{rise} a ridge, not a lump", FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
+    reason = f"{rise} wider or less covered than a lump: uneven fat, a rib and the map's rim look so"
+    return Abstention("undetected", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER, at)
 
 
 def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, prior: BumpPrior) -> Abstention | None:
@@ -236,7 +249,7 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
             f"the map hardly narrows the widths: their posterior SD is {share:.2f} of the prior's "
             f"(at most {MOST_PRIOR_SHARE:g})"
         )
-        return Abstention("prior", reason, "scan again, more slowly or with more lines, and map all scans together")
+        return Abstention("prior", reason, MORE_LINES, MORE_LINES_ON_PAPER)
     return None
 
 
@@ -250,10 +263,10 @@ def _width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Absten
     wide, narrow = max(x, y), min(x, y)
     if narrow * margin < LEAST_WIDTH_IN_CELLS * cell_mm:
         reason = f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved"
-        return Abstention("unresolved", reason, f"map again with --cell-mm {max(0.1, narrow / 0.75):.1g}")
+        return _coarse(reason, narrow)
     if wide / narrow > MOST_AXIS_RATIO * margin:
-        reason = f"a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
-        return Abstention("unresolved", reason, "feel whether it is a rib; name the lump's place with --centre-mm")
+        reason = f"what rises is a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
+        return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER)
     return None
 
 

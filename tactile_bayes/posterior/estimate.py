@@ -7,16 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 
-from tactile_bayes.abstention import Abstention
+from tactile_bayes.abstention import NO_LUMP, Abstention
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
 from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.abstention import hopeless_shape, no_bump, no_verdict, searched, undetected
+from tactile_bayes.posterior.abstention import (
+    FEEL_AGAIN,
+    FEEL_AGAIN_ON_PAPER,
+    hopeless_shape,
+    no_bump,
+    no_verdict,
+    searched,
+    undetected,
+)
 from tactile_bayes.posterior.assessment import Assessment, MapDraws, bump_of
 from tactile_bayes.posterior.drawn import Drawn, draw_sized
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
 from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
 from tactile_bayes.posterior.result import Estimate, ModalBump
 from tactile_bayes.posterior.search import best_chance, search
@@ -26,12 +35,14 @@ from tactile_bayes.posterior.white.fit import Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
 from tactile_bayes.size import omissions
 from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.size.calibration_range import extrapolated
+from tactile_bayes.size.calibration_range import UNLIKE_ON_PAPER, extrapolated
 from tactile_bayes.size.eq6 import Recipe
 from tactile_bayes.size.fat_depth import head_profile
 from tactile_bayes.size.posterior import SizePosterior
 
 MOST_INVALID = 0.05
+SCAN_AGAIN = "scan again: nothing of the area was read"
+OTHER_METHOD_ON_PAPER = "have the size estimated again by the slower method"
 OTHER_HEAD = (
     "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
     "calibrate size population.csv --form eq6-residual -o size.json`, and give --size-calibration size.json"
@@ -76,8 +87,8 @@ def estimate_map(
         check_recipe(tactile_map, calibration, options.fit)
         calibration = calibration_for(tactile_map, calibration)
     found = _answer(tactile_map, calibration, options, rng=rng, progress=progress)
-    if found.code == "undetected" and (why := no_verdict(tactile_map.recipe.cell_mm)) is not None:
-        found = replace(found, code=why.code, reason=why.reason, advice=why.advice, detection=None)
+    if found.code in ("undetected", "ridge") and (why := no_verdict(tactile_map.recipe.cell_mm)) is not None:
+        found = _none(why, found.candidates)
     return replace(found, findings=by_weight((*tactile_map.findings, *found.findings)))
 
 
@@ -91,26 +102,39 @@ def _answer(
 ) -> Estimate:
     """The lump's size, or why there is none."""
     if not tactile_map.covered.any():
-        return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place"))
+        return _none(Abstention("empty", "the map has no covered cell", "map a scan that covers the place", SCAN_AGAIN))
     where = searched(tactile_map, options.fit.centre_mm)
     candidates, seen = search(tactile_map, options)
     if not candidates:
-        return _none(Abstention("empty", f"no lump found {where}: nothing rises above the background"))
+        reason = f"no lump found {where}: nothing rises above the background"
+        return _none(Abstention("empty", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER))
     if seen is None:
         likeliest = best_chance(tactile_map, candidates, options)
         why = no_bump(tactile_map, candidates, likeliest, where=where)
         if likeliest is None:
             return _none(why, candidates)
-        candidate, detection = likeliest
-        lump = detection.probability >= DETECTED and why.code != "undetected"
-        return _none(why, candidates, detection, bump_of(candidate.fit) if lump and candidate.fit else None)
-    detection = seen.detection
-    if detection.probability < DETECTED:
-        return _none(undetected(detection, DETECTED, where=where), candidates, detection)
-    if options.scene == "none":
-        chance = f"the map gives one a probability of {detection.probability:.2g}"
-        return _none(Abstention("undetected", f"no lump was assumed; {chance}"), candidates, detection)
-    return _measured(tactile_map, seen, candidates, calibration, options, rng=rng, progress=progress)
+        fit, detection = None if likeliest.candidate is None else likeliest.candidate.fit, likeliest.detection
+        lump = detection.probability >= DETECTED and why.code not in NO_LUMP
+        found = _none(why, candidates, detection, bump_of(fit) if lump and fit is not None else None)
+        return replace(found, weighed=likeliest)
+    weighed = _weighed(tactile_map, seen, seen.detection)
+    if seen.detection.probability < DETECTED or weighed.probability < LIKELY:
+        found = _none(undetected(weighed, where=where), candidates, seen.detection)
+    elif options.scene == "none":
+        why = Abstention("undetected", "no lump was assumed")
+        found = _none(why, candidates, seen.detection)
+    else:
+        found = _measured(tactile_map, seen, candidates, calibration, options, rng=rng, progress=progress)
+    if found.code == "ridge" and not found.reason.startswith("no lump found"):
+        found = replace(found, reason=f"no lump found {where}: {found.reason}")
+    return replace(found, weighed=_weighed(tactile_map, seen, found.detection or seen.detection))
+
+
+def _weighed(tactile_map: TactileMap, seen: Assessment, detection: Detection) -> Weighed:
+    """The assessed place: by its mode where it is a lump by the evidence, else by least squares."""
+    bump = seen.bump() if seen.detection.probability >= DETECTED else bump_of(seen.fit)
+    widths = (bump.sigma_x_mm, bump.sigma_y_mm)
+    return weigh(tactile_map, detection, centre_mm=(bump.x_mm, bump.y_mm), widths_mm=widths)
 
 
 def _measured(
@@ -134,7 +158,8 @@ def _measured(
         if options.method == "ensemble" or not options.fit.correlated:
             raise
         advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
-        return _none(Abstention("method", f"no method converged: {error}", advice), candidates, detection, bump)
+        why = Abstention("method", f"no method converged: {error}", advice, OTHER_METHOD_ON_PAPER)
+        return _none(why, candidates, detection, bump)
     made, size, calibration = found.made, found.size, found.calibration
     detection = made.detection
     if found.fault is not None:
@@ -144,7 +169,9 @@ def _measured(
         return _none(extrapolated(list(found.too_far)), candidates, detection, bump, diagnostics)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
-        outside = Abstention("extrapolated", reason, "learn a calibration whose table holds such lumps")
+        outside = Abstention(
+            "extrapolated", reason, "learn a calibration whose table holds such lumps", UNLIKE_ON_PAPER
+        )
         return _none(outside, candidates, detection, bump, diagnostics)
     return Estimate(
         "estimate",
@@ -171,15 +198,18 @@ def _none(
     bump: ModalBump | None = None,
     diagnostics: Diagnostics | None = None,
 ) -> Estimate:
+    is_lump = why.code not in NO_LUMP
     return Estimate(
         "no_estimate",
         why.reason,
         detection=detection,
-        bump=bump,
+        bump=bump if is_lump else None,
         candidates=candidates,
         diagnostics=diagnostics,
         code=why.code,
         advice=why.advice,
+        on_paper=why.on_paper,
+        about_mm=why.about_mm if bump is None or is_lump else (bump.x_mm, bump.y_mm),
     )
 
 

@@ -12,12 +12,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from tactile_bayes.abstention import NO_LUMP
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, on_map
+from tactile_bayes.posterior.lump_probability import weigh
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.other_rises import other_rises, without
 from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
+from tactile_bayes.posterior.white.detection import Detection
 
 OF_A_LUMP = ("seat", "depth_mm", "stiffness_ratio")
 """Known properties that are of one lump, not of the whole body."""
@@ -58,7 +61,9 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: EstimateOptio
     found = by_evidence(found)
     kept = options.fit.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
     reported = first if kept or not found else found[0].estimate
-    masses = tuple(replace(one, reported=one.estimate is reported) for one in found)
+    masses = tuple(
+        replace(one, reported=one.estimate is reported, probability=_calibrated(tactile_map, one)) for one in found
+    )
     beside = tuple(_rise(one, masses) for one in masses if not one.reported)
     return replace(reported, candidates=first.candidates, masses=masses, other_rises=beside)
 
@@ -143,7 +148,7 @@ def _sized_at(
     if first.map_posterior is not None and near and not _stays(found, rise, first):
         less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
         found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
-    if found.code in ("undetected", "coarse"):
+    if found.code in (*NO_LUMP, "coarse"):
         return None
     if _stays(found, rise, first):
         return Mass(*_place(found), max(rise.probability, _probability(found)), found)
@@ -183,7 +188,7 @@ def _stands(found: Estimate, first: Estimate) -> bool:
 
 def _in_the_flank(found: Estimate) -> Estimate:
     reason = f"it stands in the flank of a lump more than {1 / LEAST_SHARE:.0f} times as high, which hides its shape"
-    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH)
+    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
 
 
 def _no_size(found: Estimate) -> Estimate:
@@ -191,23 +196,34 @@ def _no_size(found: Estimate) -> Estimate:
     if found.status == "no_estimate":
         return found
     reason = "its fit moves to the lump beside it: the map does not tell them apart"
-    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH)
+    return Estimate("no_estimate", reason, detection=found.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
 
 
 def _hidden(rise: Rise) -> Estimate:
     """A second lump of a scene that is none without that scene."""
     reason = "the map shows it beside the first lump only, not by itself"
-    return Estimate("no_estimate", reason, code="unresolved", advice=BOTH, bump=_bump_of(rise))
+    return Estimate("no_estimate", reason, code="unresolved", advice=BOTH, on_paper=BOTH, bump=_bump_of(rise))
 
 
 def _beyond(rise: Rise) -> Estimate:
     """A rise at the rim whose fit has its centre off the map."""
-    advice = "extend the strokes beyond it"
-    return Estimate("no_estimate", "its centre lies off the map", code="window", advice=advice, bump=_bump_of(rise))
+    advice, reason = "extend the strokes beyond it", "its centre lies off the map"
+    return Estimate("no_estimate", reason, code="window", advice=advice, on_paper=advice, bump=_bump_of(rise))
 
 
 def _bump_of(rise: Rise) -> ModalBump:
     return ModalBump(rise.amplitude, rise.x_mm, rise.y_mm, rise.sigma_x_mm, rise.sigma_y_mm)
+
+
+def _calibrated(tactile_map: TactileMap, mass: Mass) -> float:
+    """Probability that a mass is a lump, by its own estimate, or by the odds and the bump of its rise."""
+    bump = mass.estimate.bump
+    assert bump is not None
+    if mass.estimate.probability is not None:
+        return mass.estimate.probability
+    odds = Detection(mass.probability, float(np.log(mass.probability) - np.log1p(-min(mass.probability, 1.0 - 1e-16))))
+    widths = (bump.sigma_x_mm, bump.sigma_y_mm)
+    return weigh(tactile_map, odds, centre_mm=(bump.x_mm, bump.y_mm), widths_mm=widths).probability
 
 
 def _rise(mass: Mass, masses: Sequence[Mass]) -> Rise:

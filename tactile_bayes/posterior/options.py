@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tactile_bayes.inference.chain_state import ChainStore
 
 DETECTED = 0.95
-"""Below this probability of a lump there is no estimate."""
+"""Evidence for a bump against smooth errors, as a probability at even odds, below which there is no estimate."""
 ROTATION_ODDS = 3.0
 """Odds above which a rotated ellipse is used instead of one along the head's axes."""
 

@@ -13,6 +13,7 @@ from tactile_bayes.posterior.assessment import Assessment, bump_of
 from tactile_bayes.posterior.correlated.neighbour import LEAST_RISE
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, candidate_centres, levelled, on_map, smoothed_excess
 from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.lump_probability import LIKELY
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.posterior.result import Estimate, ModalBump, Rise
 from tactile_bayes.posterior.search import best_chance, search
@@ -152,9 +153,11 @@ def _at_rim(
     if bump.amplitude <= (0.0 if lump is None else LEAST_RISE_AT_RIM * lump.amplitude):
         return None
     chance = best_chance(rest, candidates, options)
-    if chance is None or chance[1].probability < LEAST_PROBABILITY:
+    if chance is None or chance.detection.probability < LEAST_PROBABILITY or chance.probability < LIKELY:
         return None
-    return Rise(bump.x_mm, bump.y_mm, None, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, chance[1].probability)
+    return Rise(
+        bump.x_mm, bump.y_mm, None, bump.amplitude, bump.sigma_x_mm, bump.sigma_y_mm, chance.detection.probability
+    )
 
 
 def _stands_out(rise: Rise, rest: TactileMap) -> bool:

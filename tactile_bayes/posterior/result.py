@@ -9,6 +9,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
 from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.sensitivity import Sensitivity
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import BumpFit, Candidate
@@ -17,6 +18,7 @@ from tactile_bayes.size.posterior import SizePosterior
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.selection import SceneChoice
+    from tactile_bayes.posterior.smallest_lump import SmallestLumps
 
 Status = Literal["estimate", "no_estimate"]
 
@@ -80,8 +82,12 @@ class Estimate:
         Figures and flags for the report; None where nothing was drawn.
     left_out
         What the estimate does not contain, in words.
-    code, advice
-        Without an estimate: one of `abstention.CODES`, and what would fix it.
+    code, advice, on_paper, about_mm
+        Without an estimate: as in `Abstention`.
+    weighed
+        The lump of the answer, or the rise that is most like one, with its probability; None where nothing was weighed.
+    smallest
+        On a map without a lump: the smallest that it would have shown; None where nobody has asked.
     scene
         Under a noise field: what the window holds, and what was asked about it.
     sensitivity
@@ -108,12 +114,21 @@ class Estimate:
     left_out: tuple[str, ...] = ()
     code: str = ""
     advice: str = ""
+    on_paper: str = ""
+    about_mm: tuple[float, float] | None = None
+    weighed: Weighed | None = None
+    smallest: SmallestLumps | None = None
     scene: SceneChoice | None = None
     sensitivity: Sensitivity | None = None
     other_rises: tuple[Rise, ...] = ()
     bump: ModalBump | None = None
     masses: tuple[Mass, ...] = ()
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def probability(self) -> float | None:
+        """Probability that the lump of the answer, or the likeliest rise, is one; None where nothing was weighed."""
+        return None if self.weighed is None else self.weighed.probability
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +140,7 @@ class Mass:
     x_mm, y_mm
         Its centre in `plane`: the posterior median, or where the fit has it.
     probability
-        That it is a lump, as `Detection` has it; of a second lump in another's window, by its odds.
+        That it is a lump; of a second lump in another's window, by its odds.
     estimate
         Its own: draws and size, or why there is none.
     reported

@@ -8,6 +8,7 @@ from dataclasses import replace
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.assessment import Assessment, assess
 from tactile_bayes.posterior.lump.cells import levelled, window_cells
+from tactile_bayes.posterior.lump_probability import NO_EVIDENCE, Weighed, weigh_candidate
 from tactile_bayes.posterior.options import DETECTED, EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import (
@@ -51,7 +52,7 @@ def search(tactile_map: TactileMap, options: EstimateOptions) -> tuple[tuple[Can
         if looks == MOST_LOOKS:
             break
         rather = f": rather {detection.ridge}" if detection.ridge else ""
-        fault = f"no lump by the evidence (probability {detection.probability:.2g}){rather}"
+        fault = f"{NO_EVIDENCE}{rather}"
         tried[-1] = replace(candidate, fault=fault)
     if options.fit.correlated:
         close = _close_search(tactile_map, tried, options)
@@ -112,33 +113,36 @@ def _close_search(
     return None
 
 
-def best_chance(
-    tactile_map: TactileMap, candidates: Sequence[Candidate], options: EstimateOptions
-) -> tuple[Candidate, Detection] | None:
+def best_chance(tactile_map: TactileMap, candidates: Sequence[Candidate], options: EstimateOptions) -> Weighed | None:
     """The most probable lump among rises that cannot be measured; None where none can be assessed.
 
     Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too,
     from a smaller window where the fit ran away or outgrew its own. A fit to a single cell says nothing of a lump and
     is passed over.
     """
-    weighed = [(one, one.detection) for one in candidates if one.detection is not None]
-    for candidate in candidates:
-        if len(weighed) >= MOST_LOOKS:
+    weighed: list[Weighed] = []
+    for candidate in sorted(candidates, key=lambda one: one.detection is None):
+        if candidate.detection is None and len(weighed) >= MOST_LOOKS:
             break
-        detection = None if candidate.detection else _weighed(tactile_map, candidate, options)
+        fit, detection = candidate.fit, candidate.detection
+        if detection is None:
+            fit, detection = _weighed(tactile_map, candidate, options) or (None, None)
         if detection is not None:
-            weighed.append((candidate, detection))
-    return max(weighed, key=lambda one: one[1].probability) if weighed else None
+            one = weigh_candidate(tactile_map, replace(candidate, fit=fit), detection)
+            weighed += [] if one is None else [replace(one, candidate=candidate)]
+    return max(weighed, key=lambda one: (one.probability, one.detection.log_bayes_factor), default=None)
 
 
-def _weighed(tactile_map: TactileMap, candidate: Candidate, options: EstimateOptions) -> Detection | None:
+def _weighed(
+    tactile_map: TactileMap, candidate: Candidate, options: EstimateOptions
+) -> tuple[BumpFit, Detection] | None:
     """Odds of a lump at a faulty place, fitted from close by where the first fit moved away or grew too large."""
     fit, settings = candidate.fit, _search_options(tactile_map, options.fit)
     if fit is None or candidate.fault.startswith(OUTGROWN):
         fit, _ = fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
     if fit is None or min(fit.widths()[:2]) < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
         return None
-    return assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
+    return fit, assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
 
 
 def _search_options(tactile_map: TactileMap, fit: FitOptions) -> FitOptions:

@@ -44,8 +44,8 @@ def estimate_document(
     def point(name: str) -> dict[str, Any] | None:
         return {axis: one(f"{name}.{axis}") for axis in "xy"} if f"{name}.x" in quantities else None
 
+    about = estimate.about_mm
     share = estimate.size.variance_share if estimate.size is not None else None
-    detection = estimate.detection
     masses = masses_document(
         estimate.masses,
         tactile_map,
@@ -62,6 +62,9 @@ def estimate_document(
         "reason": estimate.reason,
         "reason_code": estimate.code,
         "advice": estimate.advice,
+        "on_paper": estimate.on_paper,
+        "about_mm": None if about is None else {"x": nine_digits(about[0]), "y": nine_digits(about[1])},
+        "smallest_lump": None if estimate.smallest is None else estimate.smallest.as_dict(),
         **{name: one(name) for name in (*SIZES, *WIDTHS)},
         ANOTHER_EXAM: another_exam(estimate.size, quantities),
         "supposing": supposed_document(estimate.size, quantities.get("max_size_mm")),
@@ -69,7 +72,7 @@ def estimate_document(
         "centre_patient_mm": point("centre_patient_mm"),
         "position": None if place is None else place.as_dict(probability),
         "angle_deg": one("angle_deg"),
-        "detected_probability": None if detection is None else nine_digits(detection.probability),
+        "detected_probability": None if estimate.probability is None else nine_digits(estimate.probability),
         "variance_share": None if share is None else {k: nine_digits(v) for k, v in share.items()},
         "scene": None if estimate.scene is None else scene_document(estimate.scene),
         "prior_sensitivity": None if estimate.sensitivity is None else rounded(estimate.sensitivity.as_dict()),

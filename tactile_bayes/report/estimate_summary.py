@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from tactile_bayes.findings import finding_summary
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.mapping.clock_face import ClockPosition
+from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import (
@@ -17,6 +18,7 @@ from tactile_bayes.report.estimate_text import (
     no_estimate_line,
     size_decimals,
     size_table,
+    smallest_lines,
     tracker_share,
 )
 from tactile_bayes.report.lump_place import from_xiphoid
@@ -57,7 +59,7 @@ def estimate_summary(
     """
     if estimate.status == "no_estimate":
         body = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
-        body += [no_estimate_line(estimate.reason), *advice_lines(estimate)]
+        body += [no_estimate_line(estimate.reason), *smallest_lines(estimate), *advice_lines(estimate)]
         body += [*_masses(masses, room=MOST_MASSES), *finding_summary(estimate.findings, "check", most=MOST_CHECKS)]
     else:
         body = _something(estimate, quantities, probability, masses, place)
@@ -100,7 +102,7 @@ def _lump(
     estimate: Estimate, quantities: Mapping[str, Quantity], number: str, place: ClockPosition | None
 ) -> list[str]:
     """Probability of a lump, and its place; `number` says which of several masses it is."""
-    parts = [] if estimate.detection is None else [f"Probability of a lump {estimate.detection.probability:.3f}"]
+    parts = [] if estimate.probability is None else [f"Probability of a lump {chance_text(estimate.probability)}"]
     if "amplitude" in quantities:
         parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
     if place is not None:

@@ -9,8 +9,10 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.summary import Quantity
 from tactile_bayes.mapping.clock_face import ClockPosition
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump.diagnostics import Diagnostics
+from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.lump_place import place_line
@@ -29,6 +31,7 @@ from tactile_bayes.report.size_text import (
     table_row,
     two_intervals_text,
 )
+from tactile_bayes.report.smallest_text import smallest_text
 from tactile_bayes.report.supposed_text import supposed_document, supposed_lines
 from tactile_bayes.size.posterior import EXTREMES, SIZES
 
@@ -79,7 +82,8 @@ def estimate_text(
             estimate.masses, tactile_map, probability=probability, quantities=quantities, reason=estimate.reason
         )
     if estimate.status == "no_estimate":
-        first = [*finding_lines(estimate.findings), no_estimate_line(estimate.reason), *advice_lines(estimate)]
+        first = [*finding_lines(estimate.findings), no_estimate_line(estimate.reason), *smallest_lines(estimate)]
+        first += advice_lines(estimate)
         return "\n".join([*first, *mass_lines(masses), *passed_over(estimate), RESEARCH_USE]) + "\n"
     table = size_table(quantities, probability, exam_spread=exam_spread(estimate))
     lines = [*finding_lines(estimate.findings, "caution"), *table, ""]
@@ -100,6 +104,11 @@ def estimate_text(
 def no_estimate_line(reason: str) -> str:
     """First line of a report without an estimate."""
     return f"{reason[0].upper()}{reason[1:]}." if reason.startswith("no lump found") else f"No estimate: {reason}."
+
+
+def smallest_lines(estimate: Estimate) -> list[str]:
+    """What a map without a lump would have shown, as one line; empty where nobody has asked."""
+    return [] if estimate.smallest is None else [f"{smallest_text(estimate.smallest.as_dict())}."]
 
 
 def advice_lines(estimate: Estimate) -> list[str]:
@@ -134,9 +143,10 @@ def exam_spread(estimate: Estimate) -> float | None:
 
 def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Sequence[MassDocument]) -> list[str]:
     lines, found = [], estimate.diagnostics
-    if estimate.detection is not None:
+    if estimate.probability is not None:
         which = f"{number}. " if (number := numbered(masses)) else ""
-        lines.append(f"{which}Probability of a lump: {estimate.detection.probability:.3f}.")
+        prior = f"where {100 * SHARE_WITH_LUMP:g} % of exams hold one"
+        lines.append(f"{which}Probability of a lump: {chance_text(estimate.probability)}, {prior}.")
     lines += mass_lines(masses)
     if estimate.size is not None:
         spread = exam_spread(estimate)

@@ -8,13 +8,14 @@ from typing import Final
 
 from tactile_bayes import __version__
 from tactile_bayes.mapping.orientation import orientation_of
+from tactile_bayes.posterior.abstention import chance_text
+from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report.exam import Exam, Quantity
 from tactile_bayes.report.exam_dial import breast_dial
-from tactile_bayes.report.exam_picture import Frame, colour_bar, exam_picture, small_pictures
+from tactile_bayes.report.exam_picture import Frame, colour_bar, exam_picture, marked, small_pictures
 from tactile_bayes.report.exam_ruler import size_ruler
 from tactile_bayes.report.exam_words import (
-    detail_sentence,
     facts,
     finding_sentences,
     headline,
@@ -27,6 +28,7 @@ from tactile_bayes.report.exam_words import (
     size_sentences,
     why_no_clock,
 )
+from tactile_bayes.report.smallest_picture import smallest_pictures
 
 TITLE: Final = "Tactile exam"
 NO_MAP: Final = (
@@ -88,6 +90,7 @@ def exam_page(exam: Exam) -> str:
         *_paragraphs([_cut(text, longest) for text in finding_sentences(exam, most)], kind="caution"),
         '<div class="columns"><div class="figure">',
         *_picture(exam),
+        *_smallest(exam),
         *_place(exam),
         "</div><div>",
         *_findings(exam),
@@ -139,8 +142,8 @@ def _picture(exam: Exam) -> Iterator[str]:
         lines.append(f"Full line: the estimated size{of_all}; dashed: the ends of its interval.")
     elif exam.disagrees:
         lines.append("Full line: the size by this map alone; dashed: the ends of its interval.")
-    if not exam.main.masses:
-        lines.append("Crosses: the highest rises, none of which was taken for a lump.")
+    if marked(exam.main) is not None:
+        lines.append("Cross: the rise that the reason is about.")
     view = orientation_of(tactile_map)
     sides = "; R, L: the patient's right and left; H: head, F: feet" if view.notch is not None else ""
     lines.append(f"{view.words[0].upper()}{view.words[1:]}{sides}.")
@@ -154,7 +157,6 @@ def _findings(exam: Exam) -> Iterator[str]:
     size = largest(exam)
     if size is None:
         yield from _paragraphs(list(nothing_sentences(exam)))
-        yield from (f'<p class="small">{html.escape(_cut(text))}</p>' for text in [detail_sentence(exam)] if text)
     else:
         yield f"<h2>Size{_of_mass(exam)}</h2>"
         yield size_ruler(_intervals(exam, size))
@@ -163,6 +165,15 @@ def _findings(exam: Exam) -> Iterator[str]:
     if narrowing:
         yield "<h2>How sure</h2>"
         yield from _paragraphs(narrowing)
+
+
+def _smallest(exam: Exam) -> Iterator[str]:
+    """What the map would have shown, by place and depth."""
+    smallest, tactile_map = exam.main.document.get("smallest_lump"), exam.main.tactile_map
+    if smallest is None or tactile_map is None:
+        return
+    yield "<h2>Smallest ball that would have shown: diameter in mm</h2>"
+    yield f'<div class="repeats">{"".join(smallest_pictures(tactile_map, smallest))}</div>'
 
 
 def _of_mass(exam: Exam) -> str:
@@ -180,13 +191,10 @@ def _place(exam: Exam) -> Iterator[str]:
     yield from _paragraphs([place_sentence(mass, INTERVAL if size is None else size["probability"])])
     if mass.probability is not None:
         which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
-        yield from _paragraphs([f"Probability that it is a lump, by {which}: {_chance(mass.probability)}."])
+        told = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
+        yield from _paragraphs([f"{told}, where one such exam in {1 / SHARE_WITH_LUMP:g} holds one."])
     yield from (f'<p class="small">{html.escape(text)}</p>' for text in [why_no_clock(exam)] if text)
     yield "</div></div>"
-
-
-def _chance(probability: float) -> str:
-    return "above 0.999" if probability > 0.999 else f"{probability:.3f}"
 
 
 def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:

@@ -85,6 +85,12 @@ def _map_of(exam: ExamMap) -> TactileMap:
     return exam.tactile_map
 
 
+def marked(exam: ExamMap) -> tuple[float, float] | None:
+    """Place that the reason for no size is about, where no mass is drawn there; None without one."""
+    place = exam.document.get("about_mm")
+    return None if exam.masses or place is None else (place["x"], place["y"])
+
+
 def colour_limits(exam: ExamMap) -> tuple[float, float]:
     """Values at the ends of the colours: a rib beside the lump does not take them all, noise alone is no lump."""
     tactile_map, document = _map_of(exam), exam.document
@@ -258,15 +264,15 @@ def _text(x: float, y: float, text: str, *, size: float, anchor: str = "middle")
 
 
 def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
-    """Scale bar, nipple, direction of the sternal notch, and the places looked at in vain."""
+    """Scale bar, nipple, direction of the sternal notch, and the place that a reason for no size is about."""
     width, height = frame.size_mm
     length = next((one for one in _SCALE_BARS_MM if frame.scale * one >= _LEAST_BAR_MM), _SCALE_BARS_MM[-1])
     yield _stroked(f"M4 {height - 4:.2f}h{frame.scale * length:.2f}", 0.9, kind="scale")
     yield _text(4 + frame.scale * length / 2, height - 5.6, f"{length:g} mm", size=3.2)
-    if not exam.masses:
-        for one in exam.document["candidates"]:
-            x, y = frame.at((one["x_mm"], one["y_mm"]))
-            yield _stroked(f"M{x - 1:.2f} {y - 1:.2f}l2 2m0 -2l-2 2", 0.3, kind="looked-at")
+    place = marked(exam)
+    if place is not None:
+        x, y = frame.at(place)
+        yield _stroked(f"M{x - 1.5:.2f} {y - 1.5:.2f}l3 3m0 -3l-3 3", 0.4, kind="meant")
     nipple = frame.tactile_map.nipple_mm
     if nipple is not None:
         yield from _nipple((float(nipple[0]), float(nipple[1])), frame)

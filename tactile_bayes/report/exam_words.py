@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.abstention import NO_LUMP
 from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.clock_face import clock_text
@@ -17,8 +18,8 @@ from tactile_bayes.report.exam import Exam, ExamMass, Quantity
 from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.narrowing import width_lines
 from tactile_bayes.report.size_text import shape_text
+from tactile_bayes.report.smallest_text import smallest_text
 
-UNDETECTED: Final = ("undetected", "empty")
 _OPTIONS: Final = re.compile(r" \((?:estimate|calibrate)[^)]*\)")
 _LEFT_OUT: Final = (
     ("dropped_low", "pressed too lightly"),
@@ -39,7 +40,7 @@ def headline(exam: Exam) -> str:
         return _capital(exam.document["reason"])
     if masses:
         return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
-    return "No lump found in the area covered" if exam.main.document["reason_code"] in UNDETECTED else "No size"
+    return "No lump found in the area covered" if exam.main.document["reason_code"] in NO_LUMP else "No size"
 
 
 def largest(exam: Exam) -> Quantity | None:
@@ -94,8 +95,7 @@ def _supposed(exam: Exam) -> str:
 
 
 def nothing_sentences(exam: Exam) -> Iterator[str]:
-    """Why there is no size, what would help, and what was covered."""
-    document = exam.document
+    """Why there is no size, what could have been missed, and what would help."""
     if exam.disagrees:
         yield "No common size is given: look at each map."
         for number, one in enumerate(exam.document["maps"], start=1):
@@ -104,25 +104,21 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
                 ends = f"{_percent(size)}: {size['low']:.1f} to {size['high']:.1f} mm"
                 yield f"By map {number} alone the largest diameter is about {size['median']:.1f} mm ({ends})."
         return
-    if exam.main.document["reason_code"] in UNDETECTED:
-        tactile_map = exam.main.tactile_map
+    document, tactile_map = exam.main.document, exam.main.tactile_map
+    if exam.pooled is not None:
+        yield f"{_capital(exam.pooled['reason'])}."
+    if document["reason_code"] in NO_LUMP:
         area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
         yield f"No lump was found in the area that was covered{area}."
-        chance = exam.main.document["detected_probability"]
-        if chance is not None:
-            yield f"Probability that the likeliest rise on the map is a lump: {chance_text(chance)}."
-    if document.get("advice"):
-        yield f"What would help: {document['advice']}."
-    if not exam.main.masses:
-        yield "A lump may lie outside the area that was covered, or be too small, too deep or too soft to show."
-        yield "The program does not say from one map how small a lump it would have found."
-
-
-def detail_sentence(exam: Exam) -> str:
-    """Why there is no size, as the program's other reports give it; empty where there is one."""
-    document = exam.document
-    reason = document["reason"] if largest(exam) is None and not exam.disagrees else ""
-    return f"In detail: {reason.replace('cm2', 'cm²')}." if reason else ""
+        if document["reason_code"] == "ridge":
+            yield "What rises at the cross on the picture is long like a rib, not round like a lump."
+        if document.get("smallest_lump"):
+            yield f"{smallest_text(document['smallest_lump'])}."
+        yield "A lump may be smaller, deeper or softer than these, or lie outside the area that was covered."
+    else:
+        yield f"{_capital(document['reason'])}."
+    if document.get("on_paper"):
+        yield f"What would help: {document['on_paper']}."
 
 
 def place_sentence(mass: ExamMass, probability: float) -> str:
@@ -263,7 +259,7 @@ def _age(exam: Exam) -> str:
 def mass_row(mass: ExamMass) -> tuple[str, str, str]:
     """Number, size with its interval, and place of a mass, for a table of several."""
     if mass.largest is None:
-        chance = "" if mass.probability is None else f" (probability of a lump {mass.probability:.2f})"
+        chance = "" if mass.probability is None else f" (probability of a lump {chance_text(mass.probability)})"
         size = f"no size{chance}: {mass.why}"
     else:
         size = f"{mass.largest['median']:.1f} mm ({mass.largest['low']:.1f} to {mass.largest['high']:.1f})"

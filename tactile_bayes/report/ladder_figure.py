@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_bayes.posterior.options import DETECTED
+from tactile_bayes.posterior.lump_probability import LIKELY
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.studies.cost_ladder import Ladder, Priced
@@ -80,7 +80,7 @@ def _lines(axes: Axes, ladder: Ladder) -> None:
     """The interval's half width, the tolerance and the reference's own error, each named at the right."""
     answer = ladder.reference.answer
     if answer is None:
-        axes.axhline(DETECTED, color="0.5", ls="--", lw=1.0, label=f"needed for a size, {DETECTED:g}")
+        axes.axhline(LIKELY, color="0.5", ls="--", lw=1.0, label=f"needed for a size, {LIKELY:g}")
         return
     named = (
         (answer.half_width_mm, "k", "-", "half width of the interval"),

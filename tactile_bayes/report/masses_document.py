@@ -10,6 +10,7 @@ import numpy as np
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.summary import Quantity, nine_digits
 from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.result import Mass
 from tactile_bayes.report.lump_place import lump_place
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, estimate_quantities
@@ -106,7 +107,7 @@ def mass_words(mass: MassDocument, here: MassDocument | None) -> str:
     if here is not None:
         for pair in touching_masses([here, mass]):
             told += f"; may be one lump with mass {here['number']}, {together_words(pair)}"
-    return f"{place}: {told}; probability of a lump {mass['detected_probability']:.3f}"
+    return f"{place}: {told}; probability of a lump {chance_text(mass['detected_probability'])}"
 
 
 def numbered(masses: Sequence[MassDocument]) -> str:

@@ -12,6 +12,7 @@ from tactile_bayes.abstention import Abstention
 
 FARTHEST = {"amplitude": 2.0, "sigma_mm": 1.2}
 """Sizes are given up to this multiple of the largest value in the table, and down to its smallest over it."""
+UNLIKE_ON_PAPER = "nothing by this exam: the lump is unlike those that sizes were learned from"
 UNITS = {"amplitude": "", "sigma_mm": " mm"}
 Domain = Mapping[str, tuple[float, float]]
 
@@ -40,7 +41,8 @@ def extrapolated(far: Sequence[str]) -> Abstention:
         "learn a calibration whose table holds such lumps (`population`, `calibrate size`), or give "
         "--size-calibration none for amplitude and widths"
     )
-    return Abstention("extrapolated", f"too far outside the calibration's range for a size: {'; '.join(far)}", advice)
+    reason = f"too far outside the calibration's range for a size: {'; '.join(far)}"
+    return Abstention("extrapolated", reason, advice, UNLIKE_ON_PAPER)
 
 
 def _beyond(domain: Domain, amplitude: float, sigma_mm: float, *, factors: Mapping[str, float]) -> list[str]:

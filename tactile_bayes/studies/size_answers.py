@@ -62,9 +62,8 @@ def answer_of(estimate: Estimate, *, probability: float) -> SizeAnswer:
     probability
         Of the intervals.
     """
-    chance = None if estimate.detection is None else estimate.detection.probability
     if estimate.map_posterior is None or estimate.draws is None:
-        return SizeAnswer(estimate.reason, chance, code=estimate.code)
+        return SizeAnswer(estimate.reason, estimate.probability, code=estimate.code)
     replicates = estimate.draws.replicates
     found = {
         name: summarise(getattr(estimate.map_posterior, name), probability=probability, replicates=replicates)
@@ -74,7 +73,7 @@ def answer_of(estimate: Estimate, *, probability: float) -> SizeAnswer:
     if estimate.size is not None:
         found[SIZE] = estimate.size.summarise(SIZE, probability=probability)
         shares = estimate.size.variance_share
-    return SizeAnswer("", chance, found, estimate.draws.method, shares)
+    return SizeAnswer("", estimate.probability, found, estimate.draws.method, shares)
 
 
 @dataclass(frozen=True, slots=True)

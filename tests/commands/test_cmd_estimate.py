@@ -77,7 +77,7 @@ def test_text_tells_the_size_its_interval_and_what_was_left_out(ensemble_run: Co
     for words in (
         "95 % interval (equal-tailed)",
         "largest size",
-        "Probability of a lump: 1.000.",
+        "where 50 % of exams hold one.",
         "What makes the interval wide:",
         "Method ensemble: Monte-Carlo error of the interval ends: sizes",
         "; R-hat 1.0",
@@ -114,7 +114,7 @@ def test_no_lump_is_an_answer_with_its_reason_and_exit_6(folder: Path, tmp_path:
     output = tmp_path / "p.nc"
     done = run_here("estimate", "empty.nc", *FAST, "-o", output, cwd=folder)
     assert done.returncode == 6
-    assert done.stdout.startswith("No lump found on the 26 cm2 that the map covers (probability of one below 0.001")
+    assert done.stdout.startswith("No lump found on the 26 cm2 that the map covers: ")
     assert "Research use only" in done.stdout
     assert not output.exists()
 

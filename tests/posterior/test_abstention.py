@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map, bump_values, grid_map
 
-from tactile_bayes.abstention import CODES
+from tactile_bayes.abstention import CODES, NO_LUMP
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.posterior import estimate, search
-from tactile_bayes.posterior.abstention import extend_advice, fault_code, missing_strokes, shape_fault
+from tactile_bayes.posterior.abstention import extend_advice, missing_strokes, no_bump, shape_fault
 from tactile_bayes.posterior.correlated import draw as methods
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
+from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import Candidate, fit_bump
 from tactile_bayes.report.estimate_text import estimate_text
 
@@ -39,7 +41,7 @@ def cut(*, right: int) -> np.ndarray:
     ("values", "code", "advice"),
     [
         (np.full((9, 9), np.nan), "empty", "map a scan"),
-        (np.ones((51, 51)), "empty", ""),
+        (np.ones((51, 51)), "empty", "go over the place again"),
         (1 + WHITE, "undetected", "go over the place again"),
         (cut(right=1), "window", "mm to the picture's right (+x)"),
     ],
@@ -49,6 +51,8 @@ def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advi
     assert found.status == "no_estimate"
     assert (found.code, found.code in CODES) == (code, True), found.reason
     assert advice in found.advice
+    assert found.on_paper
+    assert "--" not in found.on_paper  # a reader of the page has no command line
     text = estimate_text(found, grid_map(values), probability=0.95)
     assert ("What would help" in text) == bool(found.advice)
 
@@ -70,7 +74,7 @@ def test_cells_too_large_to_show_a_lump_are_no_verdict_on_the_breast() -> None:
     [
         ({"sigma_x": 16.0, "sigma_y": 16.0}, "wider than the window", "window", "fit a larger window"),
         ({"sigma_x": 0.3, "sigma_y": 0.3, "x": 0.0, "y": 0.0}, "narrower than a cell", "unresolved", "--cell-mm"),
-        ({"sigma_x": 12.0, "sigma_y": 1.5, "x": 0.0, "y": 0.0}, "a ridge", "unresolved", "rib"),
+        ({"sigma_x": 12.0, "sigma_y": 1.5, "x": 0.0, "y": 0.0}, "a ridge", "ridge", "rib"),
         ({"amplitude": -0.3}, "a depression", "undetected", ""),
     ],
 )
@@ -80,13 +84,17 @@ def test_a_bump_that_cannot_be_measured_has_its_code(
     tactile_map = grid_map(bump_values(half_mm=45.0, **bump))
     fit, found = fit_bump(tactile_map, (bump.get("x", 1.3), bump.get("y", -0.8)), options=FitOptions())
     assert fault in found
-    answer = fault_code(tactile_map, Candidate((0.0, 0.0), fit, found))
-    assert answer[0] == code
-    assert advice in answer[1]
+    candidate = Candidate((0.0, 0.0), fit, found)
+    lump = Weighed(Detection(1.0, 50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
+    answer = no_bump(tactile_map, [candidate], lump, where="here")
+    assert answer.code == code
+    assert advice in answer.advice
+    assert answer.about_mm == (0.0, 0.0)
+    assert "--" not in answer.on_paper
 
 
 @pytest.mark.parametrize("centre", [None, (3.0, 2.0)])
-def test_no_lump_is_said_first_with_its_probability_and_the_place(centre: tuple[float, float] | None) -> None:
+def test_no_lump_is_said_first_with_the_place(centre: tuple[float, float] | None) -> None:
     tactile_map = grid_map(1 + WHITE)
     fit = replace(FIELD, centre_mm=centre)
     found = estimate_map(tactile_map, calibration=None, options=EstimateOptions(fit=fit), rng=np.random.default_rng(1))
@@ -94,9 +102,8 @@ def test_no_lump_is_said_first_with_its_probability_and_the_place(centre: tuple[
     assert first.startswith("No lump found ")
     assert ("on the 26 cm2 that the map covers" if centre is None else "near (3.0, 2.0) mm") in first
     assert "strokes" not in found.advice
-    assert found.detection is None or found.detection.probability < 0.5
-    if centre is None:
-        assert "(probability of one " in first
+    assert "probability" not in first
+    assert found.probability is None or found.probability < 0.5
 
 
 def test_rises_at_the_rim_of_an_empty_map_do_not_ask_for_strokes() -> None:
@@ -161,10 +168,9 @@ def test_when_every_method_fails_there_is_no_number(monkeypatch: pytest.MonkeyPa
     assert "importance: too heavy; ensemble: too heavy" in found.reason
 
 
-def test_assuming_no_lump_gives_its_probability_only() -> None:
+def test_where_no_lump_is_assumed_there_is_no_size() -> None:
     found = run(bump_values() + WHITE, scene="none")
-    assert found.status == "no_estimate"
-    assert "probability of 1" in found.reason
+    assert (found.status, found.code, found.reason) == ("no_estimate", "undetected", "no lump was assumed")
 
 
 @pytest.mark.parametrize("options", [{"scene": "round"}, {"accuracy_mm": 0.1}])
@@ -208,4 +214,4 @@ def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
     found = estimate.estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     assert (Odd.drawings > 0) == drawn
     assert found.status == ("estimate" if drawn else "no_estimate")
-    assert drawn or found.code == "unresolved"
+    assert drawn or found.code in ("unresolved", *NO_LUMP)

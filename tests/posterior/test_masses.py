@@ -202,7 +202,7 @@ def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
     assert masses[1]["centre_mm"]["x"] == pytest.approx(WIDE[0], abs=0.5)
     assert masses[1]["centre_patient_mm"] is None
     text = run_here(*words, cwd=tmp_path).stdout
-    assert "Mass 1 of 2: probability of a lump 1.000" in text
+    assert "Mass 1 of 2: probability of a lump 0.9" in text
     assert "Mass 2 at (-16.9, 1.9) mm, 33 mm from mass 1: largest size " in text
     assert "a second lump within 20 mm" in text
     bare = json.loads(run_here(*words, "--json", "--size-calibration", "none", cwd=tmp_path).stdout)["masses"]

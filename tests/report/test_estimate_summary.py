@@ -168,7 +168,7 @@ def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show(
     for one, shown in ((full, quantities), (full, quantities | size), (sized, quantities | another)):
         text = estimate_summary(one, shown, probability=0.9, masses=masses)
         assert len(text.splitlines()) <= MOST_LINES
-        assert "Mass 1 of 10: probability of a lump 1.000" in text
+        assert "Mass 1 of 10: probability of a lump 0.9" in text
         listed = re.findall(r"^Mass \d+ at .*$", text, re.MULTILINE)
         assert f"; and {9 - len(listed)} more masses." in listed[-1]
         assert "40 % of the width variance is tracker position error" in text

@@ -87,13 +87,24 @@ def exam(scans: tuple[Mapping[str, str], ...] = SCANS, **more: Any) -> Exam:
     return Exam((exam_map(tactile_map, document, side=side),), None, scans, **more)
 
 
-def without_lump(reason_code: str = "undetected") -> Exam:
+SMALLEST = {
+    "probability": 0.95,
+    "depths_mm": [8.0, 15.0],
+    "best_mm": [5.5, 13.0],
+    "worst_mm": [7.0, None],
+    "spacing_mm": 20.0,
+    "places": [{"x_mm": -10.0, "y_mm": 0.0, "d_mm": [5.5, 13.0]}, {"x_mm": 10.0, "y_mm": 0.0, "d_mm": [7.0, None]}],
+}
+
+
+def without_lump(reason_code: str = "undetected", **more: Any) -> Exam:
     tactile_map, document = demo()
     nothing = dict.fromkeys(
         ("max_size_mm", "min_size_mm", "another_exam", "centre_mm", "amplitude", "background", "variance_share")
     )
     told = {"reason": "no lump found on the 50 cm2 that the map covers", "reason_code": reason_code}
     gone = {**document, **nothing, **told, "status": "no_estimate", "masses": [], "detected_probability": 0.03}
+    gone |= {"smallest_lump": SMALLEST, "on_paper": "scan the place again", "about_mm": None, **more}
     return Exam((exam_map(tactile_map, gone, side="left"),), None, SCANS)
 
 
@@ -226,21 +237,34 @@ def test_the_ellipses_are_drawn_to_scale() -> None:
     assert float(bar["d"].split("h")[1]) == pytest.approx(10 * scale, rel=0.01)
 
 
-def test_no_lump_found_is_told_with_what_was_covered() -> None:
+def test_no_lump_found_is_told_with_what_was_covered_and_what_would_have_shown() -> None:
     page = Page(exam_page(without_lump()))
     for text in (
         "No lump found in the area covered",
         "No lump was found in the area that was covered: ",
         "cm² with 10 readings a cell or more",
-        "Probability that the likeliest rise on the map is a lump: 0.03.",
-        "A lump may lie outside the area that was covered, or be too small, too deep or too soft to show.",
-        "The program does not say from one map how small a lump it would have found.",
+        "5.5 to 7 mm at a depth of 8 mm; 13 to more than 30 mm at a depth of 15 mm",
+        "A lump may be smaller, deeper or softer than these, or lie outside the area that was covered.",
+        "What would help: scan the place again.",
+        "8 mm deep",
         RESEARCH_USE,
     ):
         assert text in page.words, text
+    assert page.words.index("No lump was found") < page.words.index("What would help")  # the reason first
+    assert "robability" not in page.words.replace("Probability that", "")
+    assert page.named("path", **{"class": "meant"}) == []  # no cross: the reason is about no one place
     assert page.named("path", **{"class": "size"}) == []
     assert "about" not in headline(without_lump())
     assert headline(without_lump("window")) == "No size"  # a rise that cannot be measured is not "no lump"
+    assert headline(without_lump("ridge")) == "No lump found in the area covered"
+
+
+def test_one_cross_marks_the_rise_that_the_reason_is_about() -> None:
+    page = Page(exam_page(without_lump("ridge", about_mm={"x": 3.0, "y": 2.0})))
+    assert len(page.named("path", **{"class": "meant"})) == 1
+    assert "What rises at the cross on the picture is long like a rib, not round like a lump." in page.words
+    assert "Cross: the rise that the reason is about." in page.words
+    assert "--" not in page.words
 
 
 def unsized(reason: str) -> dict[str, Any]:
@@ -303,12 +327,12 @@ def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     assert "How good the exam was (map 2)" in page.words
     assert "1: no size" in page.words
     assert "Map 2 of 2. Full line: the estimated size of all maps; dashed: the ends of its interval." in page.words
-    assert "Probability that it is a lump, by map 2: above 0.999." in page.words
+    assert "Probability that it is a lump, by map 2: 0.9" in page.words
     assert len(page.named("path", **{"class": "size-high"})) == 1
     alone = Page(exam_page(Exam((with_lump,), None, SCANS))).words
     assert "Map 1 of" not in alone
     assert "Full line: the estimated size; dashed" in alone
-    assert "by this map: above 0.999." in alone
+    assert "by this map: 0.9" in alone
 
 
 def test_what_was_reached_is_told_by_the_patients_left_and_right() -> None:

@@ -155,6 +155,14 @@ class CollapsedTarget:
         self._made_up = total - float(np.logaddexp.reduce(left))
         return before != self.chosen_fields()
 
+    def settle_lengths(self) -> None:
+        """Keep only the lengths with evidence where there is no structure, each with all its shares."""
+        dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
+        found = self._walk(lambda columns: columns.null_evidence(dof=dof))
+        total = float(np.logaddexp.reduce(np.concatenate([one for _, one in found])))
+        self._fields = [columns for columns, one in found if one.max() > total + np.log(NEGLIGIBLE)]
+        self._made_up = 0.0
+
     def chosen_fields(self) -> list[tuple[float, tuple[float, ...]]]:
         """Correlation lengths in the mixture, each with its shares."""
         return [(columns.field.length_mm, tuple(columns.shares)) for columns in self._fields or ()]

@@ -21,12 +21,12 @@ MOST_BLOCKS = 480
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """Odds of a bump against none.
+    """Odds of a bump against smooth errors alone; see `lump_probability` for whether it is a lump.
 
     Parameters
     ----------
     probability
-        Posterior probability of a bump at even prior odds.
+        Of a bump, at even odds and if there were only bumps and smooth errors.
     log_bayes_factor
         Natural log of the evidence ratio.
     ridge

@@ -30,8 +30,10 @@ def estimate(values: np.ndarray) -> Estimate:
 def test_a_ridge_alone_gets_no_number(seed: int) -> None:
     found = estimate(1.0 + ridge(seed) + errors(seed))
     assert found.status == "no_estimate"
-    assert found.code == "undetected"
+    assert found.code == "ridge"
     assert "a ridge along" in found.reason
+    assert found.probability is not None
+    assert found.probability < 0.5
 
 
 def test_it_would_get_one_if_only_noise_were_asked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,46 @@
+"""The probability of a lump: what lowers it, and that it agrees with the verdict."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from posterior_maps import bump_values, grid_map
+
+from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
+from tactile_bayes.posterior.white.detection import detection_from_odds
+
+CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4.5), "fault": ""}
+
+
+def weighed(**changes: object) -> Weighed:
+    given = {**CLEAR, **changes}
+    detection = detection_from_odds(given.pop("log_bayes_factor"))  # type: ignore[arg-type]
+    return weigh(grid_map(bump_values(x=0.0, y=0.0)), detection, **given)  # type: ignore[arg-type]
+
+
+def test_a_clear_round_rise_is_a_lump() -> None:
+    assert weighed().probability > 0.95
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"widths_mm": (11.8, 0.59)},  # the stripe of the packaged empty scan
+        {"widths_mm": (14.0, 10.6), "log_bayes_factor": 4.8},  # a rib of a simulated body
+        {"centre_mm": (26.0, 26.0), "fault": "at the rim of the map (20 % of the bump is covered)"},
+        {"log_bayes_factor": -5.0},
+    ],
+)
+def test_ridges_rims_ribs_and_errors_are_none(changes: dict[str, object]) -> None:
+    assert weighed(**changes).probability < LIKELY
+
+
+def test_more_evidence_never_lowers_it() -> None:
+    found = [weighed(log_bayes_factor=value).probability for value in np.linspace(-20.0, 100.0, 25)]
+    assert (np.diff(found) >= 0).all()
+
+
+def test_without_the_evidence_for_a_size_it_is_never_told_as_a_lump() -> None:
+    """The control: with it the same rise is."""
+    assert max(weighed(log_bayes_factor=value).probability for value in (-np.inf, -3.0, 0.0, 2.9)) < LIKELY
+    assert weighed(log_bayes_factor=3.0).probability > LIKELY

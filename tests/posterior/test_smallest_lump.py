@@ -1,0 +1,53 @@
+"""The smallest lump that a map without one would have shown."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from posterior_maps import bump_values, grid_map
+
+from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+from tactile_bayes.posterior.smallest_lump import WIDTHS_MM, needed_amplitudes, smallest_lumps
+
+FIELD = EstimateOptions(method="laplace", fit=FitOptions(background="free", noise="field"), draws=400)
+
+
+def noise(sd: float = 0.01) -> np.ndarray:
+    return sd * np.random.default_rng(6).standard_normal((51, 51))
+
+
+def empty(sd: float = 0.01) -> TactileMap:
+    return grid_map(1.0 + noise(sd))
+
+
+def test_deeper_lumps_must_be_larger_and_noisier_maps_show_only_larger_ones() -> None:
+    quiet, loud = (smallest_lumps(empty(sd), fat_mm=15.0) for sd in (0.01, 0.05))
+    assert list(quiet.depths_mm) == [8.0, 11.0, 15.0]
+    assert (np.diff(quiet.d_mm, axis=1) >= 0).all()
+    assert (quiet.d_mm[:, -1] > quiet.d_mm[:, 0]).all()
+    assert (loud.d_mm > quiet.d_mm).all()
+
+
+def test_places_lie_on_what_is_covered() -> None:
+    values = 1.0 + noise()
+    values[:, 26:] = np.nan
+    found = smallest_lumps(grid_map(values), fat_mm=15.0)
+    assert (found.places_mm[:, 0] < 1.0).all()
+    assert len(found.places_mm) <= 30
+
+
+def test_as_plain_data_a_lump_that_nothing_shows_is_null() -> None:
+    told = smallest_lumps(empty(1.0), fat_mm=30.0).as_dict()
+    assert told["worst_mm"][-1] is None
+    assert told["probability"] == 0.95
+
+
+@pytest.mark.parametrize(("times", "shown"), [(2.0, True), (0.4, False)])
+def test_a_bump_well_above_the_needed_amplitude_is_found_and_one_below_is_not(times: float, shown: bool) -> None:
+    width = float(WIDTHS_MM[2])
+    amplitude = times * needed_amplitudes(empty(), (0.0, 0.0))[2]
+    bump = bump_values(x=0.0, y=0.0, sigma_x=width, sigma_y=width, amplitude=amplitude)
+    found = estimate_map(grid_map(bump + noise()), calibration=None, options=FIELD, rng=np.random.default_rng(1))
+    assert (found.status == "estimate") == shown
