@@ -110,7 +110,7 @@ def test_a_comparison_is_at_the_sites_repeatability(site: Path, tmp_path: Path) 
         assert "repeatability" in [one["role"] for one in document["provenance"]["inputs"]]
         (found[name],) = document["changes"]
         assert found[name]["another_exam"] is None
-    least = {name: np.log1p(one["smallest_detectable_percent"] / 100) / 1.96 for name, one in found.items()}
+    least = {name: np.log1p(one["smallest_detectable_percent"]["growth"] / 100) / 1.96 for name, one in found.items()}
     apart = 2 * (spread["site"] ** 2 - spread["alike"] ** 2)
     assert least["site"] ** 2 - least["alike"] ** 2 == pytest.approx(apart, rel=0.15)
     plain = run_here(*words, cwd=tmp_path).stdout
