@@ -12,6 +12,7 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes as tb
+from tactile_bayes.errors import UsageError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.size.body_calibration import BodyCalibration
@@ -123,7 +124,7 @@ def test_python_gives_what_the_file_holds(folder: Path) -> None:
     one, two = (tb.estimate(folder / "demo.nc", size_calibration=c, method="laplace") for c in (given, written))
     assert one.max_size_mm is not None and two.max_size_mm is not None  # noqa: PT018
     assert one.max_size_mm.median == pytest.approx(two.max_size_mm.median, rel=1e-6)
-    with pytest.raises(TypeError, match="leave them out"):
+    with pytest.raises(UsageError, match="leave them out"):
         tb.calibrate_size(table(), correct="solid", form="eq6-residual")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import tactile_bayes as tb
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.coarse_frames import POOL_S, every_stretch, thinning
 from tactile_bayes.mapping.thinning import every_nth, first_seconds
@@ -48,7 +48,7 @@ def test_the_first_seconds_are_those():
 
 @pytest.mark.parametrize("every", [0, -2, 1.5, True])
 def test_a_number_that_is_none_is_refused(every):
-    with pytest.raises(BadDataError, match=r"every is .*; give a whole number from 1 on"):
+    with pytest.raises(UsageError, match=r"every is .*; give a whole number from 1 on"):
         build_map(scan(), every=every)
 
 

@@ -203,8 +203,8 @@ def put(value: Any, *where: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (drop("x"), "must contain"),
-        (drop("recipe"), "must contain"),
+        (drop("x"), "has no x"),
+        (drop("recipe"), "has no recipe"),
         (put("tactile-bayes/size-calibration/2", "schema"), "schema"),
         (put("log-quadratic", "form"), "form"),
         (put("median", "recipe", "normalise"), "recipe.normalise"),
