@@ -15,8 +15,9 @@ from tactile_bayes.api.paths import PathLike
 from tactile_bayes.errors import UsageError
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.quantities import leading_size
 from tactile_bayes.report.size_text import exams_label
-from tactile_bayes.size.posterior import SIZES
+from tactile_bayes.size.posterior import EXTREMES, SIZES
 
 if TYPE_CHECKING:
     import pandas
@@ -48,7 +49,11 @@ class Sized:
 
     @property
     def max_size_mm(self) -> Draws | None:
-        """Largest diameter; None without a size."""
+        """Largest diameter if exams differ as simulated ones do, or by the spread of the site; None without a size.
+
+        These draws are the posterior's that `save` writes and `validate` reads. Where `max_size_another_exam_mm` is not
+        None, that is the one that reports lead with (docs/decisions/0130).
+        """
         return self._of_size("max_size_mm")
 
     @property
@@ -117,15 +122,19 @@ class Sized:
         return f"<{type(self).__name__} {' '.join([*cautions, self._words()])}>"
 
     def _words(self) -> str:
-        return f"no size: {self.why}" if self.max_size_mm is None else f"largest size {self.max_size_mm}"
+        size = self.max_size_another_exam_mm or self.max_size_mm
+        return f"no size: {self.why}" if size is None else f"largest size {size}"
 
     def _rows(self) -> Iterator[tuple[str, str]]:
         """Names and values of the notebook's table."""
-        sizes = (("largest size", self.max_size_mm), ("smallest size", self.min_size_mm))
-        yield from ((name, repr(draws)) for name, draws in sizes if draws is not None)
-        another = None if self._size is None else self._size.another_exam
-        if another is not None:
-            yield f"largest size {exams_label(another.figures['between_map_sd'])}", repr(self.max_size_another_exam_mm)
+        if self._size is None:
+            return
+        leads = leading_size(self._size)
+        for name in EXTREMES:
+            draws = Draws(np.atleast_2d(getattr(leads, name)), "mm", self.probability, leads.replicates)
+            yield f"{'largest' if name == 'max_size_mm' else 'smallest'} size", repr(draws)
+        if leads is not self._size:
+            yield f"largest size {exams_label(self._size.figures.get('between_map_sd'))}", repr(self.max_size_mm)
 
     def _repr_html_(self) -> str:
         told = "".join(f"<p>{escape(line)}</p>" for line in finding_lines(self.findings, paper=True))

@@ -96,7 +96,7 @@ def _group(estimate: EstimateFile, finding: SizedMass, maps: Sequence[MapFile], 
         group = sr.MeasurementsAndQualitativeEvaluations(**what)
     else:
         group = sr.PlanarROIMeasurementsAndQualitativeEvaluations(**what, referenced_region=region)
-    for text in (finding.reason, finding.another_exam):
+    for text in (finding.reason, finding.alike_exams):
         if text:
             group[0].ContentSequence.append(_text(codes.COMMENT, text))
     return group

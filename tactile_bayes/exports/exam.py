@@ -22,6 +22,8 @@ from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reading import open_input
 from tactile_bayes.findings import Finding, Verdict, finding_lines, findings_in, verdict
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.quantities import leading
+from tactile_bayes.report.size_text import exams_label
 
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
@@ -58,7 +60,7 @@ class SizedMass:
     number
         From 1, in the order of the estimate.
     largest, smallest
-        Quantities in mm as the estimate's JSON has them; None without a size.
+        Quantities in mm as the estimate's JSON has them, with the intervals that lead; None without a size.
     code
         Reason code of the estimate where there is no number; empty with a size.
     reason
@@ -67,8 +69,8 @@ class SizedMass:
         That there is a lump; None where the file does not tell.
     centre_mm, centre_patient_mm
         Medians of x and y in `plane` and in `patient`; None where the file does not tell.
-    another_exam
-        The interval if exams of the mass differ more, in words; empty where the file does not tell.
+    alike_exams
+        The interval if exams of the mass differ less, in words; empty where there is one interval.
     """
 
     number: int
@@ -79,7 +81,7 @@ class SizedMass:
     probability: float | None = None
     centre_mm: tuple[float, float] | None = None
     centre_patient_mm: tuple[float, float] | None = None
-    another_exam: str = ""
+    alike_exams: str = ""
 
     @property
     def outcome(self) -> Code:
@@ -238,21 +240,25 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
 def masses_of(document: Mapping[str, Any]) -> tuple[SizedMass, ...]:
     """The masses of an estimate's JSON object: those that it lists, or the one that it is of."""
     listed = document.get("masses") or ({"number": 1, **document},)
-    return tuple(_mass(one) for one in listed)
+    alike = (document.get("diagnostics") or document.get("figures") or {}).get("between_map_sd")
+    return tuple(_mass(one, alike) for one in listed)
 
 
-def _mass(mass: Mapping[str, Any]) -> SizedMass:
+def _mass(mass: Mapping[str, Any], alike: float | None) -> SizedMass:
+    """A mass with the sizes that lead, and in words the interval for exams that differ by `alike`."""
+    leads = leading(mass)
+    narrow = "" if leads is mass else f"{_capital(exams_label(alike))}: largest size {size_words(mass['max_size_mm'])}"
     code = "" if mass["max_size_mm"] else mass.get("reason_code") or "no size"
     return SizedMass(
         int(mass["number"]),
-        mass["max_size_mm"],
-        mass["min_size_mm"],
+        leads["max_size_mm"],
+        leads["min_size_mm"],
         code,
         plain_line(mass["reason"]) if code else "",
         mass.get("detected_probability"),
         _point(mass.get("centre_mm")),
         _point(mass.get("centre_patient_mm")),
-        _another_exam(mass.get("another_exam")),
+        narrow,
     )
 
 
@@ -264,11 +270,8 @@ def _point(point: Mapping[str, Any] | None) -> tuple[float, float] | None:
     return float(x), float(y)
 
 
-def _another_exam(another: Mapping[str, Any] | None) -> str:
-    size = another["max_size_mm"] if another else None
-    if another is None or size is None:
-        return ""
-    return f"If exams differ by {100 * another['between_map_sd']:.0f} %: largest size {size_words(size)}"
+def _capital(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def size_words(size: Mapping[str, Any]) -> str:

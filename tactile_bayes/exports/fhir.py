@@ -131,7 +131,7 @@ class _Exam:
     def _observation(self, role: str, code: dict[str, Any], finding: SizedMass) -> dict[str, Any]:
         site = codes.BREASTS.get(self.estimate.facts.get("side", ""))
         notes = [RESEARCH_USE, verdict_words(self.estimate), *self.estimate.lines]
-        notes += [finding.another_exam] if finding.another_exam else []
+        notes += [finding.alike_exams] if finding.alike_exams else []
         if len(self.estimate.masses) > 1:
             notes.append(f"Mass {finding.number} of {len(self.estimate.masses)}")
         return {
@@ -176,8 +176,8 @@ def _lines(estimate: EstimateFile) -> Iterator[str]:
             continue
         yield f"{mass}Largest size {size_words(one.largest)}."
         yield f"{mass}Smallest size {size_words(one.smallest)}."
-        if one.another_exam:
-            yield f"{mass}{one.another_exam}."
+        if one.alike_exams:
+            yield f"{mass}{one.alike_exams}."
     yield RESEARCH_USE
 
 

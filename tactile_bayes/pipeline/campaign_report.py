@@ -30,6 +30,7 @@ from tactile_bayes.pipeline.campaign_growth import growth_rows, growth_text
 from tactile_bayes.pipeline.campaign_tables import Row, exam_rows, write_tables
 from tactile_bayes.records import dataclass
 from tactile_bayes.report.growth import Growth, growth_line
+from tactile_bayes.report.quantities import leading
 from tactile_bayes.trial.visits import at_excision
 
 if TYPE_CHECKING:
@@ -325,7 +326,7 @@ def _card(campaign: Campaign, row: Row) -> Card:
         status=FAILED if row.document is None else UNSIZED if row.size is None else SIZED,
         facts=tuple(facts),
         reason=row.reason,
-        size=row.size,
+        size=None if row.document is None else leading(row.document)["max_size_mm"],
         findings=row.findings,
         thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
         links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},

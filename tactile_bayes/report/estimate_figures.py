@@ -60,18 +60,20 @@ def draw_size(
     force: bool,
 ) -> Figure:
     """Draw the posterior of the largest and smallest size with their intervals, and what speaks against them."""
+    from tactile_bayes.report.quantities import leading_size
     from tactile_bayes.report.size_figure import SizeInterval, size_figure
     from tactile_bayes.report.size_text import exams_label
 
-    quantities = {which: size.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
+    leads = leading_size(size)
+    quantities = {which: leads.summarise(f"{which}_size_mm", probability=probability) for which in ("max", "min")}
     intervals = {which: SizeInterval(q.low, q.high, q.probability, q.kind) for which, q in quantities.items()}
     if size.another_exam is not None:
-        q = size.another_exam.summarise("max_size_mm", probability=probability)
-        supposes = exams_label(size.another_exam.figures["between_map_sd"])
-        intervals["another"] = SizeInterval(q.low, q.high, q.probability, q.kind, supposes)
+        q = size.summarise("max_size_mm", probability=probability)
+        supposes = exams_label(size.figures.get("between_map_sd"))
+        intervals["alike"] = SizeInterval(q.low, q.high, q.probability, q.kind, supposes)
     return size_figure(
-        size.max_size_mm.ravel(),
-        size.min_size_mm.ravel(),
+        leads.max_size_mm.ravel(),
+        leads.min_size_mm.ravel(),
         path,
         intervals=intervals,
         title=f"Size of the lump: {name}",

@@ -12,9 +12,10 @@ from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import (
     ANOTHER_LARGEST,
+    ANOTHER_SMALLEST,
     advice_lines,
+    alike_spread,
     convergence_text,
-    exam_spread,
     no_estimate_line,
     size_decimals,
     size_table,
@@ -24,7 +25,7 @@ from tactile_bayes.report.estimate_text import (
 from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.masses_document import MassDocument, mass_lines, numbered
 from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
-from tactile_bayes.report.quantities import xiphoid_mm
+from tactile_bayes.report.quantities import leading_size, xiphoid_mm
 from tactile_bayes.report.scene_text import scene_line
 from tactile_bayes.report.supposed_text import supposed_document, supposed_line
 from tactile_bayes.size.posterior import EXTREMES
@@ -76,15 +77,15 @@ def _something(
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
     lines = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
     shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
-    table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST]
-    lines += size_table({name: quantities[name] for name in table}, probability, exam_spread=exam_spread(estimate))
+    table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST]
+    lines += size_table({name: quantities[name] for name in table}, probability, alike=alike_spread(estimate))
     lines += _lump(estimate, quantities, numbered(masses), place)
     after = [f"No size: {estimate.reason}.", *advice_lines(estimate)] if estimate.reason else []
     last = [*_quality(estimate, {name: quantities[name] for name in shown})]
     last += finding_summary(estimate.findings, "check", most=MOST_CHECKS)
     room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
     beside = _masses(masses, room=min(MOST_MASSES, room))
-    widths = [] if estimate.size is None else width_lines(estimate.size.variance_share)
+    widths = [] if estimate.size is None else width_lines(leading_size(estimate.size).variance_share)
     lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
     return [*lines, *_supposed(estimate, quantities)] if len(lines) < MOST_LINES - 2 else lines
 

@@ -18,7 +18,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.lump_place import place_line
 from tactile_bayes.report.masses_document import MassDocument, mass_lines, masses_document, numbered, others
 from tactile_bayes.report.narrowing import width_lines
-from tactile_bayes.report.quantities import ANOTHER_EXAM, estimate_quantities
+from tactile_bayes.report.quantities import ANOTHER_EXAM, estimate_quantities, leading_size
 from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
 from tactile_bayes.report.size_text import (
     SIZE_DECIMALS,
@@ -36,9 +36,11 @@ from tactile_bayes.report.supposed_text import supposed_document, supposed_lines
 from tactile_bayes.size.posterior import EXTREMES, SIZES
 
 ANOTHER_LARGEST = f"{ANOTHER_EXAM}.max_size_mm"
+ANOTHER_SMALLEST = f"{ANOTHER_EXAM}.min_size_mm"
 ROWS = (
+    (ANOTHER_LARGEST, "largest size", "mm"),
+    (ANOTHER_SMALLEST, "smallest size", "mm"),
     ("max_size_mm", "largest size", "mm"),
-    (ANOTHER_LARGEST, "if another exam may differ", "mm"),
     ("min_size_mm", "smallest size", "mm"),
     ("d_x_mm", "size across the head, d_x", "mm"),
     ("d_y_mm", "size along the head, d_y", "mm"),
@@ -85,7 +87,7 @@ def estimate_text(
         first = [*finding_lines(estimate.findings), no_estimate_line(estimate.reason), *smallest_lines(estimate)]
         first += advice_lines(estimate)
         return "\n".join([*first, *mass_lines(masses), *passed_over(estimate), RESEARCH_USE]) + "\n"
-    table = size_table(quantities, probability, exam_spread=exam_spread(estimate))
+    table = size_table(quantities, probability, alike=alike_spread(estimate))
     lines = [*finding_lines(estimate.findings, "caution"), *table, ""]
     if estimate.reason:
         lines += [f"No size: {estimate.reason}.", *advice_lines(estimate)]
@@ -116,29 +118,28 @@ def advice_lines(estimate: Estimate) -> list[str]:
     return [f"What would help: {estimate.advice}."] if estimate.advice else []
 
 
-def size_table(
-    quantities: Mapping[str, Quantity], probability: float, *, exam_spread: float | None = None
-) -> list[str]:
+def size_table(quantities: Mapping[str, Quantity], probability: float, *, alike: float | None = None) -> list[str]:
     """Table with a row per quantity; all sizes have the digits that the least certain one supports.
 
-    `exam_spread` is that of `SizePosterior.another_exam`, a share of the size: its interval gets a row.
+    Where sizes have two intervals that for exams of patients leads, and the narrower one of the largest size follows,
+    for exams whose spread `alike` is, a share of the size.
     """
     rows = [table_head(probability)]
     of_sizes = size_decimals([quantities[name] for name in SIZES if name in quantities])
     for name, label, unit in ROWS:
-        if name == ANOTHER_LARGEST and exam_spread is not None:
-            label = exams_label(exam_spread)
-        if name in quantities:
+        if name == "max_size_mm" and ANOTHER_LARGEST in quantities:
+            label = exams_label(alike)
+        if name in quantities and not (name == "min_size_mm" and ANOTHER_SMALLEST in quantities):
             q = quantities[name]
-            places = of_sizes if name in (*SIZES, ANOTHER_LARGEST) else decimals(q.mc_error)
+            sizes = (*SIZES, ANOTHER_LARGEST, ANOTHER_SMALLEST)
+            places = of_sizes if name in sizes else decimals(q.mc_error)
             rows.append(table_row(label, q.median, (q.low, q.high), unit=unit, places=places))
     return rows
 
 
-def exam_spread(estimate: Estimate) -> float | None:
-    """The spread between exams of the second interval, a share of the size; None where there is none."""
-    another = None if estimate.size is None else estimate.size.another_exam
-    return None if another is None else another.figures["between_map_sd"]
+def alike_spread(estimate: Estimate) -> float | None:
+    """The spread between exams of the narrower interval, a share of the size; None where it has none."""
+    return None if estimate.size is None else estimate.size.figures.get("between_map_sd")
 
 
 def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Sequence[MassDocument]) -> list[str]:
@@ -149,9 +150,10 @@ def _findings(estimate: Estimate, quantities: Mapping[str, Quantity], masses: Se
         lines.append(f"{which}Probability of a lump: {chance_text(estimate.probability)}, {prior}.")
     lines += mass_lines(masses)
     if estimate.size is not None:
-        spread = exam_spread(estimate)
-        lines += [] if spread is None else [two_intervals_text(estimate.size.figures.get("between_map_sd"), spread)]
-        lines += width_lines(estimate.size.variance_share)
+        another = estimate.size.another_exam
+        if another is not None:
+            lines.append(two_intervals_text(alike_spread(estimate), another.figures["between_map_sd"]))
+        lines += width_lines(leading_size(estimate.size).variance_share)
         if found is not None and found.repeatability:
             lines.append(site_interval_text(found.repeatability))
         largest = quantities["max_size_mm"]

@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.mapping.clock_face import ClockPosition, clock_position
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.report.masses_document import patient_mm
+from tactile_bayes.report.quantities import leading
 from tactile_bayes.size.pooling import DISAGREE
 
 Quantity = Mapping[str, Any]
@@ -28,10 +29,8 @@ class ExamMass:
         x and y in `plane`.
     axes_mm, angle_deg
         Diameters of the ellipse along its own axes, and the angle from x to the first; None without a size.
-    largest, smallest, another
-        Largest and smallest size, and the largest if exams differ more, as the estimate's JSON has them; None without.
-    another_sd
-        By how much exams differ for `another`, a share of the size.
+    largest, smallest
+        Largest and smallest size with the intervals that lead, as the estimate's JSON has them; None without.
     probability
         That it is a lump; None where it is not told.
     place
@@ -48,8 +47,6 @@ class ExamMass:
     angle_deg: float = 0.0
     largest: Quantity | None = None
     smallest: Quantity | None = None
-    another: Quantity | None = None
-    another_sd: float | None = None
     probability: float | None = None
     place: ClockPosition | None = None
     patient_mm: tuple[float, float] | None = None
@@ -109,7 +106,7 @@ class Exam:
         first, *others = self.main.masses
         if first.axes_mm is None or first.largest is None:
             return self.main
-        size = self.pooled["max_size_mm"]
+        size = leading(self.pooled)["max_size_mm"]
         along, across = (axis * size["median"] / first.largest["median"] for axis in first.axes_mm)
         return replace(self.main, masses=(replace(first, axes_mm=(along, across), largest=size), *others))
 
@@ -155,7 +152,7 @@ def _masses(tactile_map: TactileMap | None, document: Mapping[str, Any], side: s
 def _reported(number: int, tactile_map: TactileMap | None, document: Mapping[str, Any], side: str) -> ExamMass:
     point, angle = document["centre_mm"], document["angle_deg"]
     sized = document["max_size_mm"] is not None
-    another = document.get("another_exam")
+    leads = leading(document)
     return _placed(
         number,
         (point["x"]["median"], point["y"]["median"]),
@@ -165,10 +162,8 @@ def _reported(number: int, tactile_map: TactileMap | None, document: Mapping[str
         centre_sd_mm=(point["x"]["sd"], point["y"]["sd"]),
         axes_mm=(document["d_x_mm"]["median"], document["d_y_mm"]["median"]) if sized else None,
         angle_deg=0.0 if angle is None else angle["median"],
-        largest=document["max_size_mm"],
-        smallest=document["min_size_mm"],
-        another=None if another is None else another["max_size_mm"],
-        another_sd=None if another is None else another["between_map_sd"],
+        largest=leads["max_size_mm"],
+        smallest=leads["min_size_mm"],
         probability=document["detected_probability"],
         why="" if sized else document["reason"],
     )
@@ -176,8 +171,8 @@ def _reported(number: int, tactile_map: TactileMap | None, document: Mapping[str
 
 def _listed(one: Mapping[str, Any], tactile_map: TactileMap | None, side: str) -> ExamMass:
     """A mass besides the reported one."""
-    largest, another, angle = one["max_size_mm"], one["another_exam"], one["angle_deg"]
-    along, across = one["d_x_mm"], one["d_y_mm"]
+    leads, angle = leading(one), one["angle_deg"]
+    largest, along, across = leads["max_size_mm"], one["d_x_mm"], one["d_y_mm"]
     return _placed(
         one["number"],
         (one["centre_mm"]["x"], one["centre_mm"]["y"]),
@@ -187,9 +182,7 @@ def _listed(one: Mapping[str, Any], tactile_map: TactileMap | None, side: str) -
         axes_mm=None if largest is None else (along["median"], across["median"]),
         angle_deg=0.0 if angle is None else angle["median"],
         largest=largest,
-        smallest=one["min_size_mm"],
-        another=None if another is None else another["max_size_mm"],
-        another_sd=None if another is None else another["between_map_sd"],
+        smallest=leads["min_size_mm"],
         probability=one["detected_probability"],
         why=one["reason"],
     )

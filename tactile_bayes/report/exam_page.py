@@ -199,11 +199,12 @@ def _place(exam: Exam) -> Iterator[str]:
 
 def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
     """Both intervals of the largest size, with what they suppose."""
-    another = exam.document.get("another_exam")
-    found = [("this exam" if exam.pooled is None else "these exams", size)]
-    if another is not None:
-        found.append((f"exams differ by {100 * another['between_map_sd']:.0f} %", another["max_size_mm"]))
-    return found
+    another, alike = exam.document.get("another_exam"), exam.figures.get("between_map_sd")
+    if another is None:
+        return [("this exam" if exam.pooled is None else "these exams", size)]
+    narrow = "exams alike" if alike is None else f"if exams differ by {100 * alike:.0f} %"
+    patients = f"as exams of patients differ, {100 * another['between_map_sd']:.0f} %"
+    return [(patients, size), (narrow, exam.document["max_size_mm"])]
 
 
 def _several_masses(exam: Exam) -> Iterator[str]:

@@ -17,6 +17,7 @@ from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.report.exam import Exam, ExamMass, Quantity
 from tactile_bayes.report.lump_place import from_xiphoid
 from tactile_bayes.report.narrowing import width_lines
+from tactile_bayes.report.quantities import leading
 from tactile_bayes.report.size_text import shape_text
 from tactile_bayes.report.smallest_text import smallest_text
 
@@ -45,7 +46,7 @@ def headline(exam: Exam) -> str:
 
 def largest(exam: Exam) -> Quantity | None:
     """The largest size that the page reports: the pooled one of several maps."""
-    size: Quantity | None = exam.document["max_size_mm"]
+    size: Quantity | None = leading(exam.document)["max_size_mm"]
     return size
 
 
@@ -58,15 +59,14 @@ def size_sentences(exam: Exam) -> Iterator[str]:
     yield f"The largest diameter is about {size['median']:.1f} mm (the middle of its probable values)."
     yield f"With a probability of {share} it lies between {size['low']:.1f} and {size['high']:.1f} mm{_supposed(exam)}."
     if document.get("another_exam") is not None:
-        other, sd = document["another_exam"]["max_size_mm"], document["another_exam"]["between_map_sd"]
-        apart = f"If exams of a lump differ by {100 * sd:.0f} %, as those of patients did in the published trial"
-        if exam.pooled is not None:
-            apart = (
-                "If exams of a lump may differ as much as those of patients did in the published trial "
-                f"({100 * sd:.0f} % after these maps)"
-            )
-        yield f"{apart}, it lies between {other['low']:.1f} and {other['high']:.1f} mm ({share})."
-    least = document["min_size_mm"]
+        alike, spread = document["max_size_mm"], exam.figures.get("between_map_sd")
+        told = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % alone"
+        learned = "as is learned from these maps" if exam.pooled is not None else "as those of simulated bodies do"
+        yield (
+            f"Were exams of a lump known to have {told}, {learned}, it would lie between {alike['low']:.1f} and "
+            f"{alike['high']:.1f} mm ({share}): repeat exams can show that."
+        )
+    least = leading(document)["min_size_mm"]
     if least is not None:
         ends = f"{share}: {least['low']:.1f} to {least['high']:.1f} mm"
         yield f"The smallest diameter is about {least['median']:.1f} mm ({ends})."
@@ -76,10 +76,13 @@ def size_sentences(exam: Exam) -> Iterator[str]:
 
 def _supposed(exam: Exam) -> str:
     """What the size's interval supposes of the spread between exams, and where that is from."""
-    spread = exam.figures.get("between_map_sd")
+    document, spread = exam.document, exam.figures.get("between_map_sd")
+    if document.get("another_exam") is not None:
+        after = " after these maps" if exam.pooled is not None else ""
+        share = f"{100 * document['another_exam']['between_map_sd']:.0f} %"
+        return f", if exams of a lump differ by {share}{after}, as those of patients did in the published trial"
     if spread is None:
         return ""
-    document = exam.document
     at_site = document.get("repeatability") or exam.figures.get("repeatability")
     if at_site and exam.pooled is None:
         return f"; {at_site}"
@@ -156,7 +159,7 @@ def why_no_clock(exam: Exam) -> str:
 def narrowing_sentences(exam: Exam) -> list[str]:
     """What makes the interval wide and what would narrow it, without the program's options."""
     document = exam.document
-    share = document["variance_share"]
+    share = leading(document)["variance_share"]
     return [] if share is None else [_OPTIONS.sub("", line) for line in width_lines(share)]
 
 

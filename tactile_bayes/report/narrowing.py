@@ -12,7 +12,7 @@ MORE = "More (all quantities, places looked at, odds, priors, omissions): estima
 """The end of a short report's last line but one."""
 NARROWED_BY = {
     "map": "a slower scan with more strokes over the lump",
-    "between_maps": "more exams of this mass, pooled (estimate --pool)",
+    "between_maps": "more exams of this mass, pooled (estimate --pool); the site's spread (calibrate repeatability)",
     "calibration": "a size calibration learned from more lumps",
     "residual": "a size calibration learned with this head and bodies like this one",
     "site": "more phantoms of known size, depth, seat and stiffness (calibrate size --correct)",

@@ -18,7 +18,7 @@ from tactile_bayes.inference.summary import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.narrowing import MORE, MOST_LINES, width_lines
 from tactile_bayes.report.population_text import fat_text, unknowns_text
-from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam
+from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, leading
 from tactile_bayes.report.site_text import site_words
 from tactile_bayes.report.size_text import (
     SIZE_DECIMALS,
@@ -218,7 +218,7 @@ def pooled_summary(document: Mapping[str, Any]) -> str:
         lines.append(_no_size(document))
     else:
         largest, spread = document["max_size_mm"], document["figures"]["between_map_sd"]
-        lines += _table(document) + width_lines(document["variance_share"])
+        lines += _table(document) + width_lines(leading(document)["variance_share"])
         ends = f"interval ends to {largest['mc_error'] / largest['sd']:.3f} SD; " if largest["sd"] > 0 else ""
         by = f"sizes by {document['site']}; " if document["site"] else ""
         site = f"; {document['repeatability']}" if "repeatability" in document else ""
@@ -257,7 +257,7 @@ def pooled_text(document: Mapping[str, Any]) -> str:
         return "\n".join([*lines, _no_size(document), RESEARCH_USE]) + "\n"
     worst, figures = _worst(document), document["figures"]
     lines += ["", *_table(document)]
-    lines += ["", *width_lines(document["variance_share"])]
+    lines += ["", *width_lines(leading(document)["variance_share"])]
     places = decimals(worst["mc_error"], most=SIZE_DECIMALS)
     lines += supposed_lines(document["supposing"], document["max_size_mm"]["median"], places=places)
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
@@ -289,11 +289,9 @@ def _table(document: Mapping[str, Any]) -> list[str]:
     places = decimals(_worst(document)["mc_error"], most=SIZE_DECIMALS)
     lines = [table_head(probability)]
     for name, label in zip(EXTREMES, ("largest size", "smallest size"), strict=True):
-        q = document[name]
-        lines.append(_row(label, q, places))
-    another = document[ANOTHER_EXAM]
-    if another is not None:
-        lines.insert(2, _row(exams_label(another["between_map_sd"]), another["max_size_mm"], places))
+        lines.append(_row(label, leading(document)[name], places))
+    if document[ANOTHER_EXAM] is not None:
+        lines.append(_row(exams_label(document["figures"].get("between_map_sd")), document["max_size_mm"], places))
     return lines
 
 

@@ -18,6 +18,21 @@ ANOTHER_EXAM = "another_exam"
 WIDTHS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd")
 
 
+def leading(told: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What holds the sizes that lead, of an estimate's JSON object or one of its masses (record 0130).
+
+    Until a site's repeatability is known these are the sizes for exams as far apart as patients' (`another_exam`); with
+    it, or a stated spread, there is one interval.
+    """
+    another = told.get(ANOTHER_EXAM)
+    return told if another is None else another
+
+
+def leading_size(size: SizePosterior) -> SizePosterior:
+    """The posterior of a size that leads; see `leading`."""
+    return size if size.another_exam is None else size.another_exam
+
+
 def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probability: float) -> dict[str, Quantity]:
     """Summaries of all quantities that an estimate has draws of, by name; empty without an estimate."""
     if estimate.map_posterior is None or estimate.draws is None:
@@ -57,4 +72,6 @@ def another_exam(size: SizePosterior | None, quantities: Mapping[str, Quantity])
     if size is None or size.another_exam is None:
         return None
     sizes = {name: quantities[f"{ANOTHER_EXAM}.{name}"].as_dict() for name in EXTREMES}
-    return {"between_map_sd": nine_digits(size.another_exam.figures["between_map_sd"]), **sizes}
+    share = {name: nine_digits(value) for name, value in size.another_exam.variance_share.items()}
+    spread = nine_digits(size.another_exam.figures["between_map_sd"])
+    return {"between_map_sd": spread, **sizes, "variance_share": share}

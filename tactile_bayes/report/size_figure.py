@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAX_COLOUR, _MIN_COLOUR = "#1f3b73", "#c8641e"  # tell apart in greyscale too
-_ANOTHER_COLOUR = "0.4"
+_ALIKE_COLOUR = "0.4"
 # The axis ends at these quantiles of the draws, or at an interval's end where that lies farther out.
 _SHOWN: Final = (0.005, 0.985)
 _SIZES: Final = {"max": "largest", "min": "smallest"}
@@ -55,8 +55,8 @@ def size_figure(
     draws_max_mm, draws_min_mm : (n,) arrays
         Posterior draws; those that are not finite are left out.
     intervals
-        For ``"max"``, ``"min"`` and ``"another"``, drawn as bars labelled with probability and kind; the last is of the
-        largest size if another exam may differ more.
+        For ``"max"``, ``"min"`` and ``"alike"``, drawn as bars labelled with probability and kind; the last is of the
+        largest size if exams differ less.
     title
         Above the figure; nothing that identifies a person.
     findings
@@ -69,7 +69,7 @@ def size_figure(
     UsageError
         When `path` exists and `force` is false, or its suffix is unknown.
     """
-    size_in = (7.0, 4.0 + 0.4 * ("another" in intervals))
+    size_in = (7.0, 4.0 + 0.4 * ("alike" in intervals))
     with figure_file(path, size_in=size_in, force=force, findings=findings) as figure:
         axes = figure.subplots()
         rows = (("max", draws_max_mm, _MAX_COLOUR, "-"), ("min", draws_min_mm, _MIN_COLOUR, "--"))
@@ -77,8 +77,8 @@ def size_figure(
             _draw_density(axes, name, draws, colour=colour, dash=dash)
             if name in intervals:
                 _draw_interval(axes, intervals[name], size=_SIZES[name], row=row, colour=colour)
-        if "another" in intervals:
-            _draw_interval(axes, intervals["another"], size=_SIZES["max"], row=len(rows), colour=_ANOTHER_COLOUR)
+        if "alike" in intervals:
+            _draw_interval(axes, intervals["alike"], size=_SIZES["max"], row=len(rows), colour=_ALIKE_COLOUR)
         axes.set_title(title or "Size of the lump", loc="left", fontsize=11)
         axes.set_xlim(_span((draws_max_mm, draws_min_mm), intervals))
         _finish_size(axes)

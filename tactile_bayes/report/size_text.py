@@ -18,17 +18,18 @@ SOURCES = {
 }
 
 
-def exams_label(spread: float) -> str:
-    """What the second interval supposes: how far exams of one mass are apart, as a share of its size."""
-    return f"if exams differ by {100 * spread:.0f} %"
+def exams_label(spread: float | None) -> str:
+    """What an interval supposes: how far exams of one mass are apart, as a share of its size; None for not at all."""
+    return f"if exams differ by {100 * spread:.0f} %" if spread is not None else "if exams do not differ"
 
 
 def two_intervals_text(this: float | None, another: float) -> str:
-    """What the two intervals of a size suppose; `this` is None where a calibration knows no spread between exams."""
-    alike = "no spread between exams" if this is None else f"exams of one mass that differ by {100 * this:.0f} %"
+    """What the intervals of a size suppose, the leading one first; `this` is None for no spread between exams."""
+    alike = "no spread" if this is None else f"{100 * this:.0f} %"
     return (
-        f"The first interval supposes {alike}, as its calibration was learned; the second {100 * another:.0f} %, "
-        "as maps of one mass differed in the paper. Settings: between_map_sd."
+        f"The intervals of the sizes suppose that exams of one mass differ by {100 * another:.0f} %, as those of "
+        f"patients did in the paper; the narrower one supposes {alike}, as those of simulated bodies do: what exams "
+        "that repeat so well can buy. `calibrate repeatability` learns a site's own spread; then there is one interval."
     )
 
 
