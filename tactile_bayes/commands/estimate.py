@@ -114,7 +114,7 @@ _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
     metavar="SITE.json",
     type=_FILE,
     help="Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then have one interval, "
-    "for any exam there. Default: two, for exams as alike as simulated ones and as the paper's.",
+    "for any exam there. Default: two, for exams as the paper's and as simulated ones.",
 )
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @click.option(
