@@ -140,7 +140,8 @@ def _to_correct(output: Path) -> str:
     "--repeatability",
     metavar="none|SITE.json",
     help="Spread between exams of one mass: a file as for `estimate`, or none (two intervals: the page leads with that "
-    "for patients, the tables hold the narrower). Default: learned from this campaign's repeats, where 5 masses have them.",
+    "for patients, the tables hold the narrower). Default: learned from this campaign's repeats, where 5 masses "
+    "have them.",
 )
 @seed_option(1)
 @click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
