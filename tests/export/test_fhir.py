@@ -45,7 +45,7 @@ def test_sizes_and_intervals_are_read_back_equal(sized: dict[str, Any], estimate
         one.resource.code.coding[0].code: one.resource for one in read.entry if "Observation" in str(type(one.resource))
     }
     for code, name in (("103339001", "max_size_mm"), ("103340004", "min_size_mm")):
-        size, one = estimate[name], found[code]
+        size, one = estimate["another_exam"][name], found[code]  # the interval that leads
         assert float(one.valueQuantity.value) == size["median"]
         assert (one.valueQuantity.system, one.valueQuantity.code) == ("http://unitsofmeasure.org", "mm")
         parts = {part.code.coding[0].code: float(part.valueQuantity.value) for part in one.component}

@@ -161,7 +161,7 @@ def crowded() -> tuple[Estimate, dict]:
 def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show() -> None:
     full, quantities = crowded()
     size = {name: summarise(np.linspace(10.0, 20.0, 99), probability=0.9) for name in ("max_size_mm", "min_size_mm")}
-    another = size | {"another_exam.max_size_mm": size["max_size_mm"]}
+    another = size | {f"another_exam.{name}": quantity for name, quantity in size.items()}
     told = {"probability": 0.9, "quantities": quantities, "reason": full.reason}
     masses = masses_document(full.masses, MAPS["clear.nc"], **told)
     sized = replace(full, reason="", advice="")
