@@ -13,7 +13,7 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.abstention import chance_text
 from tactile_bayes.posterior.result import Mass
 from tactile_bayes.report.lump_place import lump_place
-from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, estimate_quantities
+from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, estimate_quantities, leading
 from tactile_bayes.report.touching import together_words, touching_masses
 from tactile_bayes.size.posterior import SIZES
 
@@ -98,7 +98,7 @@ def mass_words(mass: MassDocument, here: MassDocument | None) -> str:
         place += f", {away:.0f} mm from mass {here['number']}"
     if mass.get("position") is not None:
         place += f" ({mass['position']['text']})"
-    size = mass["max_size_mm"]
+    size = leading(mass)["max_size_mm"]
     if size is None:
         told = f"no size: {mass['reason']}"
     else:
