@@ -20,7 +20,7 @@ import tactile_bayes as tb
 
 DEMO = Path(tb.__file__).parent / "demo"
 VALUES: tuple[Any, ...] = (
-    None, True, False, 0, -1, 1, 0.5, 1e308, -1e308, 1e-320, 2**53, "", "NaN", "x", "\x1b[2J", "a\rb", "\x07", "\u202e",
+    None, True, False, 0, -1, 1, 0.5, 1e308, -1e308, 1e-320, 2**53, "", "1e5", "x", "\x1b[2J", "a\rb", "\x07", "\u202e",
     "<script>alert(1)</script>", "=1+1", [], {}, [1, 2], [[]], {"a": 1}, "2026-13-40", "9" * 400, 1e20, -3.7, 360,
 )  # fmt: skip
 IDENTITY = ("--patient-id", "P1")
@@ -125,7 +125,7 @@ def damaged_netcdf(rng: random.Random, path: Path) -> None:
                 elif rng.random() < 0.2:
                     del place.attrs[name]
                 else:
-                    place.attrs[name] = rng.choice(("", "\x1b[2J", float("nan"), -1.0, 1e300, 0, "NaN", "x" * 300))
+                    place.attrs[name] = rng.choice(("", "\x1b[2J", float("nan"), -1.0, 1e300, 0, "1e5", "x" * 300))
 
 
 def check(folder: Path, source: str, commands: dict[str, tuple[str, ...]]) -> int:
@@ -145,7 +145,8 @@ def check(folder: Path, source: str, commands: dict[str, tuple[str, ...]]) -> in
         made = folder / output
         texts = [done.stdout, *([made.read_text("utf-8")] if made.suffix in (".html", ".json", ".csv") else [])]
         for text in texts if output != "shown" else ():  # `show` says what a file holds, whatever it is
-            assert not re.search(r"(?<![\w/+=])(nan|NaN|inf|Infinity)(?![\w/+=])", text), (output, text)
+            number = re.search(r"(?<![\w/+=])(nan|NaN|inf|Infinity)(?![\w/+=])", text)
+            assert number is None, (output, text[number.start() - 300 : number.end() + 100])
             assert not re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]", text), (output, text)
         if output == "dicom":
             read_dicom(made)
