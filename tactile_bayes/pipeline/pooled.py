@@ -71,6 +71,7 @@ def pool_answers(
     chance = one_place_probability(places) if len(places) > 1 else None
     pooled = (
         _too_far(answers)
+        or _none_can_show(documents)
         or _apart(places, chance)
         or pool_maps(
             [answer.shape for answer in answers],
@@ -105,6 +106,15 @@ def _too_far(answers: Sequence[Answer]) -> PooledEstimate | None:
         if answer.document is not None and answer.document["reason_code"] == "extrapolated":
             return PooledEstimate("no_estimate", f"map {i + 1}: {answer.document['reason']}")
     return None
+
+
+def _none_can_show(documents: Sequence[Mapping[str, Any]]) -> PooledEstimate | None:
+    """Reason for no size where the cells of all maps are too large to show a lump; else None."""
+    from tactile_bayes.size.pooling import PooledEstimate
+
+    if any(one["reason_code"] != "coarse" for one in documents):
+        return None
+    return PooledEstimate("no_estimate", "the maps cannot show whether there is a lump: their cells are too large")
 
 
 def _apart(places: Sequence[Place], chance: float | None) -> PooledEstimate | None:

@@ -131,3 +131,15 @@ def test_compare_warns_where_the_maps_of_one_visit_disagree(folder: Path) -> Non
     assert "CAUTION: visit 1: its maps show different sizes; one mass gives maps so far apart" in done.stdout
     control = run_here("compare", "a.nc", "c.nc", "--with", "b.nc", *FAST, cwd=folder)
     assert "its maps show different sizes" not in control.stdout
+
+
+def test_maps_that_cannot_show_a_lump_do_not_read_as_maps_without_one(tmp_path: Path) -> None:
+    """Cells of 10 mm; the control is the same level in cells of 1 mm."""
+    rng = np.random.default_rng(4)
+    for name, cells, side in (("c1", 9, 10.0), ("c2", 9, 10.0), ("f1", 61, 1.0), ("f2", 61, 1.0)):
+        values = 1.0 + 0.01 * rng.standard_normal((cells, cells))
+        tactile_map = grid_map(values, cell_mm=side, normalise="gain")
+        write_map(tmp_path / f"{name}.nc", tactile_map, provenance=Provenance("map", {}))
+    coarse, fine = pooled(tmp_path, "c1.nc", "c2.nc"), pooled(tmp_path, "f1.nc", "f2.nc")
+    assert coarse["reason"] == "the maps cannot show whether there is a lump: their cells are too large"
+    assert fine["reason"] == "a lump was found on 0 of 2 maps"
