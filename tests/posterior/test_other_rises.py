@@ -105,7 +105,7 @@ def test_text_json_and_pool_name_it(folder: Path) -> None:
     alone = run_here("estimate", "one.nc", cwd=folder).stdout
     assert "Mass 2" not in alone
     pooled = run_here("estimate", "one.nc", "two.nc", "--pool", cwd=folder).stdout
-    assert "two.nc: another rise stands at (1" in pooled
+    assert "map 2: another rise stands at (1" in pooled
     assert "one.nc: another rise" not in pooled
 
 
