@@ -37,9 +37,9 @@ def size_ruler(rows: Sequence[tuple[str, Quantity]]) -> str:
 def _bar(row: int, words: str, q: Quantity, scale: float) -> Iterator[str]:
     y, left, right = 4.0 + _ROW_MM * row, scale * q["low"], scale * q["high"]
     middle = min(max((left + right) / 2, 12.0), _LENGTH_MM - 12.0)
-    yield _text(middle, y - 1.4, words)
+    yield _text(middle, y - 1.7, words)
     yield f'<path d="M{left:.2f} {y:g}H{right:.2f}" stroke="#111" stroke-width="{1.6 / (1 + 0.6 * row):.2f}"/>'
-    yield f'<path d="M{scale * q["median"]:.2f} {y - 1.3:g}v2.6" stroke="#111" stroke-width="0.7"/>'
+    yield f'<path d="M{scale * q["median"]:.2f} {y - 1:g}v2" stroke="#111" stroke-width="0.7"/>'
 
 
 def _scale(end_mm: float, y: float) -> Iterator[str]:
