@@ -28,8 +28,8 @@ TOLD = "a map of the same scan as {} is no repeat: the interval is too narrow."
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Maps of two recordings: the first twice, in files with other sessions; the second once."""
     place = tmp_path_factory.mktemp("recordings")
-    for name, start, visit in (("a", 0, "1"), ("again", 0, "2"), ("b", 1, "2")):
-        write(place / f"{name}.mcap", thinned(start, 4, subject="07", side="right", visit=visit))
+    for name, start, examiner in (("a", 0, "E1"), ("again", 0, "E2"), ("b", 1, "E2")):
+        write(place / f"{name}.mcap", thinned(start, 4, subject="07", side="right", examiner=examiner))
         done = run_here("map", f"{name}.mcap", "-o", f"{name}.nc", cwd=place)
         assert done.returncode == 0, done.stderr
     return place
@@ -76,8 +76,8 @@ def test_compare_refuses_it_and_pooling_and_the_page_caution(folder: Path, tmp_p
 
 
 def test_python_knows_it_also_of_scans_that_are_in_no_file() -> None:
-    first = tb.build_map(thinned(0, 4, side="right", visit="1"))
-    again = tb.build_map(thinned(0, 4, side="right", visit="2"), cell_mm=1.2)
+    first = tb.build_map(thinned(0, 4, side="right", examiner="E1"))
+    again = tb.build_map(thinned(0, 4, side="right", examiner="E2"), cell_mm=1.2)
     assert first.scans[0]["side"] == "right"
     assert "sha256" not in first.scans[0]
     document = tb.pool([first, again], method="laplace").document

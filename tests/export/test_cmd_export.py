@@ -204,5 +204,5 @@ print(*numbers(report), observed["valueQuantity"]["value"], row["tb_max_mm"])
 """
     done = run_python("-W", "ignore", "-c", code, cwd=tmp_path, env={"PYTHONPATH": ""})
     assert done.returncode == 0, done.stderr
-    wanted = json.loads((folder / "map.json").read_text())["max_size_mm"]["median"]
+    wanted = json.loads((folder / "map.json").read_text())["another_exam"]["max_size_mm"]["median"]
     assert [float(word) for word in done.stdout.split()] == [wanted] * 3

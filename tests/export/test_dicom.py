@@ -123,7 +123,7 @@ def test_sizes_and_intervals_are_read_back_equal(files: dict[str, Any], estimate
     sizes = {one.name.value: one for one in group.get_measurements() if one.name.value in axes}
     assert set(sizes) == set(axes)
     for code, name in axes.items():
-        size, found = estimate[name], sizes[code]
+        size, found = estimate["another_exam"][name], sizes[code]
         assert (found.value, found.unit.value) == (size["median"], "mm")
         assert found.derivation.value == "373099004", "a median"
         properties = {concept(one): number(one) for one in items(found[0], "NUM")}
@@ -188,8 +188,8 @@ def test_a_posterior_gives_the_sizes_of_its_estimate(exam: Path, estimate: dict[
     report = report_of(exam, tmp_path / "out", "map.nc", "map_post.nc")
     sizes = {concept(one): number(one) for one in items(report, "NUM") if concept(one) in ("103339001", "103340004")}
     assert sizes == {
-        "103339001": pytest.approx(estimate["max_size_mm"]["median"]),
-        "103340004": pytest.approx(estimate["min_size_mm"]["median"]),
+        "103339001": pytest.approx(estimate["another_exam"]["max_size_mm"]["median"]),
+        "103340004": pytest.approx(estimate["another_exam"]["min_size_mm"]["median"]),
     }
 
 

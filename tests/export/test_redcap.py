@@ -80,7 +80,7 @@ def test_every_value_is_one_that_the_dictionary_allows(tables: Any) -> None:
 def test_sizes_are_read_back_equal(tables: Any, estimate: dict[str, Any], exam: Path) -> None:
     first, empty, draws = tables[0]
     for name in ("max", "min"):
-        size = estimate[f"{name}_size_mm"]
+        size = estimate["another_exam"][f"{name}_size_mm"]
         assert [float(first[f"tb_{name}{end}_mm"]) for end in ("", "_low", "_high")] == [
             size["median"],
             size["low"],
@@ -97,7 +97,7 @@ def test_sizes_are_read_back_equal(tables: Any, estimate: dict[str, Any], exam: 
     assert empty["tb_max_mm"] == empty["tb_max_low_mm"] == ""
     assert empty["tb_reason"] == json.loads((exam / "empty.json").read_text())["reason"]
     phantom = json.loads((exam / "phantom.json").read_text())
-    assert float(draws["tb_max_high_mm"]) == pytest.approx(phantom["max_size_mm"]["high"])
+    assert float(draws["tb_max_high_mm"]) == pytest.approx(phantom["another_exam"]["max_size_mm"]["high"])
     assert draws["tb_side"] == "3"
     assert float(draws["tb_lump_prob"]) == phantom["detected_probability"]
 

@@ -321,18 +321,17 @@ def test_a_map_whose_values_are_elsewhere_is_refused(plain: Path) -> None:
         read_map(plain)
 
 
-def test_a_report_is_described_without_obeying_it(tmp_path: Path, run_cli) -> None:
+def test_a_report_with_control_characters_is_refused_without_obeying_it(tmp_path: Path, run_cli) -> None:
     text = {"schema": "tactile-bayes/estimate/1", "note": "\x1b]0;owned\x07\u202e\r", "\x9b2J": 1}
     (tmp_path / "r.json").write_text(json.dumps(text))
     done = run_cli("show", "r.json", cwd=tmp_path)
-    assert done.returncode == 0
-    assert r"\x1b]0;owned\x07\u202e\r" in done.stdout
-    assert r"\x9b2J" in done.stdout
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert r"\x1b]0;owned\x07\u202e\r" in done.stderr
     (tmp_path / "bad\x07.toml").write_text("x")
     refused = run_cli("simulate", "bad\x07.toml", "-o", "x.mcap", cwd=tmp_path)
     assert refused.returncode == 3
     assert r"bad\x07.toml" in refused.stderr
-    assert "\x07" not in done.stdout + refused.stderr
+    assert "\x07" not in done.stdout + done.stderr + refused.stderr
 
 
 def test_an_error_repeats_little_of_what_a_file_says(tmp_path: Path) -> None:

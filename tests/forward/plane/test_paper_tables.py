@@ -216,7 +216,7 @@ def test_schemas_use_only_what_the_reader_enforces(name: str) -> None:
     assert len(set(names)) == len(names)
     for field in schema["fields"]:
         assert set(field.get("constraints", {})) <= enforced
-        assert field["type"] in {"string", "number", "integer", "boolean"}
+        assert field["type"] in {"string", "number", "integer", "boolean", "date"}
         assert field["description"].endswith(".")
     assert set(schema.get("primaryKey", [])) <= set(names)
     assert json.dumps(schema).isascii()
