@@ -70,6 +70,8 @@ def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPa
     weighed = [one.detection.probability for one in found.candidates if one.detection is not None]
     assert found.detection is not None
     assert found.detection.probability in weighed
+    assert found.weighed is not None
+    assert found.weighed.detection is found.detection
 
 
 def beside_a_rib(amplitude: float) -> TactileMap:

@@ -235,13 +235,6 @@ def error_figures(
     }
 
 
-def left_out_errors(terms: FloatArray, log_d: FloatArray) -> FloatArray:
-    """(n,) ln(predicted / true size) of each row, held out of the least-squares fit, in closed form."""
-    inverse, leverage = leverages(terms)
-    residual = log_d - terms @ (inverse @ (terms.T @ log_d))
-    return np.asarray(-residual / (1.0 - leverage))
-
-
 def check_population(table: PopulationTable) -> None:
     """Raise `BadDataError` where bodies are too few, do not vary or hold a number that is not finite."""
     bodies = len(np.unique(table.body))
