@@ -125,8 +125,6 @@ def _bump_line(lump: Lump) -> str:
 
 def _tissue_line(lump: SolidLump) -> str:
     size = f"d {lump.d_mm:g} mm"
-    size += "" if lump.width_mm is None else f", {lump.width_mm:g} mm wide"
     size += "" if lump.height_mm is None else f", {lump.height_mm:g} mm high"
-    size += ", a pair" if lump.pair else ", lobed" if lump.lobe_share else ", rough" if lump.rough_share else ""
     where = f"h/d {lump.depth_ratio:g}"
     return f"lump at {lump.x_mm:g}, {lump.y_mm:g} mm: {size}, {where}, {lump.stiffness_ratio:g} times as stiff as fat"

@@ -27,20 +27,7 @@ from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 
 _SCHEMA: Final = "scene.schema.json"
 # A lump with one of the first is tissue; only a Gaussian one may have the others.
-_OF_TISSUE: Final = (
-    "depth_ratio",
-    "stiffness_ratio",
-    "seat",
-    "height_mm",
-    "width_mm",
-    "turn_deg",
-    "tilt_deg",
-    "lobes",
-    "lobe_share",
-    "rough_share",
-    "rough_seed",
-    "pair",
-)
+_OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")
 _OF_BUMPS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_deg")
 _TYPES: Final = {
     "number": "a number",

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, THICKNESS_MM
-from tactile_bayes.forward.lump_shape import LumpShape
 
 # Default thickness of the fat in a scene without lumps.
 PLAIN_FAT_MM = 15.0
@@ -16,16 +14,6 @@ PLAIN_FAT_MM = 15.0
 _SAME_MM = 0.01
 # The skin over a lump, and the tissue under it, as a share of its half height.
 _LEAST_COVER = 0.02
-# The same of a lump that is no upright spheroid: its hull needs room too.
-_SHAPE_COVER = 0.1
-# Length of a pair in diameters of its balls, if no width is given.
-PAIR_LENGTH = 1.8
-# Ranges within which the mesh around a shape was checked.
-_PAIR_LENGTHS = (1.05, 1.85)
-_MOST_AXIS_RATIO = 3.0
-_MOST_LOBE_SHARE = 0.3
-_MOST_LOBES = 6
-_MOST_ROUGH_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +43,14 @@ class SceneBody:
 
 @dataclass(frozen=True, slots=True)
 class SolidLump:
-    """A lump of stiff or soft tissue: a ball unless other diameters or an outline are given.
+    """A lump of stiff or soft tissue: a ball, or with another height a spheroid about the vertical.
 
     Parameters
     ----------
     x_mm, y_mm
         Place of its vertical axis in the scene's `plane`.
     d_mm
-        Diameter along the lump's first axis, across the vertical.
+        Diameter across the vertical.
     height_mm
         Diameter along the vertical; None for `d_mm`.
     depth_ratio
@@ -73,12 +61,6 @@ class SolidLump:
         How far it stands out of the gland: the boundary lies at ``h + seat * height / 2``, through the centre at 0
         (centred), under the lowest point at 1, below it from there on. The phantoms' "resting" lumps, a tenth of their
         diameter above the gland, have 1.2. None is 0, or follows from the body's `fat_mm`.
-    width_mm
-        Diameter along the second axis, across the vertical and the first; None for `d_mm`, of a pair `d_mm` / 1.8.
-    turn_deg, tilt_deg
-        From the plane's x axis to the first axis, positive towards y; then by how much that axis rises to the skin.
-    lobes, lobe_share, rough_share, rough_seed, pair
-        Outline, see `LumpShape`; a pair is `d_mm` long and its balls have the diameter `width_mm`.
     """
 
     x_mm: float = 0.0
@@ -88,14 +70,6 @@ class SolidLump:
     depth_ratio: float = 1.0
     stiffness_ratio: float = 100.0
     seat: float | None = None
-    width_mm: float | None = None
-    turn_deg: float = 0.0
-    tilt_deg: float = 0.0
-    lobes: int = 3
-    lobe_share: float = 0.0
-    rough_share: float = 0.0
-    rough_seed: int = 1
-    pair: bool = False
 
     @property
     def depth_mm(self) -> float:
@@ -104,24 +78,8 @@ class SolidLump:
 
     @property
     def vertical_mm(self) -> float:
-        """Extent along the vertical: twice the farthest reach from the centre."""
-        shape = self.shape
-        return 2.0 * (shape.half_axes_mm[2] if shape.upright_spheroid else shape.half_height_mm)
-
-    @property
-    def shape(self) -> LumpShape:
-        """The boundary about the centre, before the turn about the vertical."""
-        width = self.d_mm / (PAIR_LENGTH if self.pair else 1.0) if self.width_mm is None else self.width_mm
-        height = self.height_mm or (width if self.pair else self.d_mm)
-        return LumpShape(
-            (self.d_mm / 2, width / 2, height / 2),
-            tilt_rad=math.radians(self.tilt_deg),
-            lobes=self.lobes,
-            lobe_share=self.lobe_share,
-            rough_share=self.rough_share,
-            rough_seed=self.rough_seed,
-            pair=self.pair,
-        )
+        """Diameter along the vertical."""
+        return self.d_mm if self.height_mm is None else self.height_mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,48 +173,16 @@ def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib]
     if not 0 <= body.nu < 0.5:
         raise BadDataError(f"body.nu is {body.nu}", way_out="it must be at least 0, below 0.5")
     for i, lump in enumerate(lumps):
-        for name in ("d_mm", "height_mm", "width_mm", "depth_ratio", "stiffness_ratio"):
+        for name in ("d_mm", "height_mm", "depth_ratio", "stiffness_ratio"):
             value = getattr(lump, name)
             if value is not None:
                 _above_zero(f"lump[{i}].{name}", value)
-        _check_shape(i, lump)
         if lump.seat is not None and not lump.seat >= 0:
             raise BadDataError(f"lump[{i}].seat is {lump.seat}", way_out="it must be at least 0")
         _check_depth(i, lump, body)
     for i, rib in enumerate(ribs):
         _check_rib(i, rib, body)
     fat_thickness(body, lumps)
-
-
-def _check_shape(index: int, lump: SolidLump) -> None:
-    """Raise an error for an outline that the model of shapes was not checked for."""
-    shape = lump.shape
-    if shape.upright_spheroid:
-        return
-    if lump.pair and (lump.height_mm is not None or lump.lobe_share or lump.rough_share):
-        given = next(name for name in ("height_mm", "lobe_share", "rough_share") if getattr(lump, name))
-        raise BadDataError(
-            f"lump[{index}].{given} is {getattr(lump, given):g} for a pair", way_out="a pair is two balls: leave it out"
-        )
-    a, b, c = shape.half_axes_mm
-    low, high = _PAIR_LENGTHS
-    if lump.pair and not low <= a / b <= high:
-        raise BadDataError(
-            f"lump[{index}].width_mm is {2 * b:g} for a pair {lump.d_mm:g} mm long",
-            way_out=f"it must lie in {lump.d_mm / high:.4g} to {lump.d_mm / low:.4g} mm, so that the balls touch",
-        )
-    if max(a, b, c) > _MOST_AXIS_RATIO * min(a, b, c):
-        raise BadDataError(
-            f"lump[{index}] has diameters {2 * a:g}, {2 * b:g} and {2 * c:g} mm",
-            way_out=f"the largest may be {_MOST_AXIS_RATIO:g} times the smallest",
-        )
-    for name, most in (("lobe_share", _MOST_LOBE_SHARE), ("rough_share", _MOST_ROUGH_SHARE)):
-        if not 0 <= getattr(lump, name) <= most:
-            raise BadDataError(
-                f"lump[{index}].{name} is {getattr(lump, name):g}", way_out=f"it must lie in 0 to {most:g}"
-            )
-    if not 2 <= lump.lobes <= _MOST_LOBES:
-        raise BadDataError(f"lump[{index}].lobes is {lump.lobes}", way_out=f"it must lie in 2 to {_MOST_LOBES}")
 
 
 def _check_rib(index: int, rib: Rib, body: SceneBody) -> None:
@@ -278,8 +204,7 @@ def _check_rib(index: int, rib: Rib, body: SceneBody) -> None:
 
 
 def _check_depth(index: int, lump: SolidLump, body: SceneBody) -> None:
-    cover = _LEAST_COVER if lump.shape.upright_spheroid else _SHAPE_COVER
-    half = (1.0 + cover) * lump.vertical_mm / 2
+    half = (1.0 + _LEAST_COVER) * lump.vertical_mm / 2
     least, most = half / lump.d_mm, (body.thickness_mm - half) / lump.d_mm
     if least <= lump.depth_ratio <= most:
         return

@@ -32,17 +32,9 @@ def refuse_bumps(scene: Scene, model: str) -> None:
 
 
 def _lump_truth(lump: SolidLump, body: SceneBody, fat_mm: float) -> dict[str, Any]:
-    shape = lump.shape
-    largest, smallest = shape.diameters_mm()
-    largest_across, smallest_across = shape.diameters_across_mm()
     seat = (fat_mm - lump.depth_mm) / (lump.vertical_mm / 2)
     return asdict(lump) | {
-        "width_mm": 2.0 * shape.half_axes_mm[1],
         "height_mm": lump.vertical_mm,
-        "largest_mm": largest,
-        "smallest_mm": smallest,
-        "largest_across_mm": largest_across,
-        "smallest_across_mm": smallest_across,
         "seat": seat,
         "depth_mm": lump.depth_mm,
         "lump_kpa": lump.stiffness_ratio * body.fat_kpa,

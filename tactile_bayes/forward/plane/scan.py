@@ -203,11 +203,6 @@ def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) ->
             f"lump[0].height_mm is {lump.height_mm:g}",
             way_out=f"the {fidelity} model has a circle: leave it out, or use --fidelity solid",
         )
-    if not lump.shape.upright_spheroid:
-        raise BadDataError(
-            "lump[0] has a width, a tilt or an outline",
-            way_out=f"the {fidelity} model has a circle: use --fidelity solid",
-        )
     seat = (fat_mm - lump.depth_mm) / (lump.d_mm / 2)
     if not -1e-9 <= seat <= MOST_SEAT + 1e-9:
         raise BadDataError(

@@ -156,14 +156,6 @@ def condense_lump(
     return CondensedLump(mesh.node_mm[_skin(mesh), 0], tuple(modes))
 
 
-def condense_twist(geometry: LumpGeometry, tissue: Tissue, *, size: MeshSize | None = None) -> CondensedMode:
-    """Condense twisting about the vertical, u_theta of order 0: no skin sinks, but a lump that is no ball is turned."""
-    mesh = lump_mesh(geometry, size)
-    fat, gland = tissue.fat_kpa, tissue.fat_kpa * tissue.gland_ratio
-    modulus = np.where((mesh.region == EXTERIOR_GLAND) | (mesh.region == INTERIOR_GLAND), gland, fat)
-    return _condense(mesh, element_stiffness(mesh, nu=tissue.nu), modulus, 0, twist=True)
-
-
 def orders_needed(geometry: LumpGeometry) -> int:
     r"""Fourier orders that carry all but 1e-4 of the perturbation.
 
@@ -272,20 +264,17 @@ def _skin(mesh: LumpMesh) -> IntArray:
     return mesh.surface[1:-1]
 
 
-def order_unknowns(mesh: LumpMesh, order: int, *, twist: bool = False) -> tuple[IntArray, FloatArray]:
+def order_unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
     """Index (-1: fixed) and sign of the reduced unknown for each of the (n, 3) displacements of one order.
 
     The base and the far rim do not move. On the axis, displacements must be single-valued: order 0 keeps u_z, order 1
-    a sideways motion with u_theta = -u_r, higher orders nothing. Order 0 has no torsion, or with `twist` nothing else.
+    a sideways motion with u_theta = -u_r, higher orders nothing. Order 0 has no torsion.
     """
     r, z = mesh.node_mm.T
     free = np.ones((len(r), 3), dtype=bool)
     free[(z == z.max()) | (r == r.max())] = False
     axis = r == 0
-    if twist:
-        free[:, [0, 2]] = False
-        free[axis] = False
-    elif order == 0:
+    if order == 0:
         free[:, 1] = False
         free[axis, 0] = False
     elif order == 1:
@@ -301,12 +290,10 @@ def order_unknowns(mesh: LumpMesh, order: int, *, twist: bool = False) -> tuple[
     return number, sign
 
 
-def _condense(
-    mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int, *, twist: bool = False
-) -> CondensedMode:
+def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int) -> CondensedMode:
     from scipy.sparse.linalg import splu
 
-    number, sign = order_unknowns(mesh, order, twist=twist)
+    number, sign = order_unknowns(mesh, order)
     inside = mesh.region >= INTERIOR_FAT
     stiffness = elements[0] + order * elements[1] + order**2 * elements[2]
     boundary = np.unique(number[mesh.arc])
@@ -319,7 +306,7 @@ def _condense(
     unit[at, np.arange(len(at))] = 1.0
     moved = factor.solve(unit)
     sinking = number[_skin(mesh), 2]
-    skin = np.zeros((len(sinking), len(at))) if twist else moved[np.searchsorted(used, sinking)]
+    skin = moved[np.searchsorted(used, sinking)]
     flexibility = moved[at]
 
     unit_kpa = np.ones_like(modulus_kpa)

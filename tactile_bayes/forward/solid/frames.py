@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,19 +127,11 @@ def square_mean(
     return mean
 
 
-class SkinChange(Protocol):
-    """A low-rank change of the skin's compliance."""
-
-    def vectors(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, c) values at points relative to the lump's axis and (c,) signs, as `SkinPerturbation.vectors`."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedLump:
     """A perturbation and the place of its axis in the scene's `plane`, mm."""
 
-    perturbation: SkinChange
+    perturbation: SkinPerturbation
     x_mm: float
     y_mm: float
 

@@ -9,13 +9,11 @@ import numpy as np
 
 from tactile_bayes.forward.head_face import HeadFace, head_face
 from tactile_bayes.forward.instrument import SimulatedScan, frame_times, head_positions, level_kpa, record
-from tactile_bayes.forward.lump_shape import LumpShape
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.solid.axisymmetric import CondensedLump, Tissue, condense_lump
 from tactile_bayes.forward.solid.frames import PlacedLump, SolidHead, skin_perturbation, solid_head
 from tactile_bayes.forward.solid.layers import LayeredBody
 from tactile_bayes.forward.solid.mesh import LumpGeometry
-from tactile_bayes.forward.solid.shaped import ShapedLump, ShapePerturbation, shaped_lump
 from tactile_bayes.forward.tissue import SceneBody, SolidLump, fat_thickness
 from tactile_bayes.forward.truth import refuse_bumps, tissue_truth
 from tactile_bayes.geometry import FloatArray
@@ -138,33 +136,12 @@ def _head(head: Head, body: SceneBody, fat_mm: float) -> SolidHead:
     return solid_head(face_of(head), layers_of(body, fat_mm))
 
 
-def _shaped(lump: SolidLump, body: SceneBody, fat_mm: float, pitch_mm: float) -> ShapePerturbation:
-    around = _shaped_lump(
-        lump.shape, Tissue(body.fat_kpa, body.gland_ratio, body.nu), lump.depth_mm, fat_mm, body.thickness_mm
-    )
-    change = _shape_perturbation(around, lump.stiffness_ratio * body.fat_kpa, pitch_mm)
-    return change.turned(float(np.radians(lump.turn_deg)))
-
-
-@lru_cache(maxsize=_BODIES_KEPT)
-def _shaped_lump(shape: LumpShape, tissue: Tissue, depth_mm: float, fat_mm: float, thickness_mm: float) -> ShapedLump:
-    return shaped_lump(shape, tissue, depth_mm=depth_mm, fat_mm=fat_mm, thickness_mm=thickness_mm)
-
-
-@lru_cache(maxsize=_BODIES_KEPT)
-def _shape_perturbation(around: ShapedLump, lump_kpa: float, square_mm: float) -> ShapePerturbation:
-    return around.perturbation(lump_kpa, square_mm=square_mm)
-
-
 def _placed(scene: Scene) -> list[PlacedLump]:
     """The scene's lumps with their places."""
     body = scene.body or SceneBody()
     fat = fat_thickness(body, scene.solid_lumps)
     placed = []
     for lump in scene.stiff_balls:
-        if not lump.shape.upright_spheroid:
-            placed.append(PlacedLump(_shaped(lump, body, fat, scene.head.pitch_mm), lump.x_mm, lump.y_mm))
-            continue
         around = condensed_lump(lump, body, fat)
         change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
         placed.append(PlacedLump(change, lump.x_mm, lump.y_mm))
