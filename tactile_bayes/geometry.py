@@ -8,14 +8,20 @@ from __future__ import annotations
 
 import math
 from operator import mul
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.record import Meta
 from tactile_bayes.records import dataclass
 
 FloatArray = NDArray[np.float64]
+Vector = Annotated[FloatArray, Meta(extra_json_schema={"items": {"type": "number"}})]
+"""Field of a record that holds a list of numbers in its files."""
+Matrix = Annotated[FloatArray, Meta(extra_json_schema={"items": {"type": "array", "items": {"type": "number"}}})]
+"""The same of a list of rows of numbers."""
 # A rotation's R R^T departs from the identity by no more.
 NOT_RIGID = 1e-6
 

@@ -61,7 +61,7 @@ def test_imports_go_one_way(capsys, monkeypatch):
     assert status == 0, capsys.readouterr().out
 
 
-@pytest.mark.parametrize("package", ["emcee", "arviz"])
+@pytest.mark.parametrize("package", ["emcee", "arviz", "msgspec"])
 def test_one_module_knows_the_package(package):
     assert len(importers(package)) == 1, f"{package} is imported by {importers(package)}"
 

@@ -9,20 +9,46 @@ from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.kinds import kind_of
+from tactile_bayes.files.kinds import kind_of, schema_kind
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, read_text
+from tactile_bayes.record import from_plain, schema_name
 
 MOST_LEVELS: Final = 64
 MOST_KEY_PARTS: Final = 16
+T = TypeVar("T")
 _LARGEST: Final = sys.float_info.max
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # and turned text
 # the parser's time grows with the square of a key's parts
 _LONG_KEY: Final = re.compile(
     rf"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*(?:\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*){{{MOST_KEY_PARTS}}}"""
 )
+
+
+def read_record(path: Path, kind: type[T], *, way_out: str = "give a file this program wrote") -> T:
+    """Read a record from its JSON or TOML file.
+
+    Raises
+    ------
+    BadDataError
+        When the file cannot be read, is of another kind, or a field is none of what the record declares.
+    """
+    document = load_toml(path, way_out=way_out) if path.suffix == ".toml" else load_json(path, way_out=way_out)
+    return parse_record(document, kind, path=path)
+
+
+def parse_record(document: object, kind: type[T], *, path: Path) -> T:
+    """A record from a document that was read; for the errors see `read_record`."""
+    wanted = schema_kind(schema_name(kind))
+    found = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
+    if wanted and found and found != wanted:
+        raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
+    try:
+        return from_plain(kind, document)
+    except BadDataError as error:
+        raise error.at(path) from None
 
 
 def load_json(path: Path, *, way_out: str = "give a file this program wrote") -> object:

@@ -1,0 +1,356 @@
+"""Records: what a file, an option or a result holds is declared once; reader, writer and schema come from that.
+
+A declaration gives a field its type, range and meaning::
+
+    class Head(Record):
+        "Grid and curvature of a scan head's taxels."
+
+        rows: Annotated[int, Meta(ge=1, description="Taxels across the head.")]
+        radius_mm: Annotated[float, Meta(gt=0, description="Of the arc across the head.")] | None = None
+
+`from_plain` makes one of what JSON or TOML held, `to_plain` the reverse, `schema_of` the schema in data_schema/. Files
+go through `files.documents.read_record`, which first refuses doubled keys, huge numbers and depth. Arrays are nested
+lists in files; `geometry.Vector` and `geometry.Matrix` declare them. A range belongs to its own member of a union:
+``Annotated[int, Meta(ge=1)] | None``. A rule between fields stands in ``__post_init__``, which raises `BadDataError`.
+No other module imports msgspec.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator, Mapping
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+)
+
+import msgspec
+from msgspec import Meta as Meta
+from msgspec import field as field
+
+from tactile_bayes.errors import BadDataError, meant, number_words
+
+T = TypeVar("T")
+MOST_SHOWN: Final = 100
+"""Characters of a value that a record's repr shows; of a longer one it shows what it is."""
+
+if TYPE_CHECKING:  # to a type checker each record is frozen, as the class below makes them
+
+    @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
+    class _Struct:
+        def __init_subclass__(cls, **options: Any) -> None: ...
+else:
+    _Struct = msgspec.Struct
+
+
+class Record(_Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all records: nothing is set later, and a file may hold no other keys.
+
+    Options of a class are those of `msgspec.Struct`: ``eq=False`` where a record holds arrays, ``omit_defaults=True``
+    where its files leave defaults out, ``tag`` and ``tag_field`` for one of several forms.
+    """
+
+    def __repr__(self) -> str:
+        names: tuple[str, ...] = type(self).__struct_fields__  # type: ignore[attr-defined]
+        return f"{type(self).__qualname__}({', '.join(f'{name}={_short(getattr(self, name))}' for name in names)})"
+
+
+def replace(record: T, **changes: Any) -> T:
+    """A copy of a record with some fields changed."""
+    copy: T = msgspec.structs.replace(record, **changes)  # type: ignore[type-var]
+    return copy
+
+
+def from_plain(kind: type[T], document: object) -> T:
+    """A record of plain data: dictionaries, lists, texts and numbers.
+
+    Raises
+    ------
+    BadDataError
+        In one line: the field at fault, its value, and what it may be.
+    """
+    try:
+        return msgspec.convert(document, kind, dec_hook=_array)
+    except msgspec.ValidationError:
+        raise _fault(kind, document, "") from None
+
+
+def to_plain(record: object, *, digits: int = 9) -> Any:
+    """Plain data of a record for JSON: arrays as nested lists, floats with this many significant digits."""
+    return _rounded(msgspec.to_builtins(record, enc_hook=_lists, str_keys=True), digits)
+
+
+def schema_of(kind: Any, *, title: str = "") -> dict[str, Any]:
+    """JSON schema (draft 7) of a record's files, from its declaration.
+
+    Parameters
+    ----------
+    title
+        Of the schema; the first line of the record's docstring where left out.
+    """
+    found = msgspec.json.schema(kind, schema_hook=lambda _: {"type": "array"})
+    definitions = found.pop("$defs", {})
+    body = _inlined(found, definitions)
+    title = title or body.pop("description", "").split("\n")[0].rstrip(".")
+    return {"$schema": "http://json-schema.org/draft-07/schema#", "title": title, **body}
+
+
+def schema_name(kind: Any) -> str | None:
+    """The value that the key ``schema`` of a record's files has; None where they have none."""
+    for one in _members(kind):
+        if _is_record(one):
+            for part in msgspec.structs.fields(one):
+                if part.encode_name == "schema" and get_origin(_bare(part.type)) is Literal:
+                    return str(get_args(_bare(part.type))[0])
+    return None
+
+
+def _short(value: Any) -> str:
+    """A value's repr; for arrays and long values their kind with shape or length: no draws are printed."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return repr(value) if value.shape == () else f"<array {'x'.join(map(str, value.shape))}>"
+    text, kind = repr(value), type(value).__qualname__
+    if len(text) <= MOST_SHOWN and "\n" not in text:
+        return text
+    return f"<{kind} of {len(value)}>" if hasattr(value, "__len__") else f"<{kind}>"
+
+
+def _array(kind: Any, value: object) -> object:
+    """An array of nested lists of numbers, for a field that is declared as one."""
+    import numpy as np  # a record without arrays is made without it: `--help` stays quick
+
+    if (get_origin(kind) or kind) is not np.ndarray:
+        raise NotImplementedError(f"no way to read a {kind}")
+    nested, first = float, value  # type: tuple[Any, Any]
+    while isinstance(first, list):
+        nested, first = list[nested], first[0] if first else 0.0
+    if nested is float:
+        raise BadDataError("", way_out="give a list of numbers")
+    try:
+        return np.asarray(msgspec.convert(value, nested), dtype=np.float64)
+    except ValueError as error:  # msgspec's is one
+        uneven = not isinstance(error, msgspec.ValidationError)
+        raise BadDataError(
+            "has rows of different lengths" if uneven else "", way_out="give numbers, the same count in each row"
+        ) from None
+
+
+def _lists(value: object) -> object:
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise NotImplementedError(f"no way to write a {type(value)}")
+
+
+def _rounded(value: Any, digits: int) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}")
+    if isinstance(value, dict):
+        return {key: _rounded(one, digits) for key, one in value.items()}
+    return [_rounded(one, digits) for one in value] if isinstance(value, list | tuple) else value
+
+
+# Schemas
+
+
+def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
+    """A schema with its definitions in place, tuples as draft 7 has them, and no names of classes."""
+    if isinstance(schema, list):
+        return [_inlined(one, definitions) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    if "$ref" in schema:
+        schema = {**definitions[schema["$ref"].rsplit("/", 1)[-1]], **{k: v for k, v in schema.items() if k != "$ref"}}
+    found = {key: _inlined(one, definitions) for key, one in schema.items()}
+    if "properties" in found:
+        found.pop("title", None)
+        found["properties"] = {key: _inlined(one, definitions) for key, one in schema["properties"].items()}
+    if "prefixItems" in found:
+        parts = found.pop("prefixItems")
+        alike = all(part == parts[0] for part in parts)
+        found |= {"items": parts[0]} if alike else {"items": parts, "additionalItems": False}
+    if len(found.get("enum", ())) == 1:
+        found = {"const" if key == "enum" else key: one[0] if key == "enum" else one for key, one in found.items()}
+    if "discriminator" in found:
+        del found["discriminator"]
+    return found
+
+
+# Errors
+
+
+def _fault(kind: Any, value: Any, where: str) -> BadDataError:
+    """What is wrong with a value that is none of its kind, in words: the innermost part at fault."""
+    record = _record_for(kind, value)
+    if record is not None and isinstance(value, dict):
+        found = _key_at_fault(record, value, where)
+        if found:
+            return found
+    for part, of_part, one in _parts(kind if record is None else record, value, where):
+        if _refused(of_part, one) is not None:
+            return _fault(of_part, one, part)
+    why = _refused(kind, value)
+    name = where or "the document"
+    if isinstance(why, BadDataError):  # of a record's own rules, or of an array
+        what = f"{where} {why.what}".strip() if why.what else f"{name} is {_shown(value)}"
+        return BadDataError(what, way_out=why.way_out)
+    return BadDataError(f"{name} is {_shown(value)}", way_out=_way_out(kind, value))
+
+
+def _refused(kind: Any, value: Any) -> Exception | None:
+    """Why a value is none of its kind; None where it is one."""
+    try:
+        msgspec.convert(value, kind, dec_hook=_array)
+    except msgspec.ValidationError as error:
+        return error.__cause__ if isinstance(error.__cause__, BadDataError) else error
+    return None
+
+
+def _key_at_fault(record: Any, value: Mapping[str, Any], where: str) -> BadDataError | None:
+    """The first key that a table may not have, or has not."""
+    config = record.__struct_config__
+    fields = {part.encode_name: part for part in msgspec.structs.fields(record)}
+    known = [*([config.tag_field] if config.tag_field else []), *fields]
+    for key in value if config.forbid_unknown_fields else ():
+        if key not in known:
+            return BadDataError(f"{_joined(where, _shown_key(key))} is not known", way_out=meant(str(key), known))
+    missing = [name for name, part in fields.items() if part.required and name not in value]
+    return BadDataError(f"{where or 'the document'} has no {missing[0]}", way_out="add it") if missing else None
+
+
+def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
+    """Parts of a value with the place, the kind that is declared for it, and the part."""
+    if isinstance(value, dict):
+        if _is_record(kind):
+            fields = {part.encode_name: part.type for part in msgspec.structs.fields(kind)}
+            yield from ((_joined(where, key), fields[key], one) for key, one in value.items() if key in fields)
+            return
+        for of_key, of_value in (get_args(one) for one in map(_bare, _members(kind)) if get_origin(one) is dict):
+            yield from ((_joined(where, f"key {_shown(key)}"), of_key, key) for key in value)
+            yield from ((_joined(where, _shown_key(key)), of_value, one) for key, one in value.items())
+    if isinstance(value, list):
+        for one in map(_bare, _members(kind)):
+            args = get_args(one)
+            if get_origin(one) is tuple and args[-1] is not Ellipsis:
+                yield from ((f"{where}[{i}]", of, part) for i, (of, part) in enumerate(zip(args, value, strict=False)))
+            elif get_origin(one) in (list, tuple):
+                yield from ((f"{where}[{i}]", args[0], part) for i, part in enumerate(value))
+
+
+def _record_for(kind: Any, value: Any) -> Any:
+    """The record that a table is meant to be: of several forms the one that it names."""
+    records = [one for one in map(_bare, _members(kind)) if _is_record(one)]
+    if len(records) == 1:
+        return records[0]
+    for one in records:
+        config = one.__struct_config__
+        if isinstance(value, dict) and config.tag_field and value.get(config.tag_field) == config.tag:
+            return one
+    return None
+
+
+def _members(kind: Any) -> tuple[Any, ...]:
+    """Kinds of a union, each with its ranges; a single kind alone."""
+    bare = _bare(kind)
+    return get_args(bare) if get_origin(bare) in (Union, types.UnionType) else (kind,)
+
+
+def _bare(kind: Any) -> Any:
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+
+
+def _is_record(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+def _way_out(kind: Any, value: Any) -> str:
+    """What can be given in place of a value, such as "give a number above 0"."""
+    members = [one for one in _members(kind) if one is not type(None)]
+    forms = [one for one in map(_bare, members) if _is_record(one)]
+    if len(forms) > 1 and isinstance(value, dict):  # no form of that name
+        names = ", ".join(str(one.__struct_config__.tag) for one in forms)
+        return f"give as its {forms[0].__struct_config__.tag_field} one of {names}"
+    choices = [str(one) for kind in members for one in get_args(kind) if get_origin(kind) is Literal]
+    if isinstance(value, str) and len(choices) > 1 and (near := meant(value, choices)).startswith("did"):
+        return f"{near} Give one of {', '.join(choices)}"
+    return f"give {' or '.join(dict.fromkeys(_in_words(one) for one in members))}"
+
+
+_KINDS: Final[Mapping[Any, str]] = {
+    bool: "true or false",
+    dict: "a table of keys",
+    list: "a list",
+    tuple: "a list",
+    type(None): "null",
+}
+
+
+def _in_words(kind: Any) -> str:
+    """A single kind with its range."""
+    bare, rules = _bare(kind), _rules(kind)
+    origin, args = get_origin(bare) or bare, get_args(bare)
+    if origin is Literal:
+        return repr(args[0]) if len(args) == 1 else f"one of {', '.join(map(str, args))}"
+    if origin in (int, float):
+        return _numbers(rules, whole=origin is int)
+    if origin is str:
+        return _texts(rules)
+    if origin is tuple and args[-1] is not Ellipsis:
+        return f"a list of {len(args)}"
+    if "min_length" in rules and origin in (list, tuple):
+        return f"a list of {rules['min_length']} or more"
+    return "a table of keys" if _is_record(bare) else _KINDS.get(origin, "a list of numbers")
+
+
+def _numbers(rules: Mapping[str, Any], *, whole: bool) -> str:
+    if "gt" in rules and "le" in rules:
+        return f"{number_words(rules['gt'], None, whole=whole, open_ends=True)} up to {rules['le']:g}"
+    if "ge" in rules and "lt" in rules:
+        return f"{number_words(rules['ge'], None, whole=whole).removesuffix(' on')} to below {rules['lt']:g}"
+    open_ends = "gt" in rules or "lt" in rules
+    least, most = rules.get("gt", rules.get("ge")), rules.get("lt", rules.get("le"))
+    return number_words(least, most, whole=whole, open_ends=open_ends)
+
+
+def _texts(rules: Mapping[str, Any]) -> str:
+    """A text's rule: its own words (``extra={"words": ...}``) or its meaning, for a pattern is nothing for people."""
+    if "words" in rules.get("extra", {}):
+        return str(rules["extra"]["words"])
+    if "pattern" in rules and "description" in rules:
+        return f"a text in quotes: {rules['description'][0].lower()}{rules['description'][1:].rstrip('.')}"
+    if "min_length" in rules or "max_length" in rules:
+        least, most = rules.get("min_length", 0), rules.get("max_length")
+        return f"a text of at least {least} letters" if most is None else f"a text of {least} to {most} letters"
+    return "a text, in quotes"
+
+
+_RULES: Final = ("gt", "ge", "lt", "le", "min_length", "max_length", "pattern", "description", "extra")
+
+
+def _rules(kind: Any) -> dict[str, Any]:
+    """All that is declared about a kind; the last word stands."""
+    found: dict[str, Any] = {}
+    for meta in getattr(kind, "__metadata__", ()):
+        found |= {name: getattr(meta, name) for name in _RULES if getattr(meta, name, None) is not None}
+    return found
+
+
+def _joined(where: str, key: object) -> str:
+    return f"{where}.{key}" if where else str(key)
+
+
+def _shown_key(key: object) -> str:
+    text = str(key)
+    return text if text.isidentifier() and len(text) <= 60 else _shown(key)
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
