@@ -60,3 +60,6 @@ MOST_FIELD_COSINES: Final = 40
 
 REGISTRATION_MM: Final = 5.0
 """SD each way of a mass's place in the patient between two visits; an assumption, see record 0115."""
+
+MATCH_MM: Final = 15.0
+"""Default distance for matching a mass by its place: half of what lies between two masses that are told apart."""

@@ -15,7 +15,7 @@ from tactile_bayes.api.arguments import check_keywords, door, in_keywords, plain
 from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.paths import PathLike, output_path, path_of
-from tactile_bayes.api.sized import MassEstimate, SizedExam
+from tactile_bayes.api.sized import MassEstimate, Sized
 from tactile_bayes.errors import UsageError
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
@@ -29,6 +29,26 @@ if TYPE_CHECKING:
     from tactile_bayes.size.repeatability import Repeatability
 
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
+
+
+class SizedExam(Sized):
+    """Base of the estimates of a whole exam, from one map or from several."""
+
+    @door
+    def report(
+        self,
+        path: PathLike,
+        *,
+        pdf: PathLike | None = None,
+        title: str = "",
+        name: str = "",
+        day: str = "",
+        force: bool = False,
+    ) -> None:
+        """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
+        from tactile_bayes.api.reports import exam_report
+
+        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,7 +11,6 @@ import numpy as np
 
 from tactile_bayes.api.arguments import door
 from tactile_bayes.api.draws import Draws
-from tactile_bayes.api.paths import PathLike
 from tactile_bayes.errors import UsageError
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.presets import RESEARCH_USE
@@ -142,26 +141,6 @@ class Sized:
         why = "" if self._size is not None else f"<p>No size: {escape(self.why)}</p>"
         table = f"<table>{''.join(cells)}</table>" if cells else ""
         return f"{told}{why}{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
-
-
-class SizedExam(Sized):
-    """Base of the estimates of a whole exam, from one map or from several."""
-
-    @door
-    def report(
-        self,
-        path: PathLike,
-        *,
-        pdf: PathLike | None = None,
-        title: str = "",
-        name: str = "",
-        day: str = "",
-        force: bool = False,
-    ) -> None:
-        """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
-        from tactile_bayes.api.reports import exam_report
-
-        exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import field, replace
-from typing import Any, Final
+from typing import Any
 
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.presets import DEFAULT_NORMALISE
+from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM
 from tactile_bayes.records import dataclass
-
-MATCH_MM: Final = 15.0
-"""Default distance for matching a mass by its place: half of what lies between two masses that are told apart."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.pipeline.campaign_settings import MATCH_MM
 from tactile_bayes.pipeline.one_map import Answer
+from tactile_bayes.presets import MATCH_MM
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.same_mass import Place as PatientPlace
 
