@@ -13,12 +13,20 @@ from pathlib import Path
 import psutil
 
 WORKERS, WORKER_MB, READY_S = 2, 60.0, 120.0
+_UNPROFILED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
+"""As the guide starts workers."""
 
 
 def start(log: Path, *words: str) -> subprocess.Popen[bytes]:
     """A process of its own with its output in a file."""
     with log.open("ab") as file:
-        return subprocess.Popen([sys.executable, *words], stdout=file, stderr=file, start_new_session=True)
+        return subprocess.Popen(
+            [sys.executable, *words],
+            stdout=file,
+            stderr=file,
+            start_new_session=True,
+            env={**os.environ, **_UNPROFILED},
+        )
 
 
 class Cluster:

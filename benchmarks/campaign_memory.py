@@ -4,8 +4,8 @@
     python -m benchmarks.campaign_memory DIR [--exams 300] [--dask [--profile]] [--figures]
 
 Maps, estimates and draws the scans of DIR one after the other in one worker: a process of the program's own as
-`campaign run --workers` has, or one of a dask cluster on this machine, with dask's profiler as it comes or as the
-program leaves it. Prints the resident set size (RSS) after so many exams and how many tracebacks' trees the profiler
+`campaign run --workers` has, or one of a dask cluster on this machine, with dask's profiler or as the guide starts
+workers, without. Prints the resident set size (RSS) after so many exams and how many tracebacks' trees the profiler
 holds, and last by how much the RSS after all exams exceeds that after 30.
 """
 
@@ -58,15 +58,15 @@ def _profiled() -> int:
 @contextlib.contextmanager
 def dask_worker(*, profile: bool) -> Iterator[Executor]:
     """One worker of a cluster on this machine."""
-    from distributed import Client, LocalCluster
+    import dask
+    from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
-        if not profile:
-            with open_executor(cluster=cluster.scheduler_address) as executor:
-                yield executor
-            return
-        with Client(cluster) as client, client.get_executor(pure=False) as executor:
-            yield executor
+    with (
+        dask.config.set({"distributed.worker.profile.enabled": profile}),
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        open_executor(cluster=cluster.scheduler_address) as executor,
+    ):
+        yield executor
 
 
 def main(folder: Path, exams: int, *, chosen: contextlib.AbstractContextManager[Executor], figures: bool) -> None:

@@ -149,10 +149,8 @@ class ClusterWorkers(Executor):
         """Number of items to submit ahead: no worker waits, and the scheduler holds few at any time."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """The future of ``fn(*args, **kwargs)`` on one of the workers, whose profiler does not look at it."""
-        from tactile_bayes.worker_profile import unprofiled
-
-        return self._cluster.submit(unprofiled, fn, *args, **kwargs)
+        """The future of ``fn(*args, **kwargs)`` on one of the workers."""
+        return self._cluster.submit(fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let the items end, or cancel them."""

@@ -613,68 +613,6 @@ def test_a_cluster_gives_the_same_results_and_names_what_failed(cluster):
     assert strange.error == "LocalError: cannot travel 7"
 
 
-def profiled(dask_worker):
-    """Functions of this module that the worker's profiler has seen."""
-    trees = [dask_worker.profile_recent, *(tree for _, tree in dask_worker.profile_history)]
-    seen = set()
-    while trees:
-        tree = trees.pop()
-        trees += tree["children"].values()
-        if tree["description"]["filename"].endswith("test_batch.py"):
-            seen.add(tree["description"]["name"])
-    return seen
-
-
-def work_in_sight(seconds):
-    """A task of somebody else's, at which the profiler may look."""
-    time.sleep(seconds)
-
-
-def work_unseen(seconds):
-    """A task of ours."""
-    time.sleep(seconds)
-    return seconds
-
-
-CLIENT = """
-import sys
-from test_batch import work_unseen
-from tactile_bayes.batch import run_batch
-from tactile_bayes.executors import open_executor
-
-with open_executor(cluster=sys.argv[1]) as executor:
-    told = lambda done, total: print(done, flush=True)
-    run_batch(work_unseen, [0.5 + i / 1000 for i in range(50)], key=str, executor=executor, progress=told)
-"""
-
-
-@pytest.mark.slow
-def test_a_worker_does_not_profile_our_tasks_and_goes_on_with_others_when_the_client_is_killed(
-    cluster, child_environment
-):
-    # the profiler made workers of a campaign grow by 0.4 MB an exam, to 560 MB
-    from distributed import Client
-
-    here = os.pathsep.join([child_environment["PYTHONPATH"], str(Path(__file__).parent)])
-    ours = subprocess.Popen(
-        [sys.executable, "-c", CLIENT, cluster[0]],
-        env=child_environment | {"PYTHONPATH": here},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert ours.stdout is not None
-    while ours.stdout.readline() != "2\n":
-        assert ours.poll() is None
-    ours.kill()
-    ours.communicate()
-    with Client(cluster[0]) as client:
-        client.submit(work_in_sight, 0.5, pure=False).result()
-        (seen,) = client.run(profiled).values()
-        (active,) = client.run(lambda dask_worker: dict(dask_worker.active_threads)).values()
-    assert seen == {"work_in_sight"}
-    assert active == {}
-
-
 @pytest.mark.slow
 def test_a_scheduler_killed_in_the_middle_is_one_line_and_what_is_done_is_kept(child_environment, tmp_path):
     pytest.importorskip("distributed", reason="the [cluster] extra is not installed")

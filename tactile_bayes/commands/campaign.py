@@ -145,7 +145,7 @@ def _to_correct(output: Path) -> str:
 )
 @seed_option(1)
 @click.option("--figures", is_flag=True, help="Draw map and size posterior of each exam.")
-@click.option("--dry-run", is_flag=True, help="Print what would be done and how long it takes, and do nothing.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
 @click.option(
     "--copy-to", metavar="s3://BUCKET/FOLDER", help="Copy every file into this folder of an object store, step by step."
 )
@@ -222,7 +222,7 @@ def run(
         open_executor(workers=workers, cluster=None if dry_run else scheduler) as executor,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        bar = partial(progress_bar, log_every_s=_LOG_EVERY_S)
+        bar = partial(progress_bar, log_every_s=_LOG_EVERY_S, time_left=False)
         campaign = Campaign(table, place, of_all, store=store, executor=executor, dry=dry_run, bar=bar)
         campaign.run()
         if not dry_run:
@@ -231,7 +231,7 @@ def run(
             if of_all.copy_to:
                 copy_outputs(place, of_all.copy_to)
     if dry_run:
-        _say_plan(campaign, workers, on_cluster=scheduler is not None)
+        _say_plan(campaign)
     else:
         _say_done(campaign, written, output, left)
     if dry_run or not written.report:  # which ends with it
@@ -255,7 +255,7 @@ def _check_paths(table: Sequence[Exam], output: Path, settings: CampaignSettings
         also_read(size_calibration_path(str(name)))
 
 
-def _say_plan(campaign: Campaign, workers: int, *, on_cluster: bool) -> None:
+def _say_plan(campaign: Campaign) -> None:
     found = campaign.found
     for step, todo in found.todo.items():
         named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
@@ -264,33 +264,12 @@ def _say_plan(campaign: Campaign, workers: int, *, on_cluster: bool) -> None:
         click.echo(f"{name}: {fault.step} failed: {fault.reason}")
     if len(found.faults) > _MOST_NAMED:
         click.echo(f"{len(found.faults) - _MOST_NAMED} more failed")
-    click.echo(_time_words(found, workers, on_cluster=on_cluster))
     click.echo("Nothing was run.")
 
 
 def _few(found: CampaignState, step: str) -> bool:
     """Whether all exams or masses that need a step are known by name, and fit a line."""
     return 0 < found.todo[step] == len(found.names[step])
-
-
-def _time_words(found: CampaignState, workers: int, *, on_cluster: bool) -> str:
-    """How long the planned steps take, as far as any of their kind was run in the folder."""
-    todo = {step: count for step, count in found.todo.items() if count}
-    unknown = ", ".join(step for step in todo if step not in found.seconds)
-    if unknown and not todo.keys() & found.seconds.keys():
-        return f"How long is not known: no {unknown} was run here yet."
-    seconds = sum(count * found.seconds.get(step, 0.0) for step, count in todo.items())
-    about = f"About {_duration(seconds / (1 if on_cluster else max(workers, 1)))}"
-    about += " of one worker" if on_cluster else ""
-    more = f", and more for {unknown}, which was not run here yet" if unknown else ""
-    return f"{about} by the times measured here{more}."
-
-
-def _duration(seconds: float) -> str:
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    return f"{whole // 60} min" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence[str]) -> None:

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING
 import click
 
 from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.moved_options import MovedOptions
 from tactile_bayes.commands.options import FORCE, FiniteRange, scheduler_option, seed_option
 from tactile_bayes.commands.paths import FilePath, also_read
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.pipeline.one_map import Answer, answer_file, answer_of, estimate_file
-from tactile_bayes.pipeline.settings import FROM_FILE, Settings, refuse_checkpoint
+from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 from tactile_bayes.presets import METHODS, SCENES
 
 if TYPE_CHECKING:
@@ -26,14 +25,10 @@ if TYPE_CHECKING:
 
 _FILE = FilePath()
 _DEFAULTS = Settings()
-_MOVED = {f"--{name.replace('_', '-')}": f"give {name} in --settings FILE.toml" for name in FROM_FILE} | {
-    "--prior": "--settings FILE.toml takes the same file",
-    "--rotation": "give --scene ellipse or --scene rotated, or rotation in --settings FILE.toml",
-}
 _PROBABILITY = FiniteRange(min=0.0, max=1.0, min_open=True, max_open=True)
 
 
-@click.command("estimate", cls=MovedOptions, moved=_MOVED)
+@click.command("estimate")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @click.option(
     "--size-calibration",

@@ -26,6 +26,7 @@ def progress_bar(
     stream: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,
     log_every_s: float | None = None,
+    time_left: bool = True,
 ) -> Iterator[Progress]:
     """Give a ``progress(done, total)`` callback; the bar is erased when the block ends.
 
@@ -39,12 +40,14 @@ def progress_bar(
         Seconds from anywhere.
     log_every_s
         Where the stream is no terminal: a line so often, from then on. Default: none.
+    time_left
+        Whether the time left is told, for work whose parts take equally long.
     """
     out = raw_stream(sys.stderr) if stream is None else stream
     if not out.isatty():
-        yield untold if log_every_s is None else _Log(label, out, clock, log_every_s).update
+        yield untold if log_every_s is None else _Log(label, out, clock, log_every_s, time_left=time_left).update
         return
-    bar = _Bar(label, out, clock)
+    bar = _Bar(label, out, clock, time_left=time_left)
     try:
         yield bar.update
     finally:
@@ -60,39 +63,48 @@ class _Teller(ABC):
         Until the first is told, and from one to the next.
     """
 
-    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], *, quiet_s: float, every_s: float) -> None:
+    def __init__(
+        self,
+        label: str,
+        out: TextIO,
+        clock: Callable[[], float],
+        *,
+        quiet_s: float,
+        every_s: float,
+        time_left: bool,
+    ) -> None:
         self._label, self._out, self._clock, self._every_s = label, out, clock, every_s
+        self._time_left = time_left
         self._begun = clock()
         self._next = self._begun + quiet_s
         self._first: int | None = None  # what a resumed run had before it began
 
-    def update(self, done: int, total: int, *, left_s: float | None = None) -> None:
-        """Tell `done` of `total`, at most every so often; `left_s` stands in for what it would reckon."""
+    def update(self, done: int, total: int) -> None:
+        """Tell `done` of `total`, at most every so often."""
         now = self._clock()
         self._first = done if self._first is None else self._first
         if now < self._next or total <= 0:
             return
         self._next = now + self._every_s
-        self._tell(done, total, self._left(now, done, total, left_s))
+        self._tell(done, total, self._left(now, done, total))
         self._out.flush()
 
     @abstractmethod
     def _tell(self, done: int, total: int, left: str) -> None:
         """Write what is done of how much, and the time left where it is known, which begins with a blank."""
 
-    def _left(self, now: float, done: int, total: int, left_s: float | None) -> str:
+    def _left(self, now: float, done: int, total: int) -> str:
         new = done - (self._first or 0)
-        if new <= 0 or done >= total:
+        if not self._time_left or new <= 0 or done >= total:
             return ""
-        seconds = round((now - self._begun) * (total - done) / new if left_s is None else left_s)
-        return f" {duration(seconds)} left"
+        return f" {duration(round((now - self._begun) * (total - done) / new))} left"
 
 
 class _Log(_Teller):
     """Lines in a file or a pipe, for work of hours."""
 
-    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], every_s: float) -> None:
-        super().__init__(label, out, clock, quiet_s=every_s, every_s=every_s)
+    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], every_s: float, *, time_left: bool) -> None:
+        super().__init__(label, out, clock, quiet_s=every_s, every_s=every_s, time_left=time_left)
 
     def _tell(self, done: int, total: int, left: str) -> None:
         self._out.write(f"{self._label}: {done} of {total} done{',' if left else ''}{left}\n")
@@ -101,8 +113,8 @@ class _Log(_Teller):
 class _Bar(_Teller):
     """A line that is redrawn."""
 
-    def __init__(self, label: str, out: TextIO, clock: Callable[[], float]) -> None:
-        super().__init__(label, out, clock, quiet_s=QUIET_S, every_s=REDRAW_S)
+    def __init__(self, label: str, out: TextIO, clock: Callable[[], float], *, time_left: bool) -> None:
+        super().__init__(label, out, clock, quiet_s=QUIET_S, every_s=REDRAW_S, time_left=time_left)
         self._drawn = 0
 
     def _tell(self, done: int, total: int, left: str) -> None:

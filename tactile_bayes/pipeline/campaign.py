@@ -38,9 +38,8 @@ from tactile_bayes.pipeline.campaign_repeatability import (
     too_few,
 )
 from tactile_bayes.pipeline.campaign_settings import CampaignSettings
-from tactile_bayes.pipeline.campaign_stages import CampaignState, Fault, Stages
+from tactile_bayes.pipeline.campaign_stages import CampaignState, Fault, Stages, steps_needed
 from tactile_bayes.pipeline.campaign_steps import Task
-from tactile_bayes.pipeline.campaign_time import steps_needed
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.progress import Progress, untold
 

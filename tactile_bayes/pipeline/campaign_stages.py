@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import field
 from typing import Final
@@ -13,8 +12,8 @@ from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_bat
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.pipeline.campaign_folder import StepResults, unchanged
+from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 from tactile_bayes.pipeline.campaign_steps import FILES, Result, Task, run_step
-from tactile_bayes.pipeline.campaign_time import Pace, mean_seconds
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.records import dataclass
 
@@ -32,7 +31,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CampaignState:
-    """How far a campaign is: results by step and name, faults by name, counts and times of steps.
+    """How far a campaign is: results by step and name, faults by name, counts of steps.
 
     Parameters
     ----------
@@ -44,8 +43,6 @@ class CampaignState:
         Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do.
     names
         By step, the first few exams or masses of `todo`.
-    seconds
-        Mean time that one of each step took so far.
     """
 
     results: dict[str, StepResults]
@@ -53,7 +50,6 @@ class CampaignState:
     kept: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     todo: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     names: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
-    seconds: dict[str, float] = field(default_factory=dict)
 
     def of(self, step: str, name: str) -> Result | None:
         """Result of a step of an exam or mass; None where there is none."""
@@ -71,8 +67,6 @@ class Stages:
         As `run_batch`'s.
     dry
         Plan only.
-    clock
-        Seconds from anywhere, for the time that is left.
 
     Attributes
     ----------
@@ -81,7 +75,7 @@ class Stages:
     needed
         By step, how many are still to be run or found done, as far as is known.
     tell
-        Called with the steps of this run that are done, those it does altogether, and the seconds left.
+        Called with the steps of this run that are done, and those it does altogether.
     """
 
     def __init__(
@@ -90,16 +84,14 @@ class Stages:
         store: BatchStore | None,
         executor: Executor | None = None,
         dry: bool = False,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         values = {} if store is None else store.values
         results = {step: StepResults(values) for step in FILES}
-        self.found = CampaignState(results, seconds=mean_seconds(values))
+        self.found = CampaignState(results)
         self.needed: Counter[str] = Counter()
         self.tell: Progress = untold
         self._store, self._executor, self._dry = store, executor, dry
         self._done = 0
-        self._pace = Pace(self.found.seconds, clock)
 
     def run(self, step: str, tasks: Sequence[Task], *, without: int = 0) -> None:
         """Run one step for those that need it.
@@ -130,11 +122,9 @@ class Stages:
 
     def _run(self, step: str, tasks: Sequence[Task]) -> list[Outcome[Result]]:
         before, total = self._done, self._done + self.needed.total()
-        self._pace.begin()
 
         def tell(done: int, _total: int) -> None:
-            self._pace.note(step, done)
-            self.tell(before + done, total, left_s=self._pace.left(self.needed - Counter({step: done})))
+            self.tell(before + done, total)
 
         try:
             outcomes = run_batch(run_step, tasks, key=_key, executor=self._executor, store=self._store, progress=tell)
@@ -155,6 +145,23 @@ class Stages:
             if not unchanged(task.folder, values[task.key]):
                 values.forget(task.key)
         return [task for task in known if task.key in values]
+
+
+def steps_needed(
+    exams: int, masses: int, *, settings: CampaignSettings, learns: bool, compared: int = 0
+) -> dict[str, int]:
+    """Steps that so many exams and masses take, done or not.
+
+    Parameters
+    ----------
+    masses, compared
+        To be pooled, and to be compared between visits.
+    learns
+        Whether the repeats may teach the spread between exams; then every exam gets its size by it.
+    """
+    needed = {"map": exams, "estimate": exams, "figures": exams * settings.figures, "pool": masses, "compare": compared}
+    needed |= {"repeatability": 1, "size": exams} if learns else {}
+    return {**needed, "copy": (exams + masses + compared) * bool(settings.copy_to)}
 
 
 def _key(task: Task) -> str:

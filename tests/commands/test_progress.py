@@ -31,18 +31,19 @@ def test_nothing_is_drawn_into_a_pipe():
     assert stream.getvalue() == ""
 
 
-def test_a_log_gets_a_line_now_and_then_with_the_hours_left():
+@pytest.mark.parametrize("time_left", [True, False])
+def test_a_log_gets_a_line_now_and_then_with_the_hours_left_where_they_are_told(time_left):
     stream, clock = io.StringIO(), Clock()
-    with progress_bar("steps", stream=stream, clock=clock, log_every_s=60.0) as progress:
+    with progress_bar("steps", stream=stream, clock=clock, log_every_s=60.0, time_left=time_left) as progress:
         for done in range(0, 121, 10):
             progress(done, 20_000)
             clock.now += 10.0
-        progress(130, 20_000, left_s=7384.6)
+        progress(130, 20_000)
         clock.now += 60.0
         progress(20_000, 20_000)
     assert stream.getvalue().splitlines() == [
-        "steps: 60 of 20000 done, 5:32:20 left",
-        "steps: 120 of 20000 done, 5:31:20 left",
+        "steps: 60 of 20000 done" + ", 5:32:20 left" * time_left,
+        "steps: 120 of 20000 done" + ", 5:31:20 left" * time_left,
         "steps: 20000 of 20000 done",
     ]
 
