@@ -159,7 +159,6 @@ def size(
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.pipeline.size_calibration import is_population, learn_eq6
     from tactile_bayes.report.calibration_text import calibration_text
-    from tactile_bayes.size.learn.body_effects import size_terms
 
     for path in filter(None, (output, figure)):
         refuse_existing(path, force=force)
@@ -187,7 +186,6 @@ def size(
         eq6_figure(learned.calibration, learned.lumps, figure, title=table.name, force=force)
     words = calibration_text(
         learned.calibration,
-        terms=size_terms(learned.lumps),
         not_left_out=learned.not_left_out,
         other_fit=learned.other_fit,
     )

@@ -27,18 +27,6 @@ if TYPE_CHECKING:
 
 GIVEN: Final = "given in Python"
 """Name of a calibration that is in no file."""
-FROM_FILE: Final = (
-    "background",
-    "fit_radius_mm",
-    "rotation",
-    "max_steps",
-    "noise",
-    "between_map_sd",
-    "accuracy_mm",
-    "checkpoint",
-    "field_cosines",
-)
-"""Settings that the command line takes from a settings file only, besides the priors."""
 
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "method": METHODS,

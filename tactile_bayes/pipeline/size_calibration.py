@@ -350,21 +350,6 @@ def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
     if None in columns["stiffness_ratio"]:
         return None
     depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))
-    told = {"seat_number": _seat_numbers(columns["seat"])}
-    told |= {name: columns[name] for name in ("thickness_mm", "head_radius_mm")}
-    others = {name: np.asarray(values, dtype=np.float64) for name, values in told.items() if None not in values}
+    told = {name: columns[name] for name in ("thickness_mm", "head_radius_mm") if None not in columns[name]}
+    others = {name: np.asarray(values, dtype=np.float64) for name, values in told.items()}
     return StudyCases(tuple(columns["seat"]), depth, ratio, others)
-
-
-def _seat_numbers(seats: list[str | None]) -> list[float | None]:
-    """Seats as numbers, 0 for centred and 1 for resting; None for other names."""
-    from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.forward.body import parse_seat
-
-    def number(seat: str | None) -> float | None:
-        try:
-            return None if seat is None else parse_seat(seat)
-        except TactileBayesError:
-            return None
-
-    return [number(seat) for seat in seats]

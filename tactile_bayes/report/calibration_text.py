@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
-from tactile_bayes.size.learn.body_effects import SizeTerms
 from tactile_bayes.size.learn.eq6_two_stage import OtherFit, is_two_stage
 
 LABELS = {
@@ -19,22 +16,13 @@ LABELS = {
 }
 
 
-TERM_NAMES = {
-    "seat": ("seat", "a unit"),
-    "stiffness_ratio": ("E2/E1 up to 8,", "a unit of ln"),
-    "thickness_mm": ("thickness in mm", "a unit of ln"),
-    "head_radius_mm": ("radius of the head in mm", "a unit of ln"),
-}
-
-
 def calibration_text(
     calibration: SizeCalibration,
     *,
-    terms: Mapping[str, SizeTerms] | None = None,
     not_left_out: str = "",
     other_fit: OtherFit | None = None,
 ) -> str:
-    """Text of a size calibration: fit, domain and r2 of each axis, recipe, and the effects in `terms`.
+    """Text of a size calibration: fit, domain and r2 of each axis, and recipe.
 
     Parameters
     ----------
@@ -63,8 +51,6 @@ def calibration_text(
         lines += _left_out(calibration.left_out)
     elif not_left_out:
         lines.append(f"leave one geometry out: not known, {not_left_out}")
-    if terms:
-        lines += _terms(terms, both=both)
     recipe = calibration.recipe
     how = "declared" if recipe.declared else "as the maps were made here"
     lines.append(f"recipe ({how}): {recipe}")
@@ -91,22 +77,6 @@ def _left_out(errors: LeftOutErrors) -> list[str]:
     ]
     which = f"{errors.cases} cases of E2/E1 >= {errors.least_stiffness_ratio:g}"
     return [f"leave one geometry out: {said[0]} of d ({errors.geometries} geometries, {which})", *said[1:]]
-
-
-def _terms(terms: Mapping[str, SizeTerms], *, both: bool) -> list[str]:
-    """Effect of each property on the size of the same map, and the error that knowing it would remove."""
-    lines = ["for the same amplitude and width (no part of the calibration, `estimate` does not use it):"]
-    for axis, found in terms.items():
-        words = "" if both else {"x": ", by the width across", "y": ", by the width along"}[axis]
-        for term in found.terms:
-            name, unit = TERM_NAMES[term.name]
-            lines.append(
-                f"  {name} {term.low:g} -> {term.high:g}{words}: d {100 * term.change:+.0f} % "
-                f"(ln d {term.coefficient:+.3f} +- {term.standard_error:.3f} {unit}); "
-                f"knowing it takes away {100 * term.share:.0f} % of the residual variance"
-            )
-        lines.append(f"  all of them{words}: residual SD of ln d {found.scatter:.3f} -> {found.scatter_left:.3f}")
-    return lines
 
 
 def _figures(axes: list[AxisCalibration]) -> list[str]:

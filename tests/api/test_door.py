@@ -22,8 +22,9 @@ from tactile_bayes.cli import cli
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
+from tactile_bayes.files.schema import load_schema
+from tactile_bayes.files.settings_toml import PRIORS
 from tactile_bayes.mapping import build_map
-from tactile_bayes.pipeline.settings import FROM_FILE
 from tactile_bayes.pipeline.trial import TrialSettings
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -75,7 +76,8 @@ def test_the_defaults_are_the_command_lines() -> None:
     shared = set(given) & set(shown)
     assert shared >= {"size_calibration", "method", "seed", "interval", "centre_mm", "scene", "accuracy_sd", "known"}
     assert {name: given[name] for name in shared} == {name: shown[name] for name in shared}
-    assert set(given) - shared == {"tactile_map", "progress", "prior", *FROM_FILE}
+    from_file = set(load_schema("settings.schema.json")["properties"]) - {*PRIORS}
+    assert set(given) - shared == {"tactile_map", "progress", "prior", *from_file}
     trial, shown = TrialSettings(), defaults_of("validate", "t.csv", "--excision", "e.csv")
     for name in ("intervals", "resamples", "seed", "error_ratio", "check_intervals", "bayes"):
         assert getattr(trial, name) == shown[name]

@@ -41,8 +41,7 @@ class StudyCases:
     depth_ratio, stiffness_ratio : (n,) arrays
         h/d, and E2/E1.
     others
-        (n,) arrays of what else the table tells of every row: ``thickness_mm``, ``head_radius_mm``, and ``seat_number``
-        where all seats have one.
+        (n,) arrays of what else the table tells of every row: ``thickness_mm``, ``head_radius_mm``.
     """
 
     seat: tuple[str | None, ...]
