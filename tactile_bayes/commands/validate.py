@@ -24,11 +24,11 @@ _DEFAULTS = TrialSettings()
 )
 @click.option(
     "--intervals",
-    type=click.Choice(["corrected", "jackknife", "percentile", "bca"]),
+    type=click.Choice(["corrected", "jackknife", "bca"]),
     default=_DEFAULTS.intervals,
     show_default=True,
     help="Interval method, resampling patients. corrected: jackknife with Student's t, corrected for rare "
-    "misses and few influential patients; jackknife: uncorrected; percentile, bca: bootstraps.",
+    "misses and few influential patients; jackknife: uncorrected; bca: bootstrap.",
 )
 @click.option(
     "--resamples",

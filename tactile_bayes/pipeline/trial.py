@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tactile_bayes.trial.next_mass import NextMass
     from tactile_bayes.trial.summary import TrialReport
 
-IntervalMethod = Literal["corrected", "jackknife", "percentile", "bca"]
+IntervalMethod = Literal["corrected", "jackknife", "bca"]
 SCHEMA = "tactile-bayes/validate/1"
 
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 PRIOR_DRAWS = 2000
 LIKELIHOOD_DRAWS = 400
 """Evenly thinned: a value for each cell and draw takes a second and 4 MB for 400 of them."""
-PREDICTIVE_DRAWS = 100
-"""Evenly thinned, for 1 MB and 0.2 s of CPU time."""
 LEAST_SIZED = 100
 """Fewer prior draws within the calibration's range say nothing of a size."""
 
@@ -65,8 +63,8 @@ def inference_groups(
     Returns
     -------
     dict
-        ``sample_stats``, ``log_likelihood`` and ``posterior_predictive`` (of chains under a noise field),
-        ``observed_data`` and ``prior`` (under a noise field).
+        ``sample_stats``, ``log_likelihood`` (of chains under a noise field), ``observed_data`` and ``prior`` (under a
+        noise field).
     """
     if estimate.draws is None or estimate.fit is None:
         return {}
@@ -83,7 +81,6 @@ def inference_groups(
     found["prior"] = _prior(fit, calibration, size_priors, rng)
     if estimate.draws.method == "ensemble":
         found["log_likelihood"] = _log_likelihood(estimate.draws.theta, fit)
-        found["posterior_predictive"] = _predictive(estimate.draws.theta, fit, rng)
     return found
 
 
@@ -115,18 +112,6 @@ def _log_likelihood(theta: FloatArray, fit: FieldFit) -> DrawGroup:
     note = (
         "log density of each cell's value given all the other cells (leave-one-out predictive, Buerkner, Gabry & "
         "Vehtari 2021), for evenly thinned draws: under correlated errors a likelihood is no product over cells"
-    )
-    return DrawGroup({"value": (("chain", "draw", "cell"), values)}, {"definition": note})
-
-
-def _predictive(theta: FloatArray, fit: FieldFit, rng: np.random.Generator) -> DrawGroup:
-    """Cells of other maps of the lump, by some of the draws."""
-    from tactile_bayes.posterior.correlated.pointwise import predictive_values
-
-    some = _thinned(theta, PREDICTIVE_DRAWS)
-    values = predictive_values(fit.target, some.reshape(-1, some.shape[2]), rng).reshape(*some.shape[:2], -1)
-    note = (
-        "values of the cells that another map of the same lump would have, its noise drawn anew; evenly thinned draws"
     )
     return DrawGroup({"value": (("chain", "draw", "cell"), values)}, {"definition": note})
 

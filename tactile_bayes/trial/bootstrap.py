@@ -1,4 +1,4 @@
-"""Bootstrap intervals over patients (percentile and BCa), keeping a patient's masses together."""
+"""Bootstrap intervals over patients (BCa), keeping a patient's masses together."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from tactile_bayes.trial.jackknife import UndefinedError
 from tactile_bayes.trial.readings import FloatArray
 
-Method = Literal["corrected", "jackknife", "percentile", "bca"]
-METHODS: tuple[Method, ...] = ("corrected", "jackknife", "percentile", "bca")
+Method = Literal["corrected", "jackknife", "bca"]
+METHODS: tuple[Method, ...] = ("corrected", "jackknife", "bca")
 RESAMPLES = 2000
 SEED = 1999
 # Of the redrawn trials, at least this share must have the figure at all.
@@ -26,8 +26,8 @@ class Intervals(float):
     confidence
         Probability, two-sided.
     method, resamples, seed
-        ``corrected`` is the jackknife with the corrections of record 0077; ``percentile`` and ``bca`` draw the
-        patients `resamples` times from this seed.
+        ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients
+        `resamples` times from this seed.
     """
 
     method: Method
@@ -55,12 +55,6 @@ def draw_patients(patients: int, *, resamples: int, seed: int) -> FloatArray:
     draws = rng.multinomial(patients, np.full(patients, 1 / patients), size=resamples).astype(np.float64)
     draws.flags.writeable = False
     return draws
-
-
-def percentile_interval(drawn: FloatArray, *, confidence: float) -> tuple[float, float]:
-    """Percentile interval from quantiles of the redrawn figure: Efron & Tibshirani (1993), ch. 13."""
-    low, high = np.quantile(_defined(drawn), [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence])
-    return float(low), float(high)
 
 
 def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confidence: float) -> tuple[float, float]:

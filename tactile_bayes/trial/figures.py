@@ -12,7 +12,7 @@ from typing import Protocol, assert_never
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.trial.bootstrap import Intervals, bca_interval, draw_patients, method_of, percentile_interval
+from tactile_bayes.trial.bootstrap import Intervals, bca_interval, draw_patients, method_of
 from tactile_bayes.trial.jackknife import (
     Scale,
     UndefinedError,
@@ -168,15 +168,13 @@ def _interval(
     sample: Resampled, value: float, *, scale: Scale, confidence: float, freedom: float | None
 ) -> tuple[float, float]:
     chosen = confidence if isinstance(confidence, Intervals) else Intervals(confidence)
-    draws = partial(draw_patients, len(sample.patients), resamples=chosen.resamples, seed=chosen.seed)
     match chosen.method:
         case "corrected" | "jackknife":
             left_out = sample.left_out()
             return interval_from_values(value, left_out, scale=scale, confidence=float(chosen), freedom=freedom)
-        case "percentile":
-            return percentile_interval(sample.redrawn(draws()), confidence=float(chosen))
         case "bca":
-            return bca_interval(value, sample.redrawn(draws()), sample.left_out(), confidence=float(chosen))
+            draws = draw_patients(len(sample.patients), resamples=chosen.resamples, seed=chosen.seed)
+            return bca_interval(value, sample.redrawn(draws), sample.left_out(), confidence=float(chosen))
     assert_never(chosen.method)
 
 

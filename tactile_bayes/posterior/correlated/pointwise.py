@@ -1,4 +1,4 @@
-r"""What draws say of a window's cells under correlated errors: densities with each cell left out, and new values.
+r"""What draws say of a window's cells under correlated errors: the density of each given the others.
 
 A likelihood with correlated errors is no product over cells. What takes the place of a cell's factor is the density of
 its value given all the others, with level, tilt, amplitudes and the noise scale integrated out as in `marginal`. For
@@ -58,51 +58,6 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     return -inverse
 
 
-def predictive_values(target: CollapsedTarget, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(m, n) values of a window's cells as another map of the same lump would have them, at (m, p) shape vectors.
-
-    Level, tilt, amplitudes, the noise scale and the noise field are drawn given each shape.
-
-    Parameters
-    ----------
-    target
-        Window, scene and noise fields.
-    theta : (m, p) array
-        Draws of the scene's parameters.
-    """
-    evidence, window = target.by_field(theta), target.window
-    share = np.exp(evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]).cumsum(axis=1)
-    chosen = (share < share[:, -1:] * rng.uniform(size=(len(theta), 1))).sum(axis=1)
-    fixed, middle = _fixed_columns(target), window.cells.value.mean()
-    templates = [window.of_cells(one.full()) for one in target.scene.templates(theta, window)]
-    drawn = np.empty((len(theta), len(window.cells)))
-    for h, precision_of_field in enumerate(_fields(target)):
-        of_field = np.flatnonzero(chosen == h)
-        if not of_field.size:
-            continue
-        precision = precision_of_field()
-        root = np.linalg.cholesky(precision.dense())
-        noise = np.linalg.solve(root.T, rng.standard_normal((len(window.cells), len(of_field)))).T
-        for m, errors in zip(of_field, noise, strict=True):
-            regressors = np.stack([*fixed, *(one[m] for one in templates)])
-            drawn[m] = middle + _predicted(precision, regressors, window.cells.value - middle, errors, rng)
-    return drawn
-
-
-def _predicted(
-    precision: _Precision, regressors: FloatArray, value: FloatArray, errors: FloatArray, rng: np.random.Generator
-) -> FloatArray:
-    """(n,) draw for (v, n) columns with free coefficients, from (n,) errors of scale 1."""
-    across = precision.times(regressors)
-    information = across @ regressors.T
-    coefficients = np.linalg.solve(information, across @ value)
-    left = value - coefficients @ regressors
-    squares = float(precision.times(left[None])[0] @ left)
-    scale = np.sqrt(squares / rng.chisquare(len(value) - len(regressors)))
-    spread = np.linalg.solve(np.linalg.cholesky(information).T, rng.standard_normal(len(regressors)))
-    return np.asarray((coefficients + scale * spread) @ regressors + scale * errors)
-
-
 def fitted_values(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
     """(n,) values of the model without noise at a (p,) shape, by generalised least squares in the likeliest field."""
     window, at = target.window, theta[None]
@@ -145,10 +100,6 @@ class _Precision:
     def __init__(self, weight: FloatArray, low: FloatArray, columns: FieldColumns, index: int) -> None:
         self._weight, self._low, self._taken = weight, low, columns.weight[:, index]
         self.diagonal = weight - np.square(low) @ self._taken
-
-    def dense(self) -> FloatArray:
-        """(n, n) matrix."""
-        return np.asarray(np.diag(self._weight) - (self._low * self._taken) @ self._low.T)
 
     def times(self, rows: FloatArray) -> FloatArray:
         """(v, n) products with (v, n) vectors."""
