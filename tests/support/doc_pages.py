@@ -156,20 +156,27 @@ class Reader:
             if block.file_name:
                 (self.folder / block.file_name).write_text(block.text, encoding="utf-8")
             elif block.language == "python":
-                with contextlib.chdir(self.folder):
-                    exec(compile(block.text, f"{page.name}:{block.line}", "exec"), self.names)
+                self.run_python(block)
             for command in block.commands():
                 if not command.mark:
-                    self._type(command)
+                    self.look_at(command, *self.run(command))
 
-    def _type(self, command: Command) -> None:
+    def run_python(self, block: Block) -> None:
+        """Run a block of Python in the folder."""
+        with contextlib.chdir(self.folder):
+            exec(compile(block.text, f"{block.page.name}:{block.line}", "exec"), self.names)
+
+    def run(self, command: Command) -> tuple[int, str, str]:
+        """Run one command line: its exit code, and what it prints on stdout and stderr."""
         if command.words[:2] == (PROGRAM, "demo"):
-            code, out, err = self._demo(command)
-        elif command.is_program:
+            return self._demo(command)
+        if command.is_program:
             done = run_here(*command.words[1:], cwd=self.folder)
-            code, out, err = done.returncode, done.stdout, done.stderr
-        else:
-            code, out, err = self._shell(command.text)
+            return done.returncode, done.stdout, done.stderr
+        return self._shell(command.text)
+
+    def look_at(self, command: Command, code: int, out: str, err: str) -> None:
+        """Hold what a command did against what the page says of it."""
         assert code == command.exit_code, f"{command}: ended with {code}: {err}"
         missing = not_printed(command.printed, out + err)
         assert not missing, f"{command}: {command.text} does not print {missing!r}, but\n{out}{err}"
