@@ -31,7 +31,7 @@ bench: $(VENV)/.installed
 
 # Peers and the compiler are no dependencies of the program: they are installed here only.
 bench-map: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'boost-histogram>=1.4' '.[fast]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'boost-histogram>=1.4'
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.map_speed
 
 bench-posterior: $(VENV)/.installed

@@ -29,11 +29,11 @@ from tactile_bayes.forward.simulate import head_positions
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.cells import CellSums
-from tactile_bayes.mapping.engine import Engine, NumpyEngine, compiled_engine, fast_is_installed
 from tactile_bayes.mapping.frames import chunks
 from tactile_bayes.mapping.poses import FramePoses
 from tactile_bayes.mapping.project import ProjectedTaxels, Projection, Projector
 from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.mapping.scatter import add_frames, chunk_frames
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 RATE_HZ = 200
@@ -63,14 +63,14 @@ class Frames:
             return self.pool[first : first + stop - start]
         return self.pool[np.arange(start, stop) % _POOL]
 
-    def accumulator(self, engine: Engine, *, keep_frames: bool = False) -> MapAccumulator:
+    def accumulator(self, *, keep_frames: bool = False) -> MapAccumulator:
         """An empty map under the strokes."""
         grid = MapGrid.under(self.head, self.poses(0, 1400))
-        return MapAccumulator(grid, Instrument(self.head, self.calibration), keep_frames=keep_frames, engine=engine)
+        return MapAccumulator(grid, Instrument(self.head, self.calibration), keep_frames=keep_frames)
 
     def job(self, frames: int) -> Job:
         """What the peers get: everything per frame prepared beforehand, which our own way does inside its time."""
-        grid = self.accumulator(NumpyEngine()).grid
+        grid = self.accumulator().grid
         good = np.ones(self.head.shape, dtype=bool)
         projector = Projector(self.head, plane_from_base=grid.plane_from_base, taxels=good, cell_mm=grid.cell_mm)
         projection = projector.at(self.poses(0, frames))
@@ -103,16 +103,16 @@ def cpu_s(actions: dict[str, Callable[[], object]], *, runs: int) -> dict[str, f
     return {name: min(values) for name, values in times.items()}
 
 
-def same_work(source: Frames, job: Job, engine: Engine) -> CellSums:
+def same_work(source: Frames, job: Job) -> CellSums:
     """What the peers do, our way: levels, projection and scatter, with the frames' numbers prepared beforehand."""
     good = np.ones(source.head.shape, dtype=bool)
     readout, sums = Readout.of(source.calibration, good), CellSums(1.0)
     matrix = np.concatenate([job.turn, job.shift[:, :, None]], axis=2)
     projection = Projection(ProjectedTaxels(job.taxels), matrix, 1.0)
-    for part in chunks(len(job.counts), engine.chunk_frames(readout.size)):
-        counts = job.counts[part]
-        level, _ = engine.levels(readout, counts)
-        engine.add(sums, readout, counts, projection=projection.part(part), level=level)
+    for part in chunks(len(job.counts), chunk_frames(readout.size)):
+        pressure, valid = readout.pressure_kpa(job.counts[part])
+        level, _ = readout.levels(pressure, valid)
+        add_frames(sums, readout, pressure, valid, projection=projection.part(part), level=level)
     return sums
 
 
@@ -123,11 +123,10 @@ def against_peers(frames: int, *, runs: int) -> dict[str, float]:
     poses = source.poses(0, frames)
     counts = job.counts.reshape(frames, *source.head.shape)
 
-    actions: dict[str, Callable[[], object]] = {}
-    engines = {"numpy": NumpyEngine(), **({"fast": compiled_engine()} if fast_is_installed() else {})}
-    for name, engine in engines.items():
-        actions[f"{name} path"] = lambda e=engine: same_work(source, job, e)
-        actions[f"{name} accumulator, all it does"] = lambda e=engine: source.accumulator(e).add(counts, poses)
+    actions: dict[str, Callable[[], object]] = {
+        "numpy path": lambda: same_work(source, job),
+        "numpy accumulator, all it does": lambda: source.accumulator().add(counts, poses),
+    }
     for size in BINCOUNT_FRAMES:
         actions[f"bincount/{size}"] = lambda n=size: bincount(job, frames=n)
     if find_spec("boost_histogram"):
@@ -143,10 +142,10 @@ def against_peers(frames: int, *, runs: int) -> dict[str, float]:
     return best
 
 
-def streamed(minutes: float, engine: Engine) -> tuple[float, float]:
+def streamed(minutes: float) -> tuple[float, float]:
     """CPU seconds in `MapAccumulator.add` for a scan made as it goes, and peak memory in MB of this process."""
     source = Frames()
-    grown, spent, total = source.accumulator(engine), 0.0, int(minutes * 60 * RATE_HZ)
+    grown, spent, total = source.accumulator(), 0.0, int(minutes * 60 * RATE_HZ)
     for start in range(0, total, 1000):
         stop = min(start + 1000, total)
         poses, counts = source.poses(start, stop), source.counts(start, stop)
@@ -168,10 +167,10 @@ def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
-def live_steps(seconds: float, engine: Engine, *, every: int) -> dict[str, FloatArray]:
+def live_steps(seconds: float, *, every: int) -> dict[str, FloatArray]:
     """Work of each frame in microseconds: one frame added, the plane, and a snapshot every so many frames."""
     source = Frames()
-    grown = source.accumulator(engine, keep_frames=True)
+    grown = source.accumulator(keep_frames=True)
     grown.add(source.counts(0, 1), source.poses(0, 1))
     gc.collect()
     gc.freeze()
@@ -196,25 +195,25 @@ def _bincount_us(frames: int = 1400) -> float:
     return 1e6 * min(least.values()) / frames
 
 
-def _live_report(seconds: float, name: str, engine: Engine, *, every: int, last: Comparison) -> dict[str, Any]:
+def _live_report(seconds: float, *, every: int, last: Comparison) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     peer_us = _bincount_us()
     for busy in (0, 2):
         others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
         try:
-            steps = live_steps(seconds, engine, every=every)
+            steps = live_steps(seconds, every=every)
         finally:
             for process in others:
                 process.kill()
                 process.wait()
         for kind, values in steps.items():
             p50, p99 = np.percentile(values, [50, 99])
-            rows[f"{name}, {busy} busy processes beside it, {kind}"] = {"p50_us": round(p50), "p99_us": round(p99)}
-            beside = f"{name}, {busy} busy beside it, {kind:<5}"
+            rows[f"numpy, {busy} busy processes beside it, {kind}"] = {"p50_us": round(p50), "p99_us": round(p99)}
+            beside = f"numpy, {busy} busy beside it, {kind:<5}"
             text = ""
             if kind == "work" and not busy:
                 ratio = float(p50) / peer_us
-                text = f"   p50 {ratio:.1f} x a frame of bincount{last.add(f'live p50, {name}, over bincount', ratio)}"
+                text = f"   p50 {ratio:.1f} x a frame of bincount{last.add('live p50, numpy, over bincount', ratio)}"
             print(f"{beside} p50 {p50:6.0f} us   p99 {p99:6.0f} us{text}", flush=True)
     return rows
 
@@ -234,20 +233,20 @@ def _compare(minutes: Sequence[float], *, runs: int, last: Comparison) -> dict[s
     return rows
 
 
-def _growth(minutes: Sequence[float], name: str, *, last: Comparison) -> dict[str, Any]:
+def _growth(minutes: Sequence[float], *, last: Comparison) -> dict[str, Any]:
     """Each length in a process of its own, so that its peak memory is its own."""
     rows = {}
     for length in minutes:
-        words = [sys.executable, "-m", "benchmarks.map_speed", "--stream", str(length), "--engine", name]
+        words = [sys.executable, "-m", "benchmarks.map_speed", "--stream", str(length)]
         done = subprocess.run(words, capture_output=True, text=True, check=True, env=os.environ)
         cpu, peak = json.loads(done.stdout)
         each_us = 1e6 * cpu / (length * 60 * RATE_HZ)
-        print(f"  {name:<6}{length:6g} min{cpu:9.3f} s CPU{each_us:7.2f} us a frame{peak:7.0f} MB", flush=True)
+        print(f"  numpy {length:6g} min{cpu:9.3f} s CPU{each_us:7.2f} us a frame{peak:7.0f} MB", flush=True)
         rows[f"{length:g} min"] = {"cpu_s": round(cpu, 3), "peak_mb": round(peak, 1)}
     if len(minutes) > 1:
         longest, shortest = (rows[f"{length:g} min"]["peak_mb"] for length in (max(minutes), min(minutes)))
-        before = last.add(f"{name} peak memory, {max(minutes):g} over {min(minutes):g} min", longest / shortest)
-        print(f"  {name:<6} peak memory of the longest over the shortest {longest / shortest:.2f}{before}", flush=True)
+        before = last.add(f"numpy peak memory, {max(minutes):g} over {min(minutes):g} min", longest / shortest)
+        print(f"  numpy  peak memory of the longest over the shortest {longest / shortest:.2f}{before}", flush=True)
     return rows
 
 
@@ -261,22 +260,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--keep", action="store_true", help="keep these ratios: later runs are compared with them")
     parser.add_argument("--json", type=Path, metavar="OUT")
     parser.add_argument("--stream", type=float, help=argparse.SUPPRESS)
-    parser.add_argument("--engine", choices=("numpy", "fast"), default="numpy", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.stream:
-        engine = NumpyEngine() if options.engine == "numpy" else compiled_engine()
-        streamed(0.01, engine)  # start-up is told apart: see `tactile_bayes.mapping.engine`
-        print(json.dumps(streamed(options.stream, engine)))
+        print(json.dumps(streamed(options.stream)))
         return 0
     document = {"schema": "tactile-bayes/benchmarks-map/1", "load": os.getloadavg()[0]}
     last = Comparison("map")
     print(f"load average {document['load']:.2f} on {os.cpu_count()} cores")
     document["peers"] = _compare(options.minutes, runs=options.runs, last=last)
     print("cost against length")
-    names = ["numpy", *(["fast"] if fast_is_installed() else [])]
-    document["growth"] = {name: _growth(options.growth, name, last=last) for name in names}
+    document["growth"] = {"numpy": _growth(options.growth, last=last)}
     print("live step: one frame added, the plane, a snapshot every 8th frame (25 Hz)")
-    document["live"] = _live_report(options.live_s, "numpy", NumpyEngine(), every=8, last=last)
+    document["live"] = _live_report(options.live_s, every=8, last=last)
     print(last.report())
     if options.keep:
         last.keep()

@@ -37,7 +37,7 @@ def command(
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval.
 
     The map is built with several sizes of cells, from a part of the frames, from the first part of the scan, by every
-    way to normalise and by each engine, and estimated by default. Sizes are compared with a long run on the map of all
+    way to normalise, and estimated by default. Sizes are compared with a long run on the map of all
     frames in cells of 0.5 mm. Times are CPU seconds of this machine; about how long it takes is printed on stderr.
 
     Where that map has no size there is no reference: what each setting says is printed, exit code 6.

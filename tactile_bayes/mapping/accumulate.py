@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.cells import CellSums
-from tactile_bayes.mapping.engine import Engine
+from tactile_bayes.mapping.scatter import add_frames, chunk_frames
 from tactile_bayes.mapping.source import Progress, Source, no_progress
 
 GAIN_TOLERANCE = 1e-4
@@ -49,7 +49,6 @@ def accumulate(
     *,
     cell_mm: float,
     normalise: str,
-    engine: Engine,
     progress: Progress = no_progress,
 ) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane.
@@ -60,8 +59,6 @@ def accumulate(
         ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does. A lump under the head is
         in that mean, so the map's amplitude and widths come out low by a few per cent. ``"gain"`` solves for one gain
         a frame jointly with the map. ``"none"`` keeps kPa.
-    engine
-        Which inner loops to use.
     progress
         Called with the frames done and the frames in all, anew in each pass.
     """
@@ -69,11 +66,11 @@ def accumulate(
     if normalise == "none":
         levels = [np.ones(len(level)) for level in levels]
     if normalise != "gain":
-        return Accumulated(add_all(sources, levels, cell_mm=cell_mm, engine=engine, progress=progress), levels)
+        return Accumulated(add_all(sources, levels, cell_mm=cell_mm, progress=progress), levels)
     from tactile_bayes.mapping.gains import solve_gains
 
     solved = solve_gains(sources, levels, tolerance=GAIN_TOLERANCE, progress=progress)
-    sums = add_all(sources, solved.gains, cell_mm=cell_mm, engine=engine, progress=progress)
+    sums = add_all(sources, solved.gains, cell_mm=cell_mm, progress=progress)
     return Accumulated(sums, solved.gains, float(np.nanmedian(sums.mean())), solved.passes, solved.last_change)
 
 
@@ -82,15 +79,16 @@ def add_all(
     levels: list[FloatArray],
     *,
     cell_mm: float,
-    engine: Engine,
     progress: Progress = no_progress,
 ) -> CellSums:
     """One pass over all used frames, each divided by its level."""
     sums = CellSums(cell_mm)
     done, total = 0, sum(len(source.projection) for source in sources)
     for source, level in zip(sources, levels, strict=True):
-        for part, counts in source.parts(engine.chunk_frames(source.readout.size)):
-            engine.add(sums, source.readout, counts, projection=source.projection.part(part), level=level[part])
+        for part, counts in source.parts(chunk_frames(source.readout.size)):
+            pressure, valid = source.readout.pressure_kpa(counts)
+            projection = source.projection.part(part)
+            add_frames(sums, source.readout, pressure, valid, projection=projection, level=level[part])
             done += len(counts)
             progress(done, total)
     return sums

@@ -12,13 +12,13 @@ from tactile_bayes.geometry import FloatArray, Plane, check_rigid
 from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.cells import CellSums
 from tactile_bayes.mapping.elements import TaxelFault
-from tactile_bayes.mapping.engine import Engine, NumpyEngine
 from tactile_bayes.mapping.frames import BoolArray, chunks, gate
 from tactile_bayes.mapping.head_profile import GrowingProfile
 from tactile_bayes.mapping.plane import HeadMoments, MomentSums, head_moments
 from tactile_bayes.mapping.poses import FramePoses
 from tactile_bayes.mapping.project import Projection, Projector
 from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.mapping.scatter import add_frames, chunk_frames
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.scan import CountArray, ElementCalibration, HeadGeometry
@@ -122,8 +122,6 @@ class MapAccumulator:
     keep_frames
         Keep counts and poses (0.9 kB a frame of 416 taxels), which `rebuild` needs. Without, memory grows with the
         number of cells only.
-    engine
-        Which inner loops to use.
 
     Notes
     -----
@@ -131,11 +129,8 @@ class MapAccumulator:
     portions nor order leave a trace.
     """
 
-    def __init__(
-        self, grid: MapGrid, instrument: Instrument, *, keep_frames: bool = True, engine: Engine | None = None
-    ) -> None:
+    def __init__(self, grid: MapGrid, instrument: Instrument, *, keep_frames: bool = True) -> None:
         self.grid, self.instrument = grid, instrument
-        self._engine = engine or NumpyEngine()
         self._sums = CellSums(grid.cell_mm)
         self._projector = Projector(
             instrument.head, plane_from_base=grid.plane_from_base, taxels=instrument.good, cell_mm=grid.cell_mm
@@ -183,9 +178,9 @@ class MapAccumulator:
         return sum(self._add(counts[part], poses.part(part)) for part in chunks(len(counts), _PORTION))
 
     def _add(self, counts: CountArray, poses: FramePoses) -> int:
-        """Add a portion: projected and counted as a whole, read in chunks that suit the engine."""
+        """Add a portion: projected and counted as a whole, read in chunks."""
         readout, projection = self.instrument.readout, self._projector.at(poses)
-        size = self._engine.chunk_frames(readout.size)
+        size = chunk_frames(readout.size)
         if len(counts) <= size:
             used = self._read(readout.counts(counts), poses.known, projection)
         else:
@@ -198,18 +193,20 @@ class MapAccumulator:
 
     def _read(self, readings: CountArray, known: BoolArray, projection: Projection) -> BoolArray:
         """Add a chunk; return which of its frames are used."""
-        instrument, engine = self.instrument, self._engine
-        level, share = engine.levels(instrument.readout, readings)
+        instrument = self.instrument
+        pressure, valid = instrument.readout.pressure_kpa(readings)
+        level, share = instrument.readout.levels(pressure, valid)
         low, high, used = gate(known, level, share, pressure_window_kpa=instrument.pressure_window_kpa)
         number = self._count(known, low, high, used)
         if number < len(used):
             readings, projection, level, share = readings[used], projection.part(used), level[used], share[used]
+            pressure, valid = pressure[used], None if valid is None else valid[used]
         if number:
             taxels, array = len(instrument.readout.taxels), instrument.readout.size
             self._saturated += round(number * taxels - float(share.sum()) * array)
             self._profile.add(readings, level, share)
             divisor = level if instrument.normalise == "mean" else np.ones(number)
-            engine.add(self._sums, instrument.readout, readings, projection=projection, level=divisor)
+            add_frames(self._sums, instrument.readout, pressure, valid, projection=projection, level=divisor)
         return used
 
     def _count(self, known: BoolArray, low: BoolArray, high: BoolArray, used: BoolArray) -> int:
@@ -272,7 +269,7 @@ class MapAccumulator:
         if self._kept is None:
             raise UsageError("the frames were not kept; make the accumulator with keep_frames=True")
         grid = MapGrid(self.plane().plane_from_base, self.grid.cell_mm)
-        anew = MapAccumulator(grid, self.instrument, engine=self._engine)
+        anew = MapAccumulator(grid, self.instrument)
         for counts, poses in self._kept:
             anew.add(counts, poses)
         return anew

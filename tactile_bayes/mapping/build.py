@@ -14,7 +14,6 @@ from tactile_bayes.head_shape import HeadShape
 from tactile_bayes.mapping.accumulate import Accumulated, accumulate
 from tactile_bayes.mapping.assumptions import broken_assumptions, handling_findings
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
-from tactile_bayes.mapping.engine import Engine, choose_engine
 from tactile_bayes.mapping.evenness import evenness_figures
 from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
 from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
@@ -56,7 +55,6 @@ def build_map(
     flat_field: bool = False,
     register_strokes: bool = False,
     every: int = 1,
-    engine: str = "auto",
     progress: Progress = no_progress,
 ) -> TactileMap:
     """Build the tactile map of one scan, or of several scans of one examination on a common plane.
@@ -84,8 +82,6 @@ def build_map(
         Shift the strokes onto each other before they are averaged, for a lump that follows the head.
     every
         Use one frame of every so many: quicker, and noisier.
-    engine
-        ``"numpy"``, ``"fast"`` (compiled; needs the extra ``[fast]``) or ``"auto"``: the same map, bit for bit.
     progress
         Called with frames done and frames in all, anew in each pass over the scans.
 
@@ -108,8 +104,7 @@ def build_map(
             "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
         )
     _check_same_examination(parts)
-    loops = choose_engine(engine, readings=sum(scan.frames.counts.size for scan in parts))
-    rules = _Rules(_window(pressure_window_kpa), max_pose_gap_ms, loops)
+    rules = _Rules(_window(pressure_window_kpa), max_pose_gap_ms)
     figures: dict[str, float] = {} if every == 1 else {"frames_every": float(every)}
     late_ms = 0.0 if isinstance(latency_ms, str) else float(latency_ms)
     selections = rules.select(parts, late_ms)
@@ -123,13 +118,13 @@ def build_map(
     plane = _plane(selections)
     if plane_radius_mm is not None:
         radius = None if isinstance(plane_radius_mm, str) else plane_radius_mm
-        plane, near = local_plane(selections, plane, radius_mm=radius, engine=loops)
+        plane, near = local_plane(selections, plane, radius_mm=radius)
         figures.update(near)
     sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=cell_mm)
     if register_strokes:
         sources, strokes = find_shifts(sources)
         figures.update(stroke_figures(strokes))
-    done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, engine=loops, progress=progress)
+    done = accumulate(sources, cell_mm=cell_mm, normalise=normalise, progress=progress)
     figures.update(shared_frame_figures(sources, done.levels, done.sums))
     figures |= evenness_figures(selections, plane) | stroke_lag_figures(sources)
     figures["stroke_count"] = float(stroke_count(sources))
@@ -153,7 +148,6 @@ class _Rules:
 
     window_kpa: tuple[float, float]
     max_pose_gap_ms: float
-    engine: Engine
 
     def select(self, scans: list[Scan], late_ms: float) -> list[SelectedFrames]:
         """Select the used frames of every scan; an error if none is left in any of them."""
@@ -163,7 +157,6 @@ class _Rules:
                 pressure_window_kpa=self.window_kpa,
                 latency_ms=late_ms,
                 max_pose_gap_ms=self.max_pose_gap_ms,
-                engine=self.engine,
             )
             for scan in scans
         ]

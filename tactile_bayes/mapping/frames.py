@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.elements import TaxelFault, find_faults
-from tactile_bayes.mapping.engine import Engine, NumpyEngine
 from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS, FramePoses, poses_at
 from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.mapping.scatter import chunk_frames
 from tactile_bayes.scan import Scan
 
 BoolArray = NDArray[np.bool_]
@@ -94,7 +94,6 @@ def select_frames(
     pressure_window_kpa: tuple[float, float],
     latency_ms: float = 0.0,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
-    engine: Engine | None = None,
 ) -> SelectedFrames:
     """Decide for every frame of a scan whether it is used.
 
@@ -109,7 +108,7 @@ def select_frames(
     faults = find_faults(scan)
     _refuse_dead(scan, faults)
     poses = poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
-    level, share = _levels(scan, good_taxels(scan, faults), engine or NumpyEngine())
+    level, share = _levels(scan, good_taxels(scan, faults))
     low, high, used = gate(poses.known, level, share, pressure_window_kpa=pressure_window_kpa)
     return SelectedFrames(scan, faults, poses, level, share, low, high, used)
 
@@ -123,12 +122,13 @@ def gate(
     return low, high, candidate ^ (low | high)
 
 
-def _levels(scan: Scan, good: BoolArray, engine: Engine) -> tuple[FloatArray, FloatArray]:
+def _levels(scan: Scan, good: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Mean over the valid taxels and share of valid taxels of each frame."""
     readout = Readout.of(scan.element_calibration, good)
     level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
-    for part in chunks(len(scan.frames), engine.chunk_frames(good.size)):
-        level[part], share[part] = engine.levels(readout, readout.counts(scan.frames.counts[part]))
+    for part in chunks(len(scan.frames), chunk_frames(good.size)):
+        counts = readout.counts(scan.frames.counts[part])
+        level[part], share[part] = readout.levels(*readout.pressure_kpa(counts))
     return level, share
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Plane, apply, inverse
 from tactile_bayes.mapping.accumulate import add_all
-from tactile_bayes.mapping.engine import Engine
 from tactile_bayes.mapping.frames import SelectedFrames
 from tactile_bayes.mapping.plane import HeadMoments, head_moments
 from tactile_bayes.mapping.poses import FramePoses
@@ -22,11 +21,11 @@ _CELL_MM = 2.0
 _WIDER = 1.5
 
 
-def find_mass(selections: Sequence[SelectedFrames], plane: Plane, *, engine: Engine) -> FloatArray:
+def find_mass(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
     """(2,) place of the highest point of the smoothed map on `plane`, mm."""
     sources = sources_of(list(selections), plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
     levels = [source.selection.level_kpa[source.selection.used] for source in sources]
-    sums = add_all(sources, levels, cell_mm=_CELL_MM, engine=engine).trimmed()
+    sums = add_all(sources, levels, cell_mm=_CELL_MM).trimmed()
     count, total = smooth(sums.count), smooth(sums.total)
     mean = np.divide(total, count, out=np.full_like(total, -np.inf), where=count >= FEW_READINGS)
     row, column = np.unravel_index(int(mean.argmax()), mean.shape)
@@ -34,7 +33,7 @@ def find_mass(selections: Sequence[SelectedFrames], plane: Plane, *, engine: Eng
 
 
 def local_plane(
-    selections: Sequence[SelectedFrames], plane: Plane, *, radius_mm: float | None, engine: Engine
+    selections: Sequence[SelectedFrames], plane: Plane, *, radius_mm: float | None
 ) -> tuple[Plane, dict[str, float]]:
     """Best-fit plane of the frames near the mass.
 
@@ -54,7 +53,7 @@ def local_plane(
     BadDataError
         When no frame lies within a given radius, or they span no plane.
     """
-    mass = find_mass(selections, plane, engine=engine)
+    mass = find_mass(selections, plane)
     radius = radius_mm or max(_half_diagonal(part) for part in selections)
     while True:
         try:

@@ -1,14 +1,13 @@
-"""Cost of accuracy before the map: cells, frames, time of strokes, normalising and engine, each up to the size."""
+"""Cost of accuracy before the map: cells, frames, time of strokes and normalising, each up to the size."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.mapping import build_map
-from tactile_bayes.mapping.engine import fast_is_installed
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.mapping.thinning import first_seconds
 from tactile_bayes.posterior.options import EstimateOptions
@@ -23,7 +22,7 @@ FINEST_CELL_MM = 0.5
 CELLS_MM = (FINEST_CELL_MM, 0.75, 1.5, 2.0, 3.0, 4.0)
 EVERY = (2, 4, 8, 16, 32)
 SHARES_OF_TIME = (0.75, 0.5, 0.25)
-CELL, FRAMES, TIME, LEVEL, ENGINE = "cell size", "frames used", "time of strokes", "normalising", "engine"
+CELL, FRAMES, TIME, LEVEL = "cell size", "frames used", "time of strokes", "normalising"
 Inputs = Callable[[TactileMap], tuple[Calibration | None, EstimateOptions]]
 
 
@@ -70,13 +69,7 @@ def settings_of(scan: Scan) -> list[MapSetting]:
             for way in NORMALISE
             if way != DEFAULT_NORMALISE
         ),
-        *_engines(),
     ]
-
-
-def _engines() -> Iterator[MapSetting]:
-    for name in ("numpy", "fast") if fast_is_installed() else ("numpy",):
-        yield MapSetting(ENGINE, f"engine {name}", {"engine": name}, usable=False)
 
 
 def measure(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:

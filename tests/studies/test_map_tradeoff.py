@@ -57,8 +57,7 @@ def test_the_finest_map_is_the_reference():
     assert ladder().reference.error_mm < 0.02
 
 
-def test_the_engine_and_every_second_frame_change_little():
-    assert row("engine numpy").answer == row("--cell-mm 1").answer
+def test_every_second_frame_changes_little():
     assert row("--every 2").off.ends < 1.0
 
 
