@@ -133,9 +133,7 @@ def size(
 
     With depth_ratio and stiffness_ratio the table is a study: each geometry
     (seat, d_mm, depth_ratio) is also left out of the learning in turn, and the report tells how far Eq 6 and a
-    quadratic in logarithms then miss the hard lumps' sizes. Where seat, stiffness below 8, thickness_mm or
-    head_radius_mm vary in it, the report tells what each does to the size that Eq 6 gives, and how much of its scatter
-    would go if it were known; `estimate` does not use that.
+    quadratic in logarithms then miss the hard lumps' sizes.
 
     From a table of `population`, which has a row for each exam of a body, every form tells apart what differs between
     bodies and between exams of one body. `population` made the maps: nothing is declared, and --normalise chooses among
