@@ -13,8 +13,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import Meta
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.record import Meta
 from tactile_bayes.records import dataclass
 
 FloatArray = NDArray[np.float64]

@@ -11,10 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from tactile_bayes.declarations import from_plain, schema_name
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.kinds import kind_of, schema_kind
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, read_text
-from tactile_bayes.record import from_plain, schema_name
 
 MOST_LEVELS: Final = 64
 MOST_KEY_PARTS: Final = 16

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_bayes.declarations import Meta, Record, field, from_plain, replace, schema_of, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.geometry import Matrix, Vector
-from tactile_bayes.record import Meta, Record, field, from_plain, replace, schema_of, to_plain
 
 Name = Annotated[
     str, Meta(pattern="^[a-z]{1,8}$", extra={"words": "up to 8 small letters"}, description="What it is called.")
