@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import argparse
 import math
+from typing import get_args
 
 import numpy as np
 
-from tactile_bayes.trial.bootstrap import METHODS, Intervals
+from tactile_bayes.trial.bootstrap import Intervals, Method
 from tactile_bayes.trial.check_intervals import ErrorModel, check_intervals, simulate
 from tactile_bayes.trial.comparison import mape_ratio
 from tactile_bayes.trial.proportion import clopper_pearson
 from tactile_bayes.trial.readings import ModalitySizes
 
+METHODS = get_args(Method)
 PATIENT = np.minimum(np.arange(25), 23)
 MODELS = {
     "tactile-like, SD 0.20": ErrorModel(0.0, 0.20),

@@ -193,14 +193,14 @@ def _map(folder: Path) -> bytes:
 
 
 def _posterior() -> bytes:
-    from tactile_bayes.files.netcdf import Variable, netcdf_bytes
+    from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes
     from tactile_bayes.files.posterior_nc import SCHEMA
 
     sizes = np.random.default_rng(2).lognormal(2.5, 0.1, (1, 60))
     names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm", "amplitude")
     variables = {name: Variable(sizes, ("chain", "draw"), {}) for name in names}
     attributes = {"schema": SCHEMA, "method": "importance", "diagnostics": "{}", "provenance": '{"seed": 1}'}
-    return netcdf_bytes(variables, attributes=attributes, group="posterior")
+    return grouped_netcdf_bytes({"posterior": Contents(variables, attributes)})
 
 
 def _checkpoint(folder: Path) -> bytes:

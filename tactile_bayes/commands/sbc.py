@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from tactile_bayes.size.body_calibration import BodyCalibration
     from tactile_bayes.studies.sbc import MapRanks
 
-_FILE = FilePath()
-
 
 @click.command("sbc")
 @click.option("--maps", type=click.IntRange(1, MOST_ITEMS), default=200, show_default=True, help="Maps to simulate.")

@@ -59,16 +59,3 @@ OUTCOME: Final = Code("outcome", OWN_SCHEME, "Outcome of the estimate")
 NOT_DETECTED: Final = Code("no-lump-shown", OWN_SCHEME, "The map shows no lump that can be measured")
 NOT_SIZED: Final = Code("not-sized", OWN_SCHEME, "A lump may be there, without a size")
 SIZED: Final = Code("sized", OWN_SCHEME, "Lump with a size")
-OWN: Final = (
-    EXAM,
-    METHOD,
-    RELATIVE_PRESSURE,
-    PRESSURE,
-    INTERVAL_LOW,
-    INTERVAL_HIGH,
-    INTERVAL_PROBABILITY,
-    OUTCOME,
-    NOT_DETECTED,
-    NOT_SIZED,
-    SIZED,
-)

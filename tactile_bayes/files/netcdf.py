@@ -54,31 +54,26 @@ class Variable:
     scale: float | None = None
 
 
-def netcdf_bytes(variables: Mapping[str, Variable], *, attributes: Mapping[str, str], group: str = "/") -> bytes:
-    """A netCDF-4 file as bytes; equal contents give equal bytes under one version of HDF5 and zlib.
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What one group of a netCDF file holds.
 
     Parameters
     ----------
     variables
         By name; one that is called as its only dimension becomes that dimension's coordinate.
     attributes
-        Text by name, of the group.
-    group
-        Where everything goes, for example ``posterior``.
+        Text by name.
     """
-    return grouped_netcdf_bytes({group: Contents(variables, attributes)})
-
-
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """What one group of a netCDF file holds: variables and attributes, as in `netcdf_bytes`."""
 
     variables: Mapping[str, Variable]
     attributes: Mapping[str, str]
 
 
 def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
-    """A netCDF-4 file of several groups by name, each with its own dimensions; ``/`` is the root."""
+    """A netCDF-4 file of several groups by name, each with its own dimensions; ``/`` is the root.
+
+    Equal contents give equal bytes under one version of HDF5 and zlib."""
     import h5py
 
     with h5py.File("memory", "w", driver="core", backing_store=False, track_order=True) as file:

@@ -36,7 +36,7 @@ def write_posterior(
     document: Mapping[str, Any] | None = None,
     force: bool = False,
 ) -> None:
-    """Write the draws of an estimate atomically; equal draws give equal bytes, see `netcdf_bytes`.
+    """Write the draws of an estimate atomically; equal draws give equal bytes, see `grouped_netcdf_bytes`.
 
     Parameters
     ----------

@@ -20,7 +20,6 @@ from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading, R
 
 FASTRAK_BINARY: Final = (2, 11, 0)
 FASTRAK_ASCII: Final = (2, 11, 1)
-FASTRAK_DEFAULT: Final = (2, 4, 1)  # position and Euler angles, as after a reset
 LIBERTY_BINARY: Final = (2, 7, 8, 11, 0)
 LIBERTY_ASCII: Final = (2, 7, 8, 11, 1)
 

@@ -11,7 +11,6 @@ from tactile_bayes.trial.jackknife import UndefinedError
 from tactile_bayes.trial.readings import FloatArray
 
 Method = Literal["corrected", "jackknife", "bca"]
-METHODS: tuple[Method, ...] = ("corrected", "jackknife", "bca")
 RESAMPLES = 2000
 SEED = 1999
 # Of the redrawn trials, at least this share must have the figure at all.

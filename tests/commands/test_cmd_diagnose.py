@@ -11,7 +11,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes.files.atomic import write_bytes
-from tactile_bayes.files.netcdf import Variable, netcdf_bytes
+from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes
 
 with warnings.catch_warnings():  # its notice of the next major version, once a day
     warnings.simplefilter("ignore", FutureWarning)
@@ -30,7 +30,7 @@ def write(path: Path, chains: int, *, off: float = 0.0) -> np.ndarray:
     held = {name: Variable(np.arange(n), (name,), {}) for name, n in zip(axes, base.shape, strict=True)}
     held |= {name: Variable(values, axes, {}) for name, values in draws.items()}
     attributes = {"schema": "tactile-bayes/posterior/1", "method": "ensemble", "diagnostics": '{"pareto_k": 0.25}'}
-    write_bytes(path, netcdf_bytes(held, attributes=attributes, group="posterior"), force=True)
+    write_bytes(path, grouped_netcdf_bytes({"posterior": Contents(held, attributes)}), force=True)
     return draws["max_size_mm"]
 
 

@@ -23,8 +23,6 @@ PAPER_MODULI_KPA = (15.0, 25.0)
 """Young's modulus of normal breast tissue, section 2.1."""
 PAPER_PRESSURES_KPA = (5.0, 14.0)
 """Anticipated user-applied pressures, section 2.1."""
-PAPER_LIMIT = 0.075
-"""Largest departure of the pressure from its mean, as a share of it, section 2.1."""
 RADII_MM = (13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 45.0, 60.0, 70.0, 80.0, 100.0, 150.0, 300.0, np.inf)
 SHOULDERS_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0)
 # Contact cells: three a taxel. Six change the departure of a head that meets the limit by less than 0.001.

@@ -12,7 +12,6 @@ from tactile_bayes.cli import cli
 from tactile_bayes.errors import EXIT_USAGE, BadDataError, UsageError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.plane.head_design import (
-    PAPER_LIMIT,
     HomogeneousTissue,
     most_even,
     narrowest,
@@ -20,6 +19,9 @@ from tactile_bayes.forward.plane.head_design import (
     uniformity,
 )
 from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
+
+PAPER_LIMIT = 0.075
+"""Largest departure of the pressure from its mean, as a share of it: Wellman & Howe (1999), section 2.1."""
 
 THICK_MM = 5000.0  # 200 widths of the head: a half-plane
 EDGES = np.linspace(-12.0, 12.0, 17)  # of the 16 taxels

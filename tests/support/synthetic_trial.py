@@ -1,7 +1,6 @@
-"""A synthetic trial in the shape of the paper's, for the demo, the tutorial and the tests.
+"""The synthetic trial in the shape of the paper's that the package ships as `demo/trial.csv` and `demo/excision.csv`.
 
-The package ships ``trial_csv()`` and ``excision_csv()`` as ``demo/trial.csv`` and ``demo/excision.csv``; to make
-them anew, write the two texts to those files. Every row says that it is synthetic.
+To make them anew, write the texts of `trial_csv()` and `excision_csv()` to those files; every row says synthetic.
 """
 
 from __future__ import annotations
