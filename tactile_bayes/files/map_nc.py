@@ -261,7 +261,7 @@ def _recipe(fields: dict[str, Any]) -> MapRecipe:
 
 
 def _head(texts: Mapping[str, str]) -> HeadShape | None:
-    """The head's shape; None in an imported grid and in files of earlier versions."""
+    """The head's shape; None in an imported grid."""
     if "head" not in texts:
         return None
     try:
@@ -271,7 +271,7 @@ def _head(texts: Mapping[str, str]) -> HeadShape | None:
 
 
 def _nipple(texts: Mapping[str, str]) -> FloatArray | None:
-    """The nipple in the plane; None where it was not touched and in files of earlier versions."""
+    """The nipple in the plane; None where it was not touched."""
     if "nipple_mm" not in texts:
         return None
     values = _decoded(texts, "nipple_mm", list)

@@ -32,8 +32,8 @@ def write_posterior(
     estimate: Estimate,
     *,
     provenance: Provenance,
-    groups: Mapping[str, DrawGroup] | None = None,
-    document: Mapping[str, Any] | None = None,
+    groups: Mapping[str, DrawGroup],
+    document: Mapping[str, Any],
     force: bool = False,
 ) -> None:
     """Write the draws of an estimate atomically; equal draws give equal bytes, see `grouped_netcdf_bytes`.
@@ -77,10 +77,9 @@ def write_posterior(
         "method": estimate.draws.method,
         "provenance": json.dumps(provenance.as_dict()),
         "diagnostics": json.dumps({k: v for k, v in figures.items() if _plain(v)}),
+        "estimate": json.dumps(document),
     }
-    if document is not None:
-        attributes["estimate"] = json.dumps(document)
-    write_bytes(path, _posterior_bytes(variables, attributes, groups or {}), force=force)
+    write_bytes(path, _posterior_bytes(variables, attributes, groups), force=force)
 
 
 def write_pooled(
@@ -146,7 +145,7 @@ class PosteriorDraws:
 
 
 def read_posterior(path: Path) -> PosteriorDraws:
-    """Read what `write_posterior` or `write_pooled` wrote, of this version or an earlier one.
+    """Read what `write_posterior` or `write_pooled` wrote.
 
     Raises
     ------
@@ -157,7 +156,7 @@ def read_posterior(path: Path) -> PosteriorDraws:
     with open_netcdf(path, way_out=way_out) as file:
         group = file.group("posterior")
         attributes = {} if group is None else group.attributes()
-        if group is None or not attributes.get("schema", "").startswith("tactile-bayes/posterior/"):
+        if group is None or attributes.get("schema") != SCHEMA:
             raise BadDataError("holds no posterior of this program", way_out=way_out)
         names = [name for name in group.variables() if name not in ("chain", "draw")]
         draws = {name: group.array(name, kind="f8", dimensions=("chain", "draw")) for name in names}
@@ -180,7 +179,7 @@ def read_estimate(path: Path) -> dict[str, Any]:
     Raises
     ------
     BadDataError
-        When the file is no posterior, is of several maps or of an earlier version, or is damaged.
+        When the file is no posterior, is of several maps, or is damaged.
     """
     with open_netcdf(path, way_out="give what `estimate` wrote with -o") as file:
         group = file.group("posterior")

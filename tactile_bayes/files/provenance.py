@@ -78,7 +78,7 @@ def scans_of(document: object) -> tuple[dict[str, str], ...]:
 def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:
     """What tells the recordings of some scans from others: digests of their frames and of their files.
 
-    Two exams are of one recording where they share any of them. Files of earlier versions have the file's alone.
+    Two exams are of one recording where they share any of them.
     """
     for scan in scans:
         yield from (f"{name} {scan[name]}" for name in _DIGESTS if scan.get(name))

@@ -101,7 +101,7 @@ class TactileMap:
     masked_taxels
         Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
     head
-        Shape of the head that made the scan; None for an imported grid and for files of earlier versions.
+        Shape of the head that made the scan; None for an imported grid.
     nipple_mm : (3,) array or None
         The nipple in `plane`; None where it was not touched.
     findings

@@ -92,6 +92,7 @@ class Outcome:
         from tactile_bayes.files.posterior_nc import write_posterior
 
         told = document or answer_of(self).document
+        assert told is not None  # only the answer of an error has none
         provenance = self.provenance
         write_posterior(path, self.estimate, provenance=provenance, groups=self.groups(), document=told, force=force)
 

@@ -61,7 +61,7 @@ class MassRow:
     normalise
         How the map's frames were, see `MapRecipe`.
     head_rows, head_columns, head_pitch_mm, head_radius_mm, head_shoulder_mm, head_rim_mm
-        As in `forward.scene.Head`; the radius is None for a flat head, and all are in rows of earlier versions.
+        As in `forward.scene.Head`; the radius is None for a flat head.
     """
 
     body: int
@@ -177,8 +177,6 @@ def head_columns(head: Head) -> dict[str, Any]:
 def table_head(columns: Mapping[str, Sequence[Any]]) -> HeadShape:
     """Head that a table's maps were made with.
 
-    Tables of earlier versions, which do not name it, are of the paper's head: there was no other.
-
     Raises
     ------
     BadDataError
@@ -189,11 +187,8 @@ def table_head(columns: Mapping[str, Sequence[Any]]) -> HeadShape:
     if len(found) > 1:
         raise BadDataError("its maps were made with several heads", way_out="learn from the rows of one head")
     rows, wide, pitch, radius, shoulder, rim = found.pop()
-    if rows is None:
-        head = Head()
-    else:
-        head = Head(rows, wide, pitch, FLAT_MM if radius is None else radius, shoulder or 0.0, rim or 0.0)
-        Scene(head=head)  # refuses what is no head
+    head = Head(rows, wide, pitch, FLAT_MM if radius is None else radius, shoulder, rim)
+    Scene(head=head)  # refuses what is no head
     return HeadShape.of(head.surface_mm(), head.pitch_mm, rim_mm=head.rim_mm)
 
 

@@ -36,17 +36,17 @@ def shape_of(head: Head) -> HeadShape:
     return HeadShape.of(head.surface_mm(), head.pitch_mm)
 
 
-def row(body: int, exam: int, head: Head | None) -> MassRow:
+def row(body: int, exam: int, head: Head) -> MassRow:
     """A row whose size follows the map: ln d = 2.6 + 0.3 ln a + ln sigma - 1.4."""
     rng = np.random.default_rng([0, body])
     log_a, log_s, seat = rng.normal(-1, 0.8), rng.normal(1.4, 0.4), rng.uniform(0, 1.2)
     d = float(np.exp(2.6 + 0.3 * log_a + log_s - 1.4 + rng.normal(0, 0.05)))
     shape = (float(np.exp(log_a)), float(np.exp(log_s)), float(np.exp(log_s)))
     made = MassRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
-    return replace(made, normalise="gain", **({} if head is None else head_columns(head)))
+    return replace(made, normalise="gain", **head_columns(head))
 
 
-def write_table(path: Path, heads: Callable[[int], Head | None]) -> None:
+def write_table(path: Path, heads: Callable[[int], Head]) -> None:
     path.write_text(population.table_text([row(body, exam, heads(body)) for body in range(40) for exam in range(2)]))
 
 
@@ -59,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, head in (("old", None), ("paper", DEFAULT_HEAD), ("flat", shape_of(FLAT)), ("finger", shape_of(FINGER))):
         write_map(place / f"{name}.nc", replace(plain, head=head), provenance=MADE)
     write_table(place / "flat.csv", lambda _: FLAT)
-    write_table(place / "old.csv", lambda _: None)
+    write_table(place / "paper.csv", lambda _: Head())
     write_table(place / "mixed.csv", lambda body: FLAT if body < 20 else FINGER)
     done = run_here("calibrate", "size", "flat.csv", "-o", "eq6.json", cwd=place)
     assert done.returncode == 0, done.stderr
@@ -108,13 +108,18 @@ def test_a_calibration_knows_its_head_and_bodies_from_the_table(folder: Path) ->
     assert "thickness_mm" in shown
 
 
-def test_tables_and_calibrations_of_earlier_versions_are_of_the_papers_head(folder: Path, tmp_path: Path) -> None:
-    run_here("calibrate", "size", folder / "old.csv", "-o", "old.json", cwd=tmp_path)
-    assert read_size_calibration(tmp_path / "old.json").recipe.head == replace(DEFAULT_HEAD, rim_mm=3.0)
-    document = json.loads((tmp_path / "old.json").read_text())
-    del document["recipe"]["head"]
-    (tmp_path / "older.json").write_text(json.dumps(document))
-    assert read_size_calibration(tmp_path / "older.json").recipe.head == DEFAULT_HEAD
+def test_a_table_of_the_papers_head_teaches_for_it_and_one_that_names_none_teaches_nothing(
+    folder: Path, tmp_path: Path
+) -> None:
+    run_here("calibrate", "size", folder / "paper.csv", "-o", "paper.json", cwd=tmp_path)
+    assert read_size_calibration(tmp_path / "paper.json").recipe.head == replace(DEFAULT_HEAD, rim_mm=3.0)
+    columns, *rows = ((line.split(",")) for line in (folder / "paper.csv").read_text().splitlines())
+    at = columns.index("head_rows")
+    blank = [",".join([*cells[:at], "", *cells[at + 1 :]]) for cells in rows]
+    (tmp_path / "none.csv").write_text("\n".join([",".join(columns), *blank]) + "\n")
+    done = run_here("calibrate", "size", "none.csv", "-o", "none.json", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "head_rows" in done.stderr
 
 
 def test_a_table_of_two_heads_teaches_nothing(folder: Path, tmp_path: Path) -> None:

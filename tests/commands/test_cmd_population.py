@@ -14,8 +14,9 @@ from tactile_bayes.commands import population
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.population import BodyPrior, centred, draw_mass
+from tactile_bayes.forward.scene import Head
 from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.studies.population import MassRow, measure_mass
+from tactile_bayes.studies.population import MassRow, head_columns, measure_mass
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
 
@@ -27,7 +28,8 @@ def row(body: int, exam: int, *, seed: int = 0) -> MassRow:
     d = float(np.exp(2.6 + 0.3 * log_a + log_s - 1.4 + rng.normal(0, 0.05)))
     wobble = float(np.random.default_rng([seed, body, exam]).normal(0, 0.01))
     shape = (float(np.exp(log_a)), float(np.exp(log_s + wobble)), float(np.exp(log_s + wobble)))
-    return MassRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
+    made = MassRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
+    return replace(made, **head_columns(Head()))
 
 
 @pytest.fixture(scope="module")

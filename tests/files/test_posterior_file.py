@@ -11,9 +11,7 @@ from posterior_maps import bump_map
 
 from tactile_bayes.api.estimates import SizeEstimate
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.identify import describe
-from tactile_bayes.files.posterior_nc import read_posterior, write_posterior
-from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.files.posterior_nc import read_posterior
 from tactile_bayes.pipeline.one_map import Outcome, estimate_one
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.presets import RESEARCH_USE
@@ -112,16 +110,6 @@ def test_other_methods_write_the_groups_that_they_have(method: str, tmp_path: Pa
     shape = float(data.sample_stats.attrs["sampler_pareto_k"])
     assert shape == pytest.approx(outcome.estimate.draws.diagnostics["pareto_k"], abs=1e-6)
     assert np.isfinite(data.sample_stats["log_weight"]).all()
-
-
-def test_a_file_of_an_earlier_version_is_read(chains: tuple[Outcome, Path], tmp_path: Path) -> None:
-    """Those had the draws alone."""
-    outcome, path = chains
-    write_posterior(tmp_path / "old.nc", outcome.estimate, provenance=Provenance("test", {}))
-    old, new = read_posterior(tmp_path / "old.nc"), read_posterior(path)
-    assert old.draws.keys() == new.draws.keys()
-    np.testing.assert_array_equal(old.draws["max_size_mm"], new.draws["max_size_mm"])
-    assert describe(tmp_path / "old.nc")["chains"] == describe(path)["chains"] == 4
 
 
 def test_equal_estimates_give_equal_bytes(chains: tuple[Outcome, Path], tmp_path: Path) -> None:
