@@ -74,8 +74,8 @@ def test_a_file_that_is_missing_is_told_and_the_exit_code_says_so(tmp_path, monk
 
 def test_times_places_and_hashes_are_taken_out(tmp_path):
     first, second = "0" * 63 + "a", "0" * 63 + "b"
-    said = f"estimate: 1.348 s\nsize: 14.3 mm\n{tmp_path}/map.nc {first} {second} {first}"
-    wanted = "estimate: <time>\nsize: 14.3 mm\n<folder>/map.nc <digest 1> <digest 2> <digest 1>"
+    said = f"estimate: 1.348 s\nseed 1, 0.273 maps/s\nsize: 14.3 mm\n{tmp_path}/map.nc {first} {second} {first}"
+    wanted = "estimate: <time>\nseed 1, <rate>\nsize: 14.3 mm\n<folder>/map.nc <digest 1> <digest 2> <digest 1>"
     assert plain(said, tmp_path) == wanted
 
 

@@ -40,6 +40,7 @@ VARYING = (
     (re.compile(r"^([a-z ]+: )\d+\.\d+ s$", re.MULTILINE), r"\1<time>"),
     (re.compile(r"about \d.* to go"), "about <time> to go"),
     (re.compile(r'("\w*cpu_s": )(\{[^}]*\}|[\d.e+-]+)'), r"\1<time>"),
+    (re.compile(r'[\d.]+ maps/s|(?<="maps_per_s": )[\d.e+-]+'), "<rate>"),  # of `sbc`
     # what `tradeoff` concludes from the times
     (re.compile(r'"(frontier|enough)": [^\n]*'), r'"\1": <by time>'),
     (re.compile(r'"[^"\n]*(Advice: | s CPU)[^"\n]*"'), '"<by time>"'),
