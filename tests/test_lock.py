@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from lock import Job, compare, do, keep, main, make, plain
 
+import tactile_bayes as tb
+
+DEMO = Path(tb.__file__).parent / "demo"
 SAID = "largest size  14.25 mm\nframes used   687 of 700\n"
 VALUES = np.array([[1.0, np.nan], [0.0, 14.25]])
 PAGE = """```toml scene.toml
@@ -91,6 +94,24 @@ def test_a_page_is_followed_and_written_down(tmp_path):
     assert "diameter_mm" in said
     assert "seen" in said
     assert (tmp_path / "new" / "page" / "files" / "scene.toml.txt").exists()
+
+
+def test_files_of_every_form_are_read(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"""```sh
+tactile-bayes map {DEMO / "scan.mcap"} -o map.nc --figure map.png
+tactile-bayes import {DEMO / "scan.mcap"} -o scan.mcap
+tactile-bayes export map.nc --to nrrd -o map.nrrd
+```
+""")
+    do(Job("page", (page,)), tmp_path / "old", tmp_path / "demos")
+    files = tmp_path / "old" / "page" / "files"
+    texts = {path.name: path.read_text() for path in files.glob("*.txt")}
+    assert set(texts) == {"map.nc.txt", "map.png.txt", "scan.mcap.txt", "map.nrrd.txt"}
+    assert not [name for name, text in texts.items() if text.startswith("not readable")]
+    assert "/mean float64 ('y', 'x') (71, 95)" in texts["map.nc.txt"]
+    with np.load(files / "map.nc.npz") as arrays:
+        assert arrays["|mean"].shape == (71, 95)
 
 
 @pytest.mark.slow

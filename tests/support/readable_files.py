@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
 
 import netCDF4
 import nrrd
@@ -27,14 +26,14 @@ def netcdf(path: Path) -> tuple[str, Arrays]:
     """Groups, variables and attributes of a netCDF file as text, and its values."""
     lines, arrays = list[str](), Arrays()
 
-    def look_at(where: str, one: Any) -> None:
+    def look_at(where: str, one: netCDF4.Dataset | netCDF4.Variable) -> None:
         lines.extend(f"{where} @{name} = {one.getncattr(name)!r}" for name in sorted(one.ncattrs()))
-        for name, variable in sorted(getattr(one, "variables", {}).items()):
-            lines.append(f"{where}/{name} {variable.dtype} {variable.dimensions} {variable.shape}")
-            arrays[f"{where}/{name}"] = np.asarray(variable[...])
-            look_at(f"{where}/{name}", variable)
-        for name, group in sorted(getattr(one, "groups", {}).items()):
-            look_at(f"{where}/{name}", group)
+        if isinstance(one, netCDF4.Variable):
+            lines.append(f"{where} {one.dtype} {one.dimensions} {one.shape}")
+            arrays[where] = np.asarray(one[...])
+        else:
+            for name, inner in sorted([*one.variables.items(), *one.groups.items()]):
+                look_at(f"{where}/{name}", inner)
 
     with netCDF4.Dataset(path) as whole:
         whole.set_auto_mask(False)
@@ -79,5 +78,5 @@ def readable(path: Path) -> tuple[str, Arrays]:
                 with Image.open(path) as image:
                     return f"{image.mode} {image.size} {sorted(image.info.items())} {digest(image.tobytes())}", {}
         return path.read_text(encoding="utf-8"), {}
-    except Exception as fault:  # a damaged file of a page on faults, or one that nobody can read any more
+    except Exception as fault:  # the damaged file of the page on faults; another one is a defect
         return f"not readable: {type(fault).__name__}: {digest(path.read_bytes())}", {}
