@@ -40,20 +40,6 @@ CALIPER = 0.05
 PRIOR_MISS = 1 / 3
 
 
-class Draws(Protocol):
-    """Result of a sampler."""
-
-    @property
-    def theta(self) -> FloatArray:
-        """(chain, draw, p) draws."""
-        ...
-
-    @property
-    def diagnostics(self) -> Mapping[str, float]:
-        """Convergence diagnostics."""
-        ...
-
-
 class Sampler(Protocol):
     """Function that draws from a vectorised log density about its mode."""
 
