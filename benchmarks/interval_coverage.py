@@ -26,7 +26,6 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from scipy.optimize import least_squares
 from scipy.stats import binomtest
 
 from benchmarks.own_trial import draw_mass_like_trial
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.forward.population import draw_mass
@@ -49,7 +49,7 @@ from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.white.fit import default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.draws import SizePosterior
 
 NOMINAL = 0.9
 AXIS = np.arange(-28.0, 28.5)
@@ -345,10 +345,10 @@ def report_sizes(rows: list[Row]) -> None:
 def _size_mass(bodies: str, index: int) -> Row:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.body_calibration import BodyCalibration
-    from tactile_bayes.size.fat_depth import head_profile
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.fat import head_profile
     from tactile_bayes.size.pooling import SizePriors, pool_maps
-    from tactile_bayes.size.shape_draws import ShapeDraws
 
     path = size_calibration_path(DEFAULT)
     assert path is not None

@@ -20,13 +20,14 @@ import argparse
 import csv
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
@@ -39,12 +40,12 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.size_calibration import size_table
 from tactile_bayes.posterior.estimate import calibration_for, estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.eq6 import Recipe, SizeCalibration
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.eq6 import SizeCalibration, push_sizes
 from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.size.posterior import push_sizes
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.terms import Recipe
 
 SEED = 20261123
 FRAME_RATE_HZ = 40.0

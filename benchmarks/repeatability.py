@@ -26,7 +26,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +34,10 @@ from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from benchmarks.interval_coverage import share
+from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.learn.repeatability import GRID, RepeatedExams, learn_repeatability
+from tactile_bayes.size.learn.site import GRID, RepeatedExams, learn_repeatability
+from tactile_bayes.size.spread import BetweenMaps
 
 SEED = 20261124
 MAP_SD, MAP_LOG_SD, BODY_SD = 0.03, 0.4, 0.07

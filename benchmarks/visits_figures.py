@@ -15,12 +15,10 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray, apply, patient_from_base
 from tactile_bayes.report.compare_document import verdict
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.change import JointSizes, joint_sizes
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.pooling import SizePriors, pool_maps
-from tactile_bayes.size.same_mass import Place, apart
-from tactile_bayes.size.shape_draws import ShapeDraws
-from tactile_bayes.size.shared_body import SHARED_BODY, STRANGERS, SharedBody
+from tactile_bayes.size.visits import SHARED_BODY, STRANGERS, JointSizes, Place, SharedBody, apart, joint_sizes
 
 WHOLE = SharedBody(0.0, 1e6)
 """Everything shared: the body is the same whatever the growth."""

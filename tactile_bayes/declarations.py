@@ -17,12 +17,14 @@ No other module imports msgspec.
 
 from __future__ import annotations
 
+import dataclasses
 import types
 from collections.abc import Iterator, Mapping
 from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
+    ClassVar,
     Final,
     Literal,
     TypeVar,
@@ -46,6 +48,8 @@ if TYPE_CHECKING:  # to a type checker each record is frozen, as the class below
 
     @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
     class _Struct:
+        __struct_fields__: ClassVar[tuple[str, ...]]
+
         def __init_subclass__(cls, **options: Any) -> None: ...
 else:
     _Struct = msgspec.Struct
@@ -59,13 +63,14 @@ class Record(_Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     def __repr__(self) -> str:
-        names: tuple[str, ...] = type(self).__struct_fields__  # type: ignore[attr-defined]
-        return f"{type(self).__qualname__}({', '.join(f'{name}={_short(getattr(self, name))}' for name in names)})"
+        values = (f"{name}={_short(getattr(self, name))}" for name in self.__struct_fields__)
+        return f"{type(self).__qualname__}({', '.join(values)})"
 
 
 def replace(record: T, **changes: Any) -> T:
-    """A copy of a record with some fields changed."""
-    copy: T = msgspec.structs.replace(record, **changes)  # type: ignore[type-var]
+    """A copy of a record, or of a data class, with some fields changed."""
+    changed: Any = msgspec.structs.replace if isinstance(record, msgspec.Struct) else dataclasses.replace
+    copy: T = changed(record, **changes)
     return copy
 
 
@@ -127,7 +132,7 @@ def _array(kind: Any, value: object) -> object:
     """An array of nested lists of numbers, for a field that is declared as one."""
     import numpy as np  # a record without arrays is made without it: `--help` stays quick
 
-    if (get_origin(kind) or kind) is not np.ndarray:
+    if not _is_array(kind):
         raise NotImplementedError(f"no way to read a {kind}")
     nested, first = float, value  # type: tuple[Any, Any]
     while isinstance(first, list):
@@ -199,9 +204,16 @@ def _fault(kind: Any, value: Any, where: str) -> BadDataError:
     why = _refused(kind, value)
     name = where or "the document"
     if isinstance(why, BadDataError):  # of a record's own rules, or of an array
-        what = f"{where} {why.what}".strip() if why.what else f"{name} is {_shown(value)}"
+        what = _of_rule(where, why.what, record) if why.what else f"{name} is {_shown(value)}"
         return BadDataError(what, way_out=why.way_out)
     return BadDataError(f"{name} is {_shown(value)}", way_out=_way_out(kind, value))
+
+
+def _of_rule(where: str, what: str, record: Any) -> str:
+    """What a rule of a record or an array's form is broken by, with its place."""
+    if not where or record is None:
+        return f"{where} {what}".strip()
+    return f"{where}.{what}" if what.split(" ")[0] in record.__struct_fields__ else f"{where}: {what}"
 
 
 def _refused(kind: Any, value: Any) -> Exception | None:
@@ -232,12 +244,18 @@ def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
             fields = {part.encode_name: part.type for part in msgspec.structs.fields(kind)}
             yield from ((_joined(where, key), fields[key], one) for key, one in value.items() if key in fields)
             return
-        for of_key, of_value in (get_args(one) for one in map(_bare, _members(kind)) if get_origin(one) is dict):
+        for of_key, of_value in (
+            get_args(one) for one in map(_bare, _members(kind)) if get_origin(one) in (dict, Mapping)
+        ):
             yield from ((_joined(where, f"key {_shown(key)}"), of_key, key) for key in value)
             yield from ((_joined(where, _shown_key(key)), of_value, one) for key, one in value.items())
     if isinstance(value, list):
         for one in map(_bare, _members(kind)):
             args = get_args(one)
+            if _is_array(one):
+                yield from (
+                    (f"{where}[{i}]", one if isinstance(part, list) else float, part) for i, part in enumerate(value)
+                )
             if get_origin(one) is tuple and args[-1] is not Ellipsis:
                 yield from ((f"{where}[{i}]", of, part) for i, (of, part) in enumerate(zip(args, value, strict=False)))
             elif get_origin(one) in (list, tuple):
@@ -270,6 +288,10 @@ def _is_record(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 
 
+def _is_array(kind: Any) -> bool:
+    return getattr(get_origin(kind) or kind, "__name__", "") == "ndarray"
+
+
 def _way_out(kind: Any, value: Any) -> str:
     """What can be given in place of a value, such as "give a number above 0"."""
     members = [one for one in _members(kind) if one is not type(None)]
@@ -286,6 +308,7 @@ def _way_out(kind: Any, value: Any) -> str:
 _KINDS: Final[Mapping[Any, str]] = {
     bool: "true or false",
     dict: "a table of keys",
+    Mapping: "a table of keys",
     list: "a list",
     tuple: "a list",
     type(None): "null",

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Meta, Record, from_plain, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS
-from tactile_bayes.records import dataclass
 
 FLAT_RADIUS_MM: Final = 10_000.0
 """An arc of this radius or more counts as flat: over 40 mm it rises by 0.02 mm."""
@@ -22,32 +21,32 @@ RISE_MM: Final = 0.3
 UNEVEN_MM: Final = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class HeadShape:
-    """Grid and curvature of the taxels.
+Count = Annotated[int, Meta(ge=1)]
 
-    Parameters
-    ----------
-    rows, columns
-        Taxels across and along the head.
-    pitch_mm
-        Distance between neighbours.
-    radius_mm, radius_along_mm
-        Radius of the arc across and along the head; None where it is flat, negative where it is hollow.
-    uneven_mm
-        Root mean square departure of the taxels from these arcs, such as by shoulders.
-    rim_mm
-        Radius of the rounded edge around the taxels, which presses but senses nothing; None where it is unknown, as in
-        every scan.
-    """
 
-    rows: int = HEAD_ROWS
-    columns: int = HEAD_COLUMNS
-    pitch_mm: float = HEAD_PITCH_MM
-    radius_mm: float | None = HEAD_RADIUS_MM
-    radius_along_mm: float | None = None
-    uneven_mm: float = 0.0
-    rim_mm: float | None = None
+class HeadShape(Record):
+    """Grid and curvature of a scan head's taxels."""
+
+    rows: Annotated[Count, Meta(description="Taxels across the head.")] = HEAD_ROWS
+    columns: Annotated[Count, Meta(description="Taxels along the head.")] = HEAD_COLUMNS
+    pitch_mm: Annotated[float, Meta(gt=0, description="Distance between neighbours, mm.")] = HEAD_PITCH_MM
+    radius_mm: Annotated[
+        float | None,
+        Meta(description="Radius of the arc across the head, mm; null where it is flat, negative where it is hollow."),
+    ] = HEAD_RADIUS_MM
+    radius_along_mm: Annotated[float | None, Meta(description="The same along the head.")] = None
+    uneven_mm: Annotated[
+        float, Meta(ge=0, description="Root mean square departure of the taxels from these arcs, mm.")
+    ] = 0.0
+    rim_mm: Annotated[
+        Annotated[float, Meta(ge=0)] | None,
+        Meta(description="Radius of the edge around the taxels, which presses and senses nothing; null where unknown."),
+    ] = None
+
+    def __post_init__(self) -> None:
+        for name in ("radius_mm", "radius_along_mm"):
+            if getattr(self, name) == 0:
+                raise BadDataError(f"{name} is 0", way_out="give another radius; null is flat")
 
     @classmethod
     def of(cls, surface_mm: FloatArray, pitch_mm: float, *, rim_mm: float | None = None) -> HeadShape:
@@ -122,7 +121,7 @@ class HeadShape:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for files."""
-        return asdict(self)
+        return dict(to_plain(self, digits=17))
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> HeadShape:
@@ -133,30 +132,10 @@ class HeadShape:
         BadDataError
             When a value cannot be that of a head.
         """
-        known = cls.__match_args__
-        unknown = sorted(set(document) - set(known))
-        if unknown:
-            raise BadDataError(f"head.{unknown[0]} is not known", way_out=f"known are {', '.join(known)}")
-        head = cls(**document)
-        for name in ("rows", "columns"):
-            value = getattr(head, name)
-            _require(isinstance(value, int) and not isinstance(value, bool) and value > 0, name, value, "a count")
-        for name, optional in (
-            ("pitch_mm", False),
-            ("radius_mm", True),
-            ("radius_along_mm", True),
-            ("uneven_mm", False),
-            ("rim_mm", True),
-        ):
-            value = getattr(head, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-            _require(number or (optional and value is None), name, value, "a number")
-            if name.startswith("radius"):
-                _require(value is None or value != 0, name, value, "other than 0; null is flat")
-            else:
-                least = 1e-9 if name == "pitch_mm" else 0.0
-                _require(value is None or value >= least, name, value, "above 0" if least else "0 or more")
-        return head
+        try:
+            return from_plain(cls, dict(document))
+        except BadDataError as error:
+            raise BadDataError(f"head.{error.what}", way_out=error.way_out) from None
 
 
 DEFAULT_HEAD: Final = HeadShape()
@@ -173,8 +152,3 @@ def _near(ours: float, theirs: float, share: float) -> bool:
 
 def _arc(curvature: float) -> str:
     return f"on an arc of {1 / curvature:.3g} mm" if curvature else "flat"
-
-
-def _require(holds: bool, name: str, value: object, rule: str) -> None:
-    if not holds:
-        raise BadDataError(f"head.{name} is {value!r}", way_out=f"it must be {rule}")

@@ -25,7 +25,7 @@ from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tactile_bayes.size.change import Change
+    from tactile_bayes.size.visits import Change
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -16,6 +16,7 @@ from tactile_bayes.api.draws import Draws
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.paths import PathLike, output_path, path_of
 from tactile_bayes.api.sized import MassEstimate, Sized
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tactile_bayes.pipeline.pooled import PooledOutcome
-    from tactile_bayes.size.posterior import SizePosterior
-    from tactile_bayes.size.repeatability import Repeatability
+    from tactile_bayes.size.draws import SizePosterior
+    from tactile_bayes.size.site import Repeatability
 
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 

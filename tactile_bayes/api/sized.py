@@ -16,13 +16,13 @@ from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.quantities import leading_size
 from tactile_bayes.report.size_text import exams_label
-from tactile_bayes.size.posterior import EXTREMES, SIZES
+from tactile_bayes.size.draws import EXTREMES, SIZES
 
 if TYPE_CHECKING:
     import pandas
 
     from tactile_bayes.posterior.result import Mass
-    from tactile_bayes.size.posterior import SizePosterior
+    from tactile_bayes.size.draws import SizePosterior
 
 
 class Sized:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet
     from tactile_bayes.pipeline.size_calibration import EqSixFit, PopulationForm
     from tactile_bayes.pipeline.trial import TrialOutcome
-    from tactile_bayes.size.calibration import Calibration
-    from tactile_bayes.size.repeatability import Repeatability
+    from tactile_bayes.size.pooling import Calibration
+    from tactile_bayes.size.site import Repeatability
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,7 +156,6 @@ def calibrate_size(
     """
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_size_calibration
-    from tactile_bayes.files.size_population_json import write_population
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.pipeline.site_correction import correct_size
     from tactile_bayes.pipeline.size_calibration import FORMS, is_population, learn_eq6, learn_population
@@ -187,7 +186,7 @@ def calibrate_size(
         )
         if target is not None:
             provenance = Provenance("calibrate size", settings, inputs)
-            write_population(target, over_bodies, provenance=provenance, force=force)
+            write_size_calibration(target, over_bodies, provenance=provenance, force=force)
         return over_bodies
     rows = read_table(source, "size_table.table.json")
     learned = learn_eq6(rows, given, fit=cast("EqSixFit", fit), least_stiffness_ratio=least_stiffness_ratio, seed=seed)

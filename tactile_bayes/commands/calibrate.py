@@ -226,7 +226,7 @@ def _over_bodies(
     table: Path, output: Path, form: PopulationForm, normalise: str | None, *, against: Path | None, force: bool
 ) -> str:
     from tactile_bayes.files.provenance import Provenance, hash_inputs
-    from tactile_bayes.files.size_population_json import write_population
+    from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.pipeline.size_calibration import learn_population
     from tactile_bayes.report.population_text import body_calibration_text
@@ -237,7 +237,7 @@ def _over_bodies(
     )
     inputs = hash_inputs(table=table) if against is None else hash_inputs(table=table, against=against)
     provenance = Provenance("calibrate size", settings, inputs)
-    write_population(output, calibration, provenance=provenance, force=force)
+    write_size_calibration(output, calibration, provenance=provenance, force=force)
     return body_calibration_text(calibration)
 
 

@@ -15,10 +15,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from tactile_bayes.declarations import replace
 
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.lump.posterior import MapPosterior
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
-    from tactile_bayes.size.calibration import Calibration
+    from tactile_bayes.size.pooling import Calibration
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2

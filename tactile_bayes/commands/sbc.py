@@ -18,7 +18,7 @@ from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 if TYPE_CHECKING:
     from tactile_bayes.batch import Outcome
     from tactile_bayes.batch_store import BatchStore
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.studies.sbc import MapRanks
 
 
@@ -159,7 +159,7 @@ def ranks_of_map(index: int, *, method: Method, seed: int, cosines: int | None) 
 def _shipped() -> BodyCalibration:
     from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.bodies import BodyCalibration
 
     path = size_calibration_path(DEFAULT)
     calibration = None if path is None else read_size_calibration(path)

@@ -9,7 +9,7 @@ from tactile_bayes.commands.paths import also_read, refuse_same
 from tactile_bayes.pipeline.settings import Settings
 
 if TYPE_CHECKING:
-    from tactile_bayes.size.repeatability import Repeatability
+    from tactile_bayes.size.site import Repeatability
 
 
 def settings_of(path: Path | None, **options: Any) -> Settings:

@@ -16,7 +16,7 @@ from tactile_bayes.findings import finding_lines, findings_in
 if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
     from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.size.calibration import Calibration
+    from tactile_bayes.size.pooling import Calibration
 
 _TABLES = (
     "trial.table.json",
@@ -142,7 +142,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.bodies import BodyCalibration
 
     calibration = read_size_calibration(path)
     assert isinstance(calibration, BodyCalibration)
@@ -193,7 +193,7 @@ def _size_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 
 def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, Any]:
     """What a calibration's document says of it, without its long arrays."""
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.bodies import BodyCalibration
 
     if isinstance(calibration, BodyCalibration):
         kept = ("form", "source", "bodies", "recipe", "centre", "constants", "domain", "fit", "provenance")
@@ -207,7 +207,7 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
             "residual_points": 0 if calibration.residual is None else len(calibration.residual.points),
             "fat_mm": None if calibration.depth is None else list(calibration.depth.fat_mm),
             "other_sd": calibration.other_sd,
-            "other_source": calibration.other_source,
+            "other_source": calibration.spread.other_source,
         }
     return {
         "schema": document["schema"],

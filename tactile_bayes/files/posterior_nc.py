@@ -22,7 +22,7 @@ from tactile_bayes.posterior.inference_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.draws import SizePosterior
 
 SCHEMA = "tactile-bayes/posterior/1"
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.declarations import to_plain
 from tactile_bayes.files.atomic import sha256, write_text
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document, dump_json
-from tactile_bayes.files.size_parts_json import number
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.repeatability import PROBABILITY, Repeatability
+from tactile_bayes.size.site import PROBABILITY, Repeatability
 
 SCHEMA: Final = "tactile-bayes/repeatability/1"
 SCHEMA_FILE: Final = "repeatability.schema.json"
@@ -39,9 +39,9 @@ def repeatability_document(
     return {
         "schema": SCHEMA,
         "research_use": RESEARCH_USE,
-        "between_map_sd": number(found.sd),
-        "log_sd": number(found.log_sd),
-        **{name: number(getattr(found, name)) for name in _SPREAD},
+        "between_map_sd": to_plain(found.sd),
+        "log_sd": to_plain(found.log_sd),
+        **{name: to_plain(getattr(found, name)) for name in _SPREAD},
         "probability": PROBABILITY,
         "masses": found.masses,
         "maps": found.maps,
@@ -50,7 +50,7 @@ def repeatability_document(
             "sha256": found.calibration_sha256,
             "normalise": found.normalise,
         },
-        **({} if half_width is None else {"half_width": {name: number(v) for name, v in half_width.items()}}),
+        **({} if half_width is None else {"half_width": {name: to_plain(v) for name, v in half_width.items()}}),
         "repeats": list(repeats),
         "outlying": list(found.outlying),
         "left_out": list(left_out),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,14 +11,14 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.npz import load_npz
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.draws import ShapeDraws
 
 _DRAWS: Final = ("log_amplitude", "log_width", "q", "r")
 
 
 def write_shape(path: Path, shape: ShapeDraws, *, force: bool = False) -> None:
     """Write the draws atomically; fields that are None are left out."""
-    values: dict[str, Any] = {one.name: getattr(shape, one.name) for one in fields(shape)}
+    values: dict[str, Any] = {name: getattr(shape, name) for name in shape.__struct_fields__}
     out = io.BytesIO()
     np.savez_compressed(out, **{name: value for name, value in values.items() if value is not None})
     write_bytes(path, out.getvalue(), force=force)
@@ -34,7 +33,7 @@ def read_shape(path: Path) -> ShapeDraws:
         When the file is damaged, or its draws are not of one length.
     """
     try:
-        optional = [one.name for one in fields(ShapeDraws) if one.name not in _DRAWS]
+        optional = [name for name in ShapeDraws.__struct_fields__ if name not in _DRAWS]
         arrays = load_npz(path, required=_DRAWS, optional=optional)
         if len({arrays[name].shape for name in _DRAWS}) > 1:
             raise BadDataError("holds draws of several lengths", way_out="estimate the map again")

@@ -16,11 +16,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.provenance import recordings
@@ -46,7 +47,7 @@ from tactile_bayes.progress import Progress, untold
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from tactile_bayes.size.repeatability import Repeatability
+    from tactile_bayes.size.site import Repeatability
 
 Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")
@@ -381,7 +382,7 @@ class Campaign:
         """Which calibration cannot size several maps together; empty for none."""
         from tactile_bayes.files.shipped import size_calibration_path
         from tactile_bayes.files.size_json import read_size_calibration
-        from tactile_bayes.size.body_calibration import BodyCalibration
+        from tactile_bayes.size.bodies import BodyCalibration
 
         for name in {self.settings.of(exam).calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.campaign_names import ESTIMATE, MAP, REPEATABILITY, SHAPE, SIZED, SIZED_FIGURE
 from tactile_bayes.files.manifest_csv import Exam
@@ -21,7 +21,7 @@ from tactile_bayes.pipeline.repeatability import ExamFolder, learn_from_exams, r
 if TYPE_CHECKING:
     from tactile_bayes.pipeline.campaign_settings import CampaignSettings
     from tactile_bayes.pipeline.settings import Settings
-    from tactile_bayes.size.posterior import SizePosterior
+    from tactile_bayes.size.draws import SizePosterior
 
 FEWEST_MASSES: Final = 5
 """Masses with repeats from which a campaign learns by itself."""
@@ -100,8 +100,8 @@ def _size(folder: Path, settings: Settings) -> SizePosterior:
     from tactile_bayes.files.map_nc import read_map
     from tactile_bayes.files.shape_npz import read_shape
     from tactile_bayes.pipeline.one_map import choose_calibration, size_priors
-    from tactile_bayes.size.body_calibration import BodyCalibration
-    from tactile_bayes.size.repeatability import size_alone
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.site import size_alone
 
     tactile_map = read_map(folder / MAP)
     _, calibration, _ = choose_calibration(settings, tactile_map)
@@ -115,7 +115,7 @@ def _resized(document: dict[str, Any], size: SizePosterior, settings: Settings) 
     """The estimate's JSON object with the sizes, their sources and their provenance replaced."""
     from tactile_bayes.report.estimate_document import rounded, size_diagnostics
     from tactile_bayes.report.quantities import ANOTHER_EXAM
-    from tactile_bayes.size.posterior import SIZES
+    from tactile_bayes.size.draws import SIZES
 
     found = settings.repeatability
     assert found is not None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.pipeline.comparing import Comparing
@@ -20,13 +20,11 @@ from tactile_bayes.records import dataclass
 if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.report.compare_figure import DrawnMap
-    from tactile_bayes.size.between_maps import BetweenMaps
-    from tactile_bayes.size.body_calibration import BodyCalibration
-    from tactile_bayes.size.change import JointSizes
-    from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.draws import ShapeDraws
     from tactile_bayes.size.pooling import SizePriors
-    from tactile_bayes.size.same_mass import Apart
-    from tactile_bayes.size.shape_draws import ShapeDraws
+    from tactile_bayes.size.spread import BetweenMaps
+    from tactile_bayes.size.visits import Apart, Compared, JointSizes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,8 +115,7 @@ def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[A
 def _compared(
     visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: Comparing
 ) -> Compared:
-    from tactile_bayes.size.comparison import Compared
-    from tactile_bayes.size.same_mass import contradictions
+    from tactile_bayes.size.visits import Compared, contradictions
 
     found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [
@@ -143,9 +140,8 @@ def _by_place(
 ) -> tuple[Compared | None, tuple[Apart | None, ...], list[Finding]]:
     """Refusal where the places do not show one mass, the distances from the first visit, and what else speaks of it."""
     from tactile_bayes.pipeline.one_mass import place_of
-    from tactile_bayes.size.comparison import Compared
-    from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_place_probability
-    from tactile_bayes.size.same_mass import Place, apart
+    from tactile_bayes.size.spread import LEAST_PROBABILITY
+    from tactile_bayes.size.visits import Compared, Place, apart, one_place_probability
 
     of_maps = [[place for answer in maps if (place := place_of(answer.document)) is not None] for maps in visits]
     places = [Place.mean_of(one) for one in of_maps]
@@ -185,9 +181,8 @@ def _sized(
     """Sizes of visits that are of one mass, or why there are none."""
     import numpy as np
 
-    from tactile_bayes.size.change import joint_sizes, visit_calibrations
-    from tactile_bayes.size.comparison import Compared
     from tactile_bayes.size.pooling import MOST_INVALID
+    from tactile_bayes.size.visits import Compared, joint_sizes, visit_calibrations
 
     # one order whatever the caller's, so that the order of a visit's maps leaves no trace
     shapes: list[list[ShapeDraws]] = [
@@ -237,8 +232,8 @@ def _sizes_apart(
 ) -> list[Finding]:
     """Cautions where the maps of one visit are not of one size."""
     from tactile_bayes.report.pooled import disagreement
-    from tactile_bayes.size.map_sizes import log_sizes
-    from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_size_of
+    from tactile_bayes.size.pooling import log_sizes
+    from tactile_bayes.size.spread import LEAST_PROBABILITY, one_size_of
 
     found = []
     for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):

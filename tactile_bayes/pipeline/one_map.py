@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.abstention import NO_LUMP
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, TactileBayesError
 from tactile_bayes.findings import Finding, by_weight, findings_in
 from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from tactile_bayes.posterior.inference_groups import DrawGroup
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.posterior.result import Estimate
-    from tactile_bayes.size.calibration import Calibration
-    from tactile_bayes.size.pooling import SizePriors
-    from tactile_bayes.size.shape_draws import ShapeDraws
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.pooling import Calibration, SizePriors
 
 NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
 Progress = Callable[[int, int], None]
@@ -172,7 +171,7 @@ def estimate_one(
     from tactile_bayes.posterior.masses import with_masses
     from tactile_bayes.report.population_text import calibration_line
     from tactile_bayes.report.site_text import site_words
-    from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
+    from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
@@ -381,8 +380,8 @@ def estimate_inputs(
 
 def size_priors(settings: Settings) -> SizePriors:
     """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
-    from tactile_bayes.size.between_maps import BetweenMaps
     from tactile_bayes.size.pooling import SizePriors
+    from tactile_bayes.size.spread import BetweenMaps
 
     fixed, learned = settings.between_map_sd, settings.repeatability
     if learned is None and fixed is None:
@@ -425,8 +424,8 @@ def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | N
     """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
     import math
 
-    from tactile_bayes.size.fat_depth import head_profile
-    from tactile_bayes.size.shape_draws import ShapeDraws
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.fat import head_profile
 
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
     if posterior is None or estimate.draws is None:

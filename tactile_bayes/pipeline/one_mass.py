@@ -14,7 +14,7 @@ import numpy as np
 from tactile_bayes.pipeline.one_map import Answer
 from tactile_bayes.presets import MATCH_MM
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.same_mass import Place as PatientPlace
+from tactile_bayes.size.visits import Place as PatientPlace
 
 Document = Mapping[str, Any]
 Place = tuple[float, float]

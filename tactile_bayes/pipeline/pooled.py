@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.one_map import Answer, size_priors
 from tactile_bayes.pipeline.repeatability import check_repeatability, repeatability_digest, repeatability_setting
@@ -15,9 +16,9 @@ from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.files.provenance import Provenance
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.bodies import BodyCalibration
     from tactile_bayes.size.pooling import PooledEstimate
-    from tactile_bayes.size.same_mass import Place
+    from tactile_bayes.size.visits import Place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,8 +57,8 @@ def pool_answers(
     from tactile_bayes.files.provenance import Provenance, hash_inputs, scans_of
     from tactile_bayes.pipeline.one_mass import apart_from_others, one_place, place_of
     from tactile_bayes.report.pooled import pooled_document
-    from tactile_bayes.size.one_size import one_place_probability
     from tactile_bayes.size.pooling import DISAGREE, pool_maps
+    from tactile_bayes.size.visits import one_place_probability
 
     documents = [answer.document for answer in answers if answer.document is not None]
     scans = [scan for document in documents for scan in scans_of(document["provenance"])]
@@ -123,8 +124,8 @@ def _apart(places: Sequence[Place], chance: float | None) -> PooledEstimate | No
 
     import numpy as np
 
-    from tactile_bayes.size.one_size import LEAST_PROBABILITY
     from tactile_bayes.size.pooling import DISAGREE, PooledEstimate
+    from tactile_bayes.size.spread import LEAST_PROBABILITY
 
     if chance is None or chance >= LEAST_PROBABILITY:
         return None
@@ -171,7 +172,7 @@ def _calibration(answers: Sequence[Answer], settings: Settings) -> tuple[Path | 
     """The calibration that pools, and its file if it is in one."""
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.bodies import BodyCalibration
 
     path, calibration = None, settings.calibration
     if calibration is None or isinstance(calibration, str):

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
     from tactile_bayes.pipeline.settings import Settings
-    from tactile_bayes.size.body_calibration import BodyCalibration
-    from tactile_bayes.size.calibration import Calibration
-    from tactile_bayes.size.learn.repeatability import RepeatedExams
-    from tactile_bayes.size.repeatability import Repeatability
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.learn.site import RepeatedExams
+    from tactile_bayes.size.pooling import Calibration
+    from tactile_bayes.size.site import Repeatability
 
 COMMAND: Final = "calibrate repeatability"
 _AGAIN: Final = "run the campaign again"
@@ -137,10 +137,10 @@ def learn_from_exams(
     UsageError
         When the calibration's file is not found, or it is not learned over bodies.
     """
+    from tactile_bayes.declarations import to_plain
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.files.repeatability_json import repeatability_document
-    from tactile_bayes.files.size_parts_json import number
-    from tactile_bayes.size.learn.repeatability import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
+    from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
 
     groups, left_out = _repeats(exams)
     one_by_one = [repeat for group in groups for repeat in group]
@@ -159,9 +159,9 @@ def learn_from_exams(
         {
             "name": mass.name,
             "exams": [repeat.exam.name for repeat in group],
-            "log_size": [number(value) for value in mass.centre],
-            "map_sd": [number(math.sqrt(value)) for value in mass.noise],
-            "by_chance": number(chance),
+            "log_size": [to_plain(value) for value in mass.centre],
+            "map_sd": [to_plain(math.sqrt(value)) for value in mass.noise],
+            "by_chance": to_plain(chance),
         }
         for mass, group, chance in zip(masses, groups, learned.by_chance, strict=True)
     ]
@@ -248,7 +248,7 @@ def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
     from tactile_bayes.files.atomic import sha256
     from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.body_calibration import BodyCalibration
+    from tactile_bayes.size.bodies import BodyCalibration
 
     names = [name, *SHIPPED] if given is None else [given]
     paths = [path for one in names if (path := size_calibration_path(one)) is not None]
@@ -268,8 +268,8 @@ def _repeated(group: Sequence[_Repeat], calibration: BodyCalibration) -> Repeate
     import numpy as np
 
     from tactile_bayes.files.shape_npz import read_shape
-    from tactile_bayes.size.learn.repeatability import RepeatedExams
-    from tactile_bayes.size.repeatability import log_size_alone
+    from tactile_bayes.size.learn.site import RepeatedExams
+    from tactile_bayes.size.site import log_size_alone
 
     first = group[0].exam
     values = np.array([log_size_alone(calibration, read_shape(repeat.shape_path)) for repeat in group])

@@ -22,8 +22,8 @@ from tactile_bayes.presets import (
 from tactile_bayes.records import dataclass
 
 if TYPE_CHECKING:
-    from tactile_bayes.size.calibration import Calibration
-    from tactile_bayes.size.repeatability import Repeatability
+    from tactile_bayes.size.pooling import Calibration
+    from tactile_bayes.size.site import Repeatability
 
 GIVEN: Final = "given in Python"
 """Name of a calibration that is in no file."""

@@ -5,18 +5,19 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import LEAST_HARD_RATIO
 
 if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet, Table
     from tactile_bayes.pipeline.one_map import Progress
-    from tactile_bayes.size.body_calibration import BodyCalibration
-    from tactile_bayes.size.learn.site_shift import PhantomMap
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.learn.site import PhantomMap
 
 HARDEST_RATIO = 100.0
 """Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
@@ -47,11 +48,11 @@ class Corrected:
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --size-calibration` takes."""
         from tactile_bayes.files.provenance import Provenance, hash_inputs
-        from tactile_bayes.files.size_site_json import write_site_calibration
+        from tactile_bayes.files.size_json import write_size_calibration
 
         assert self.calibration.site is not None
         provenance = Provenance("calibrate size", self.settings, hash_inputs(**self.inputs), seed=self.seed)
-        write_site_calibration(path, self.calibration.site, base=self.base, provenance=provenance, force=force)
+        write_size_calibration(path, self.calibration, base=self.base, provenance=provenance, force=force)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +89,8 @@ def correct_size(
     from tactile_bayes.files.documents import load_json
     from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.size.body_calibration import BodyCalibration
-    from tactile_bayes.size.learn.site_shift import correct_calibration
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.learn.site import correct_calibration
 
     path = size_calibration_path(base)
     calibration = None if path is None else read_size_calibration(path)
@@ -142,8 +143,8 @@ def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Ma
 
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.presets import HEAD_PROFILE
-    from tactile_bayes.size.learn.site_shift import PhantomMap
-    from tactile_bayes.size.shape_draws import ShapeDraws
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.learn.site import PhantomMap
 
     rows = read_table(source, "size_table.table.json")
     _check_recipe(rows, calibration, declared)
@@ -172,7 +173,7 @@ def _from_maps(source: Path | Sheet, base: str, *, seed: int, progress: Progress
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.pipeline.one_map import estimate_file, pooling_shape
     from tactile_bayes.pipeline.settings import Settings
-    from tactile_bayes.size.learn.site_shift import PhantomMap
+    from tactile_bayes.size.learn.site import PhantomMap
 
     rows = read_table(source, "phantom_maps.table.json")
     folder = source.parent if isinstance(source, Path) else Path()

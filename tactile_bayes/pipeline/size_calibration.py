@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from tactile_bayes.files.tables import Sheet, Table
     from tactile_bayes.head_shape import HeadShape
     from tactile_bayes.pipeline.one_map import Progress
-    from tactile_bayes.size.body_calibration import BodyCalibration
-    from tactile_bayes.size.eq6 import LeftOutErrors, Recipe, SizeCalibration
-    from tactile_bayes.size.learn.eq6 import SizeTable, StudyCases
-    from tactile_bayes.size.learn.eq6_two_stage import OtherFit
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.eq6 import LeftOutErrors, SizeCalibration
+    from tactile_bayes.size.learn.eq6 import OtherFit, SizeTable, StudyCases
+    from tactile_bayes.size.terms import Normalise, Recipe
 
 EqSixFit = Literal["joint", "two-stage"]
 PopulationForm = Literal["eq6", "eq6-residual"]
@@ -75,12 +75,10 @@ def learn_eq6(
     NotConvergedError
         When the sampler does not converge.
     """
-    from dataclasses import replace
-
     import numpy as np
 
-    from tactile_bayes.size.learn.eq6 import learn_size_calibration
-    from tactile_bayes.size.learn.eq6_two_stage import learn_two_stage, other_fit
+    from tactile_bayes.declarations import replace
+    from tactile_bayes.size.learn.eq6 import learn_size_calibration, learn_two_stage, other_fit
 
     recipe = table_recipe(rows, declared)
     try:
@@ -144,11 +142,9 @@ def learn_population(
     NotConvergedError
         When the posterior has no mode.
     """
-    from dataclasses import replace
-
-    from tactile_bayes.size.eq6 import Recipe
-    from tactile_bayes.size.learn import population as learning
-    from tactile_bayes.size.learn.left_out import learn_other_sd
+    from tactile_bayes.declarations import replace
+    from tactile_bayes.size.learn import bodies as learning
+    from tactile_bayes.size.terms import Recipe
     from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
 
     fit = measuring_options().fit
@@ -175,7 +171,7 @@ def learn_population(
         _, others = rows_of_one_way(against, way)
         other_table = population_table(others)
         source = f"{len(set(other_table.body.tolist()))} lumps of {against.path.name}"
-        found = learn_other_sd(found, other_table, source=source)
+        found = learning.learn_other_sd(found, other_table, source=source)
         settings["other_masses"] = len(set(other_table.body.tolist()))
     return found, settings
 
@@ -208,14 +204,14 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
         When a level is to be fixed on maps that have none.
     """
     from tactile_bayes.errors import UsageError
-    from tactile_bayes.size.eq6 import Recipe
+    from tactile_bayes.size.terms import Recipe
 
     said = {name: _alike(table, name) for name in (*declared, "flat_field")}
     for name, value in declared.items():
         if None not in (value, said[name]) and value != said[name]:
             raise _contradiction(table, name, said[name], value)
     found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
-    normalise = found["normalise"] or "mean"
+    normalise: Normalise = found["normalise"] or "mean"
     background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
     if normalise == "none" and background == "fixed":
         raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
@@ -270,7 +266,7 @@ def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) 
     """Cross-validated errors, or the reason why Eq 6 has none."""
     from tactile_bayes.errors import NotConvergedError
     from tactile_bayes.size.learn.cross_validation import left_out_of_study
-    from tactile_bayes.size.learn.eq6_two_stage import axis_in_two_stages
+    from tactile_bayes.size.learn.eq6 import axis_in_two_stages
 
     one_axis = axis_in_two_stages if fit == "two-stage" else None
     try:
@@ -279,7 +275,7 @@ def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) 
         return None, str(error)
 
 
-def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[str, dict[str, list[Any]]]:
+def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict[str, list[Any]]]:
     """How a `population` table's maps were normalised, and its columns for the rows that were.
 
     Tables without the column, and empty cells, are of maps normalised by the mean.
@@ -300,7 +296,7 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[str, dict[str, 
             path=str(rows.path),
         )
     kept = [i for i, way in enumerate(ways) if way == chosen]
-    return chosen, {name: [values[i] for i in kept] for name, values in rows.columns.items()}
+    return cast("Normalise", chosen), {name: [values[i] for i in kept] for name, values in rows.columns.items()}
 
 
 def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:

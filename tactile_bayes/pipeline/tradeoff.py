@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.pipeline.one_map import Answer, answer_of, estimate_file, estimate_inputs
 from tactile_bayes.pipeline.settings import Settings
@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.options import EstimateOptions
     from tactile_bayes.scan import Scan
-    from tactile_bayes.size.calibration import Calibration
-    from tactile_bayes.size.pooling import PooledEstimate
+    from tactile_bayes.size.pooling import Calibration, PooledEstimate
     from tactile_bayes.studies.cost_ladder import Clock, Ladder, PooledRow, Work
     from tactile_bayes.studies.size_answers import SizeAnswer
 

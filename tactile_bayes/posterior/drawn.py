@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from tactile_bayes.abstention import Abstention
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.mapping.tactile_map import TactileMap
@@ -18,9 +18,8 @@ from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.calibration import Calibration, draw_sizes
-from tactile_bayes.size.pooling import SizePriors
-from tactile_bayes.size.posterior import EXTREMES, SizePosterior
+from tactile_bayes.size.draws import EXTREMES, SizePosterior
+from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
 """Of interval ends of sizes, where none is given; the methods have the same for the widths."""

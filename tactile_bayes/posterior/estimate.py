@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from tactile_bayes.abstention import NO_LUMP, Abstention
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
@@ -33,12 +33,10 @@ from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
-from tactile_bayes.size import omissions
-from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.size.calibration_range import UNLIKE_ON_PAPER, extrapolated
-from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.fat_depth import head_profile
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.draws import SizePosterior
+from tactile_bayes.size.fat import head_profile
+from tactile_bayes.size.pooling import Calibration
+from tactile_bayes.size.terms import SPREAD, UNLIKE_ON_PAPER, Recipe, extrapolated, unknown_head
 
 MOST_INVALID = 0.05
 SCAN_AGAIN = "scan again: nothing of the area was read"
@@ -327,9 +325,9 @@ def _left_out(
     if options.fit.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")
     if calibration is None:
-        return (*notes, omissions.SPREAD)
+        return (*notes, SPREAD)
     stated = options.size_priors.another_exam or options.size_priors.between_maps
-    notes += [] if stated is None or stated.sd > 0 else [omissions.SPREAD]
+    notes += [] if stated is None or stated.sd > 0 else [SPREAD]
     head = calibration.recipe.head
-    notes += [] if head is None or tactile_map.head is not None else [omissions.head(head)]
+    notes += [] if head is None or tactile_map.head is not None else [unknown_head(head)]
     return (*notes, *calibration.omissions())

@@ -15,8 +15,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.summary import quantiles_of
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.calibration import Calibration, draw_sizes
-from tactile_bayes.size.pooling import SizePriors
+from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.fit import FieldFit

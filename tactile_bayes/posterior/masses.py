@@ -8,11 +8,11 @@ that finds no lump there, the map less the first lump decides.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from tactile_bayes.abstention import NO_LUMP
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.lump.cells import SMOOTHING_MM, on_map

@@ -14,7 +14,7 @@ from tactile_bayes.posterior.sensitivity import Sensitivity
 from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.posterior.white.fit import BumpFit, Candidate
 from tactile_bayes.records import dataclass
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.draws import SizePosterior
 
 if TYPE_CHECKING:
     from tactile_bayes.posterior.correlated.selection import SceneChoice

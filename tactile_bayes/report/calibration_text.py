@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
-from tactile_bayes.size.learn.eq6_two_stage import OtherFit, is_two_stage
+from tactile_bayes.size.learn.eq6 import OtherFit, is_two_stage
 
 LABELS = {
     "m": "m",

@@ -12,13 +12,11 @@ from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.summary import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.trend import VOLUME, Trend, doubling_days, straight_line
+from tactile_bayes.size.visits import VOLUME, Trend, doubling_days, straight_line
 
 if TYPE_CHECKING:
-    from tactile_bayes.size.change import Change, JointSizes
-    from tactile_bayes.size.comparison import Compared
-    from tactile_bayes.size.repeatability import Repeatability
-    from tactile_bayes.size.same_mass import Apart
+    from tactile_bayes.size.site import Repeatability
+    from tactile_bayes.size.visits import Apart, Change, Compared, JointSizes
 
 SCHEMA: Final = "tactile-bayes/compare/1"
 SHOWN: Final = 0.95

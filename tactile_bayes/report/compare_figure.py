@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tactile_bayes.size.comparison import Compared
+    from tactile_bayes.size.visits import Compared
 
 HALF_MM: Final = 30.0
 """Half the side of the square about the mass that is drawn."""

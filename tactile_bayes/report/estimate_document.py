@@ -19,7 +19,7 @@ from tactile_bayes.report.quantities import ANOTHER_EXAM, WIDTHS, another_exam, 
 from tactile_bayes.report.scene_text import scene_document
 from tactile_bayes.report.supposed_text import supposed_document
 from tactile_bayes.report.touching import touching_masses
-from tactile_bayes.size.posterior import SIZES, SizePosterior
+from tactile_bayes.size.draws import SIZES, SizePosterior
 
 SCHEMA = "tactile-bayes/estimate/1"
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tactile_bayes.mapping.tactile_map import TactileMap
     from tactile_bayes.posterior.result import Estimate, Mass
     from tactile_bayes.report.map_figure import FitContour, NumberedMass
-    from tactile_bayes.size.posterior import SizePosterior
+    from tactile_bayes.size.draws import SizePosterior
 
 
 def draw_figures(

@@ -28,7 +28,7 @@ from tactile_bayes.report.narrowing import MORE, MOST_LINES, joined, width_lines
 from tactile_bayes.report.quantities import leading_size, xiphoid_mm
 from tactile_bayes.report.scene_text import scene_line
 from tactile_bayes.report.supposed_text import supposed_document, supposed_line
-from tactile_bayes.size.posterior import EXTREMES
+from tactile_bayes.size.draws import EXTREMES
 
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 MOST_CAUTIONS = 3

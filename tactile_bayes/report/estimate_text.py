@@ -33,7 +33,7 @@ from tactile_bayes.report.size_text import (
 )
 from tactile_bayes.report.smallest_text import smallest_text
 from tactile_bayes.report.supposed_text import supposed_document, supposed_lines
-from tactile_bayes.size.posterior import EXTREMES, SIZES
+from tactile_bayes.size.draws import EXTREMES, SIZES
 
 ANOTHER_LARGEST = f"{ANOTHER_EXAM}.max_size_mm"
 ANOTHER_SMALLEST = f"{ANOTHER_EXAM}.min_size_mm"

@@ -15,7 +15,7 @@ from tactile_bayes.posterior.result import Mass
 from tactile_bayes.report.lump_place import lump_place
 from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, estimate_quantities, leading
 from tactile_bayes.report.touching import together_words, touching_masses
-from tactile_bayes.size.posterior import SIZES
+from tactile_bayes.size.draws import SIZES
 
 MassDocument = Mapping[str, Any]
 

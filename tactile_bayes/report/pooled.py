@@ -31,12 +31,12 @@ from tactile_bayes.report.size_text import (
     table_row,
 )
 from tactile_bayes.report.supposed_text import supposed_document, supposed_line, supposed_lines
-from tactile_bayes.size import omissions
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.one_size import LEAST_PROBABILITY
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import EXTREMES, SizePosterior
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate
-from tactile_bayes.size.posterior import EXTREMES, SizePosterior
-from tactile_bayes.size.repeatability import Repeatability
+from tactile_bayes.size.site import Repeatability
+from tactile_bayes.size.spread import LEAST_PROBABILITY
+from tactile_bayes.size.terms import unknown_head
 
 SCHEMA = "tactile-bayes/pooled/1"
 MOST_NAMED = 4
@@ -99,7 +99,7 @@ def pooled_document(
 
 def _omitted(used: BodyCalibration, documents: Sequence[Mapping[str, Any]]) -> list[str]:
     """What the pooled size does not contain, in words."""
-    head = omissions.head(used.recipe.head)
+    head = unknown_head(used.recipe.head)
     unknown = any(head in document["left_out"] for document in documents)
     return [*([head] if unknown else []), *used.omissions()]
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from tactile_bayes.presets import HELD, RESEARCH_USE
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.calibration import Calibration
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.pooling import Calibration
 
 UNKNOWN_NAMES = {
     "depth_mm": "depth",
@@ -58,10 +58,10 @@ def _bodies_lines(bodies: Mapping[str, tuple[float, float]]) -> list[str]:
 
 def _eq6_lines(calibration: BodyCalibration) -> list[str]:
     """The constants of Eq 6, by the depth of the fat where maps tell it, and its residual."""
-    alpha, p, _ = calibration.centre
+    alpha, p = calibration.centre.log_amplitude, calibration.centre.log_width
     sigma = f"sigma the geometric mean width, here {np.exp(p):.2g} mm"
     if calibration.depth is None:
-        sd = np.sqrt(np.diag(calibration.covariance))
+        sd = np.sqrt(np.diag(calibration.eq6.covariance))
         return [
             f"Eq 6: d = m sigma / (e a^f) + b, {sigma}: {constants_text(calibration.constants())}",
             f"posterior SD: m/e {100 * sd[0]:.1f} %, f {sd[1]:.3f}, b {sd[2]:.2f} mm; u = ln a {-alpha:+.3f}",
@@ -79,12 +79,12 @@ def _eq6_lines(calibration: BodyCalibration) -> list[str]:
 
 def _other_lines(calibration: BodyCalibration) -> list[str]:
     """By how much bodies of another origin depart; none where nothing told it."""
-    fit = calibration.fit
-    if not calibration.other_source:
+    fit, source = calibration.fit, calibration.spread.other_source
+    if not source:
         return []
     return [
         f"bodies of another origin: SD of ln d {calibration.other_sd:.3f} more (below {fit['other_sd_most']:.3f} with "
-        f"95 % probability), by {calibration.other_source}: mean absolute error {fit['other_mae_percent']:.1f} %, bias "
+        f"95 % probability), by {source}: mean absolute error {fit['other_mae_percent']:.1f} %, bias "
         f"{fit['other_bias_percent']:+.1f} %, SD of standardised errors {fit['other_standard_sd']:.2f}"
     ]
 

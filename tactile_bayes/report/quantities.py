@@ -11,7 +11,7 @@ from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.summary import Quantity, nine_digits, summarise
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.size.posterior import EXTREMES, SIZES, SizePosterior
+from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior
 
 ANOTHER_EXAM = "another_exam"
 """Prefix of the sizes' quantities if another exam of the mass may come out apart, see `SizePosterior.another_exam`."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.size.between_maps import PAPER_SPREAD
+from tactile_bayes.size.spread import PAPER_SPREAD
 
 _MOST_NAMED: Final = 5
 FEW: Final = 5

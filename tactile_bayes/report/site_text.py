@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.site_shift import SiteShift
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.terms import SiteShift
 
 
 def site_words(site: SiteShift, log_width: float | None = None) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tactile_bayes.inference.summary import Quantity, nine_digits
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.draws import SizePosterior
 
 LEAST_CHANGE = 0.02
 """Of the size, from which a pair of suppositions is worth a line."""

@@ -1,142 +1,122 @@
-"""Eq 6: diameter of a lump from the width and amplitude of its map, with uncertain coefficients."""
+r"""Eq 6, the paper's law of the diameter: d = m sigma / (e a^f) + b.
+
+Over a population it is taken in logarithms, with constants that depend on the depth of the fat. With
+:math:`u = \ln a - \alpha_0`, :math:`v = p - p_0` and :math:`w = \ln F - w_0`, p the log of the geometric mean width and
+F the depth of the fat,
+
+.. math:: d = e^{\mu + v - f u} + b, \qquad
+          \frac{m}{e} = e^{\mu - p_0 + f\alpha_0}, \quad e = a_1^{-f},
+
+where :math:`a_1` is the amplitude that lumps one diameter deep show on average, for Delta sigma is 1 there. mu and f
+are full quadratics in v and w: what Eq 6 takes for constants depends on how deep the fat is, in mm and in widths of the
+map. Without a depth of fat the three are constants.
+
+From a study or phantoms it is learned for each axis of the head, as draws of its coefficients (`SizeCalibration`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, field
-from typing import Any
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
+from tactile_bayes.declarations import Meta, Record, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.head_shape import HeadShape
-from tactile_bayes.presets import Background, Noise
-from tactile_bayes.records import dataclass
-from tactile_bayes.size import omissions
-from tactile_bayes.size.calibration_range import beyond_lumps, outside_domain, too_far
+from tactile_bayes.geometry import FloatArray, Matrix, Vector
+from tactile_bayes.inference.draws import Labels, even_replicates
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.paired import paired_points
+from tactile_bayes.size.draws import SizePosterior, shares
+from tactile_bayes.size.spread import BetweenMaps
+from tactile_bayes.size.terms import (
+    LEARN_ANEW,
+    ONE_WIDTH,
+    Above0,
+    Range,
+    Recipe,
+    Share,
+    beyond_lumps,
+    check_shapes,
+    outside_domain,
+    too_far,
+)
 
-COEFFICIENTS = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """How a table's maps were built and fitted; a patient's map must agree.
-
-    Parameters
-    ----------
-    normalise
-        As in `MapRecipe`.
-    background
-        ``"fixed"`` or ``"free"``, as in `FitOptions`.
-    radius_mm
-        Radius of the fitted window.
-    noise
-        ``"independent"`` (least squares) or ``"field"``, as in `FitOptions`.
-    declared
-        True when somebody said so for a table made elsewhere, False when the program made the maps itself.
-    flat_field
-        Whether the head's own response was taken off, as in `MapRecipe`; None where the table does not say.
-    head
-        Head that the maps were made with; None where the table does not say.
-    """
-
-    normalise: str = "mean"
-    background: Background = "fixed"
-    radius_mm: float = 20.0
-    declared: bool = True
-    noise: Noise = "independent"
-    flat_field: bool | None = None
-    head: HeadShape | None = None
-
-    def differences(
-        self,
-        *,
-        normalise: str,
-        background: str,
-        radius_mm: float,
-        noise: str,
-        flat_field: bool | None = None,
-        head: HeadShape | None = None,
-    ) -> list[str]:
-        """Differences from another recipe in words; empty without any. Unknown settings do not differ."""
-        pairs = [
-            ("normalise", self.normalise, normalise),
-            ("background", self.background, background),
-            ("fit radius", f"{self.radius_mm:g} mm", f"{radius_mm:g} mm"),
-            ("noise", self.noise, noise),
-        ]
-        if self.flat_field is not None and flat_field is not None:
-            words = {True: "on", False: "off"}
-            pairs.append(("flat field", words[self.flat_field], words[flat_field]))
-        found = [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
-        return found + self.head_differences(head)
-
-    def head_differences(self, head: HeadShape | None) -> list[str]:
-        """In what a map's head departs from the calibration's; empty where one of them is unknown."""
-        return [] if self.head is None or head is None else self.head.differences(head)
-
-    @property
-    def map_command(self) -> str:
-        """The command that makes maps of this recipe from a scan."""
-        flat_field = " --flat-field" if self.flat_field else ""
-        return f"`map --normalise {self.normalise}{flat_field}`"
-
-    def __str__(self) -> str:
-        """The recipe in one line."""
-        parts = [f"normalise {self.normalise}", f"background {self.background}", f"fit radius {self.radius_mm:g} mm"]
-        parts.append(f"noise {self.noise}")
-        if self.flat_field is not None:
-            parts.append(f"flat field {'on' if self.flat_field else 'off'}")
-        if self.head is not None:
-            parts.append(f"head {self.head}")
-        return ", ".join(parts)
-
-    def as_dict(self) -> dict[str, object]:
-        """Plain data for a calibration's file; unknown settings are left out."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any], *, head: HeadShape | None = None) -> Recipe:
-        """Undo `as_dict`; `head` is that of files of earlier versions, which do not name one.
-
-        Raises
-        ------
-        BadDataError
-            When a value cannot be that of a head.
-        """
-        named = document.get("head")
-        return cls(**{**document, "head": head if named is None else HeadShape.from_document(named)})
+MU, F, B = range(3)
+Power = tuple[Annotated[int, Meta(ge=0, le=9)], Annotated[int, Meta(ge=0, le=9)], Annotated[int, Meta(ge=0, le=9)]]
+Powers = tuple[tuple[int, int, int], ...]
+PLAIN: Final[Powers] = ((MU, 0, 0), (F, 0, 0), (B, 0, 0))
+"""Which of mu, f and b each coefficient belongs to, and its powers of v and w, where no depth of fat is known."""
+BY_DEPTH: Final[Powers] = (*((row, i, k) for row in (MU, F) for k in range(3) for i in range(3 - k)), (B, 0, 0))
+"""The same of the thirteen with the depth of fat; see docs/decisions/0093."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AxisCalibration:
+class Eq6Law(Record, eq=False):
+    """Posterior of Eq 6's coefficients over a population, taken as normal: d = exp(mu + v - f u) + b."""
+
+    powers: Annotated[
+        tuple[Power, ...],
+        Meta(description="Which of mu (0), f (1) and b (2) each coefficient is of, and its powers of v and w."),
+    ]
+    mean: Vector
+    covariance: Matrix
+    log_amplitude_one_deep: Annotated[
+        float, Meta(description="ln a of lumps one diameter deep, where Delta sigma is 1: e = exp(-f times this).")
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        k = len(self.powers)
+        check_shapes(self, mean=(k,), covariance=(k, k))
+        if any(row > B for row, _, _ in self.powers):
+            raise BadDataError("powers names more than mu, f and b", way_out=LEARN_ANEW)
+
+
+def eq6_coefficients(theta: Sequence[float] | FloatArray, powers: Powers, v: FloatArray, w: FloatArray) -> FloatArray:
+    """(3, ...) mu, f and b of maps, for coefficients in the order of `powers`."""
+    found = np.zeros((3, *np.broadcast_shapes(v.shape, w.shape)))
+    for value, (row, i, k) in zip(theta, powers, strict=True):
+        found[row] += value * v**i * w**k
+    return found
+
+
+def eq6_parts(
+    u: FloatArray, v: FloatArray, mu: FloatArray, f: FloatArray, b_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The term of Eq 6 that is proportional to sigma, and d, both (...,) in mm; d is NaN where it is not positive."""
+    stretched = np.exp(mu + v - f * u)
+    size = stretched + b_mm
+    return stretched, np.where(size > 0, size, np.nan)
+
+
+def eq6_terms(u: FloatArray, v: FloatArray, w: FloatArray, theta: FloatArray, powers: Powers) -> FloatArray:
+    """(..., k) derivatives of ln d by the coefficients; NaN where Eq 6 has no positive size."""
+    stretched, size = eq6_parts(u, v, *eq6_coefficients(theta, powers, v, w))
+    share = stretched / size
+    slopes = (share, -u * share, 1.0 / size)
+    return np.stack([slopes[row] * v**i * w**k for row, i, k in powers], axis=-1)
+
+
+def eq6_log_size(u: FloatArray, v: FloatArray, w: FloatArray, theta: FloatArray, powers: Powers) -> FloatArray:
+    """(...,) ln d, d in mm."""
+    return np.asarray(np.log(eq6_parts(u, v, *eq6_coefficients(theta, powers, v, w))[1]))
+
+
+COEFFICIENTS: Final = ("m", "b_mm", "e", "f", "scatter", "scatter_slope")
+
+
+class AxisCalibration(Record, eq=False):
     r"""Draws of Eq 6's coefficients for the widths along one axis of the head.
 
-    Parameters
-    ----------
-    draws : (n, 6) array
-        m, b (mm), e, f, scatter s and its slope g, see `COEFFICIENTS`. The residual standard deviation of ln d is
-        :math:`s\,(a / a_0)^{-g}`: fainter maps tell less.
-    reference_amplitude
-        :math:`a_0`.
-    domain
-        Ranges of ``amplitude``, ``sigma_mm`` and ``d_mm`` in the table.
-    fit
-        Figures of the fit: rows, r2, mean absolute error in percent, whether e was identified.
+    The residual standard deviation of ln d is :math:`s\,(a / a_0)^{-g}`: fainter maps tell less.
     """
 
-    draws: FloatArray
-    reference_amplitude: float
-    domain: Mapping[str, tuple[float, float]]
+    draws: Annotated[Matrix, Meta(description="m, b (mm), e, f, scatter and its slope in each row.")]
+    reference_amplitude: Annotated[Above0, Meta(description="Of the scatter.")]
+    domain: Annotated[Mapping[str, Range], Meta(description="Ranges of amplitude, sigma_mm and d_mm in the table.")]
     fit: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.draws.ndim != 2 or self.draws.shape[1] != len(COEFFICIENTS) or not len(self.draws):
-            raise BadDataError(f"draws of an axis have shape {self.draws.shape}", way_out="they must be (n, 6)")
-        others = [self.reference_amplitude, *(end for ends in self.domain.values() for end in ends)]
-        if not (np.isfinite(self.draws).all() and np.isfinite(others).all()):
-            raise BadDataError("an axis holds a number that is not finite", way_out="learn the calibration anew")
+        check_shapes(self, draws=(max(len(self.draws), 1), len(COEFFICIENTS)))
 
     def size_mm(self, sigma_mm: FloatArray, amplitude: FloatArray, *, draws: FloatArray | None = None) -> FloatArray:
         r"""Diameter by Eq 6, without residual scatter: :math:`d = m\,\sigma / (e\,a^f) + b`.
@@ -169,68 +149,39 @@ class AxisCalibration:
             ratio = np.where(amplitude > 0, amplitude, np.nan) / self.reference_amplitude
             return np.asarray(use[..., 4] * ratio ** -use[..., 5])
 
-    def outside(self, sigma_mm: float, amplitude: float) -> list[str]:
-        """Inputs outside the table's range, in words."""
-        return outside_domain(self.domain, amplitude, sigma_mm)
 
-    def too_far(self, sigma_mm: float, amplitude: float) -> list[str]:
-        """Inputs so far outside that no size is given, in words."""
-        return too_far(self.domain, amplitude, sigma_mm)
-
-
-@dataclass(frozen=True, slots=True)
-class LeftOutErrors:
+class LeftOutErrors(Record):
     """Cross-validated errors of sizes, leaving out each geometry of a study in turn.
 
-    Parameters
-    ----------
-    cases, geometries
-        How many were left out.
-    least_stiffness_ratio
-        Softer lumps took no part.
-    eq6, log_quadratic
-        Mean absolute error in d, as a share, of Eq 6 and of a quadratic of ln d in ln a and ln sigma: by the widths
-        ``"x"`` across the head, ``"y"`` along it, and ``"both"``.
+    Mean absolute errors in d as a share, of Eq 6 and of a quadratic of ln d in ln a and ln sigma: by the widths x
+    across the head, y along it, or both.
     """
 
-    cases: int
-    geometries: int
-    least_stiffness_ratio: float
-    eq6: Mapping[str, float]
-    log_quadratic: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SizeCalibration:
-    """Eq 6 for each axis of the head.
-
-    Parameters
-    ----------
-    x, y
-        Across and along the head. A table with one width calibrates both alike.
-    residual_correlation
-        Of the residuals of the two axes: a lump that looks large along one tends to look large along both.
-    recipe
-        How the table's maps were built and fitted.
-    axes
-        ``("x", "y")``, or ``("both",)`` when the table has one width only.
-    left_out
-        Errors in geometries left out, where the table was a study.
-    cautions
-        What of the table's lumps is of one kind, or unlike a patient's, in words.
-    """
-
-    x: AxisCalibration
-    y: AxisCalibration
-    residual_correlation: float
-    recipe: Recipe
-    axes: tuple[str, ...] = ("x", "y")
-    left_out: LeftOutErrors | None = None
-    cautions: tuple[str, ...] = ()
+    cases: Annotated[int, Meta(ge=1)]
+    geometries: Annotated[int, Meta(ge=1)]
+    least_stiffness_ratio: Annotated[Share, Meta(description="Softer lumps took no part.")]
+    eq6: Mapping[str, Share]
+    log_quadratic: Mapping[str, Share]
 
     def __post_init__(self) -> None:
-        if not -1.0 <= self.residual_correlation <= 1.0:
-            raise BadDataError(f"residual_correlation is {self.residual_correlation}", way_out="it must lie in -1 to 1")
+        if not {"both"} <= set(self.eq6) <= {"x", "y", "both"} or set(self.log_quadratic) != set(self.eq6):
+            raise BadDataError("left_out has errors by other widths than x, y and both", way_out=LEARN_ANEW)
+
+
+class SizeCalibration(Record, eq=False):
+    """Eq 6 for each axis of the head, from a study or phantoms: the same for all maps, whatever their fat."""
+
+    x: Annotated[AxisCalibration, Meta(description="Across the head.")]
+    y: Annotated[AxisCalibration, Meta(description="Along the head; the same where the table has one width.")]
+    residual_correlation: Annotated[
+        float, Meta(ge=-1, le=1, description="A lump that looks large along one axis tends to along the other.")
+    ]
+    recipe: Recipe
+    axes: Annotated[tuple[Literal["x", "y", "both"], ...], Meta(min_length=1, max_length=2)] = ("x", "y")
+    left_out: LeftOutErrors | None = None
+    cautions: Annotated[
+        tuple[str, ...], Meta(description="What of the table's lumps is of one kind, or unlike a patient's.")
+    ] = ()
 
     @property
     def fat_mm(self) -> None:
@@ -248,21 +199,140 @@ class SizeCalibration:
 
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
         """In what a map lies or may lie outside the tables of the two axes, in words; empty when it lies inside."""
-        by_axis = self._by_axis(self.x.outside(sigma_x_mm, amplitude), self.y.outside(sigma_y_mm, amplitude))
-        return [*self.cautions, *by_axis]
+        x, y = (
+            outside_domain(self.x.domain, amplitude, sigma_x_mm),
+            outside_domain(self.y.domain, amplitude, sigma_y_mm),
+        )
+        return [*self.cautions, *(f"x: {text}" for text in x), *(f"y: {text}" for text in y)]
 
     def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
         """Quantities of a map so far outside the tables that no size is given, in words."""
-        return self._by_axis(self.x.too_far(sigma_x_mm, amplitude), self.y.too_far(sigma_y_mm, amplitude))
+        x, y = too_far(self.x.domain, amplitude, sigma_x_mm), too_far(self.y.domain, amplitude, sigma_y_mm)
+        return [*(f"x: {text}" for text in x), *(f"y: {text}" for text in y)]
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the tables' lumps, in words; empty when it lies within."""
         return beyond_lumps(self.x.domain, largest_mm)
 
-    @staticmethod
-    def _by_axis(x: Sequence[str], y: Sequence[str]) -> list[str]:
-        return [f"x: {text}" for text in x] + [f"y: {text}" for text in y]
-
     def omissions(self) -> list[str]:
         """Sources of error that a size does not contain, in words."""
-        return [omissions.ONE_WIDTH] if self.axes == ("both",) else []
+        return [ONE_WIDTH] if self.axes == ("both",) else []
+
+
+class _Inputs(Record, eq=False):
+    amplitude: FloatArray
+    sigma_x_mm: FloatArray
+    sigma_y_mm: FloatArray
+    angle_rad: FloatArray
+
+
+def push_sizes(
+    amplitude: FloatArray,
+    sigma_x_mm: FloatArray,
+    sigma_y_mm: FloatArray,
+    angle_rad: FloatArray,
+    *,
+    calibration: SizeCalibration,
+    rng: np.random.Generator,
+    replicates: Labels | None = None,
+    another_exam: BetweenMaps | None = None,
+) -> SizePosterior:
+    """Convert each map draw by Eq 6, with a draw of its coefficients and one of its residual scatter.
+
+    Parameters
+    ----------
+    amplitude, sigma_x_mm, sigma_y_mm, angle_rad : (chain, draw) arrays
+        Joint draws: amplitude and width go together (a stronger bump is a narrower one), which must not be lost.
+    rng
+        Of the points that pair map draws with calibration draws and scatter, see `paired_points`.
+    replicates : (chain * draw,) array
+        Label of the independent replicate of each draw. Default: the draws are independent.
+    another_exam
+        Spread between exams of a mass, for `SizePosterior.another_exam`.
+
+    Notes
+    -----
+    Wellman & Howe (1999) eq. 6, once for each axis. An ellipse turned by an angle takes, along each of its own axes,
+    the two head axes' calibrations in the proportion cos^2 to sin^2.
+    """
+    shape = amplitude.shape
+    inputs = _Inputs(amplitude.ravel(), sigma_x_mm.ravel(), sigma_y_mm.ravel(), angle_rad.ravel())
+    replicates = even_replicates(amplitude.size) if replicates is None else replicates
+    key = np.maximum(*_sizes(inputs, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0)))
+    points = paired_points(key, replicates, 4, rng)
+    coefficients_x = _coefficients_at(points[:, 0], calibration.x, inputs.sigma_x_mm, inputs.amplitude)
+    coefficients_y = _coefficients_at(points[:, 1], calibration.y, inputs.sigma_y_mm, inputs.amplitude)
+    d_x, d_y = _sizes(inputs, calibration, coefficients_x, coefficients_y)
+    z = normal_quantile(points[:, 2:].T)
+    rho = calibration.residual_correlation
+    z[1] = rho * z[0] + np.sqrt(1.0 - rho**2) * z[1]
+    scattered_x = d_x * np.exp(calibration.x.scatter(inputs.amplitude, draws=coefficients_x) * z[0])
+    scattered_y = d_y * np.exp(calibration.y.scatter(inputs.amplitude, draws=coefficients_y) * z[1])
+    valid = (d_x > 0) & (d_y > 0)
+    parts = _variances(inputs, calibration, coefficients_x, coefficients_y)
+    d_x, d_y = np.where(valid, scattered_x, np.nan), np.where(valid, scattered_y, np.nan)
+    size = SizePosterior(d_x, d_y, shares(parts), int((~valid).sum()), replicates)
+    if another_exam is not None:
+        size = replace(size, another_exam=_another(size, parts, another_exam, rng))
+    return size.reshaped(shape)
+
+
+def _another(
+    size: SizePosterior, parts: Mapping[str, float], between: BetweenMaps, rng: np.random.Generator
+) -> SizePosterior:
+    """The sizes with a spread between exams beside what one exam has, a factor that both axes share."""
+    points = paired_points(size.max_size_mm, size.replicates, 2, rng)
+    tau = between.at(points[:, 0], np.zeros(1), np.zeros(1))
+    factor = np.exp(tau * normal_quantile(points[:, 1]))
+    return replace(
+        size,
+        d_x_mm=size.d_x_mm * factor,
+        d_y_mm=size.d_y_mm * factor,
+        variance_share=shares({**parts, "between_maps": float(np.mean(tau**2))}),
+        figures={"between_map_sd": float(np.sqrt(np.mean(tau**2)))},
+    )
+
+
+def _coefficients_at(
+    points: FloatArray, axis: AxisCalibration, sigma_mm: FloatArray, amplitude: FloatArray
+) -> FloatArray:
+    """(n, 6) draws of the coefficients at uniform points, ordered by the size that they give a median map."""
+    middle = np.full(len(axis.draws), np.nanmedian(sigma_mm)), np.full(len(axis.draws), np.nanmedian(amplitude))
+    in_order = axis.draws[np.argsort(axis.size_mm(*middle, draws=axis.draws), kind="stable")]
+    return np.asarray(in_order[(points * len(in_order)).astype(np.intp)])
+
+
+def _sizes(
+    inputs: _Inputs, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Diameters along the ellipse's own axes, without scatter."""
+    along = np.cos(inputs.angle_rad) ** 2
+
+    def blend(sigma: FloatArray, share_x: FloatArray) -> FloatArray:
+        across = calibration.x.size_mm(sigma, inputs.amplitude, draws=coefficients_x)
+        along_head = calibration.y.size_mm(sigma, inputs.amplitude, draws=coefficients_y)
+        return share_x * across + (1.0 - share_x) * along_head
+
+    return blend(inputs.sigma_x_mm, along), blend(inputs.sigma_y_mm, 1.0 - along)
+
+
+def _variances(
+    inputs: _Inputs, calibration: SizeCalibration, coefficients_x: FloatArray, coefficients_y: FloatArray
+) -> dict[str, float]:
+    """Variance of ln(max size) with all but one source held at its centre."""
+    middle = _Inputs(*(np.full(1, np.median(values)) for values in (
+        inputs.amplitude, inputs.sigma_x_mm, inputs.sigma_y_mm, inputs.angle_rad
+    )))  # fmt: skip
+    by_map = _sizes(inputs, calibration, calibration.x.draws.mean(axis=0), calibration.y.draws.mean(axis=0))
+    by_coefficients = _sizes(middle, calibration, coefficients_x, coefficients_y)
+    larger: AxisCalibration = calibration.x if np.nanmedian(by_map[0] - by_map[1]) >= 0 else calibration.y
+    return {
+        "map": _log_variance(np.maximum(*by_map)),
+        "calibration": _log_variance(np.maximum(*by_coefficients)),
+        "residual": float(larger.scatter(middle.amplitude)[0] ** 2),
+    }
+
+
+def _log_variance(size_mm: FloatArray) -> float:
+    valid = size_mm[size_mm > 0]
+    return float(np.var(np.log(valid))) if len(valid) > 1 else 0.0

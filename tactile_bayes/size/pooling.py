@@ -1,4 +1,4 @@
-r"""Sizes from the maps of one mass, one or several, through a calibration over a population.
+r"""Sizes from the maps of one mass, one or several.
 
 Map i gives :math:`g_i`, the log size by the calibration's form, with its own noise. Maps of one mass differ by
 more than that: :math:`g_i = \ln d - B + E_i`, with :math:`E_i \sim N(0, \tau^2)` between maps. tau is learned from the
@@ -10,26 +10,34 @@ common to all maps of a mass and does not average out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from typing import assert_never
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels
 from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.inference.paired import evened, paired_points
-from tactile_bayes.records import dataclass
-from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.calibration_range import extrapolated
-from tactile_bayes.size.elongation import OVAL_SD, ShapePrior
-from tactile_bayes.size.map_sizes import log_sizes, lump_shape, map_terms
-from tactile_bayes.size.one_size import LEAST_PROBABILITY, one_size_probability, spread_tested
-from tactile_bayes.size.posterior import SizePosterior, shares
-from tactile_bayes.size.shape_draws import ShapeDraws, matched_draws
-from tactile_bayes.size.site_shift import site_variance
-from tactile_bayes.size.supposed import known_body, suppositions
+from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
+from tactile_bayes.size.draws import (
+    OVAL_SD,
+    Elongation,
+    ShapeDraws,
+    ShapePrior,
+    SizePosterior,
+    elongation,
+    matched_draws,
+    shares,
+    shown_share,
+    turn_matrix,
+)
+from tactile_bayes.size.eq6 import SizeCalibration, push_sizes
+from tactile_bayes.size.spread import LEAST_PROBABILITY, BetweenMaps, one_size_probability, outlying_maps, spread_tested
+from tactile_bayes.size.terms import extrapolated
 
+Calibration = SizeCalibration | BodyCalibration
+"""One learned from a study or phantoms, or over a population: whoever uses it needs to know no more."""
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
 """Of the points: ln d given all else, tau, the spread of B, oval or round, and the two components of an oval."""
@@ -42,8 +50,7 @@ IRREGULAR_SD = 0.15
 """SD of ln d by which the mean diameter of a lump with an irregular outline is off (record 0107)."""
 
 
-@dataclass(frozen=True, slots=True)
-class SizePriors:
+class SizePriors(Record):
     """Assumptions about a mass's size besides the calibration.
 
     Parameters
@@ -70,6 +77,101 @@ class SizePriors:
     def spread_of_others(self) -> BetweenMaps:
         """The prior from which maps teach the spread that a further one is held against."""
         return self.another_exam or self.learned_between_maps or BetweenMaps()
+
+
+def draw_sizes(
+    amplitude: FloatArray,
+    sigma_x_mm: FloatArray,
+    sigma_y_mm: FloatArray,
+    angle_rad: FloatArray,
+    *,
+    calibration: Calibration,
+    priors: SizePriors,
+    replicates: Labels | None,
+    rng: np.random.Generator,
+    oblique: tuple[float, float] | None = None,
+    irregular: bool = False,
+) -> SizePosterior:
+    """Draw sizes from the joint draws of one map.
+
+    Parameters
+    ----------
+    amplitude, sigma_x_mm, sigma_y_mm, angle_rad : (chain, draw) arrays
+        Of Eq 7.
+    priors
+        Spread between maps, shape of the lump, known properties of the body. Eq 6 uses the spread, for the interval
+        of another exam, and nothing else.
+    replicates : (chain * draw,) array
+        As `ParameterDraws.replicates`.
+    oblique, irregular
+        As `MapPosterior`'s; Eq 6 does not use them.
+    """
+    match calibration:
+        case BodyCalibration():
+            one = ShapeDraws.of(
+                amplitude,
+                sigma_x_mm,
+                sigma_y_mm,
+                angle_rad,
+                labels=replicates,
+                oblique=oblique,
+                irregular=irregular,
+            )
+            return pooled_size([one], calibration=calibration, priors=priors, rng=rng).reshaped(amplitude.shape)
+        case SizeCalibration():
+            return push_sizes(
+                amplitude,
+                sigma_x_mm,
+                sigma_y_mm,
+                angle_rad,
+                calibration=calibration,
+                rng=rng,
+                replicates=replicates,
+                another_exam=priors.another_exam or priors.between_maps,
+            )
+    assert_never(calibration)
+
+
+def log_sizes(calibration: BodyCalibration, maps: Sequence[ShapeDraws]) -> list[FloatArray]:
+    """(n,) ln d of each map's draws without B and E, with the site's correction where there is one."""
+    return [calibration.corrected_log_size(one.log_amplitude, one.log_width) for one in maps]
+
+
+def map_terms(calibration: BodyCalibration, maps: Sequence[ShapeDraws]) -> FloatArray:
+    """(k, n, t) terms of each map's draws."""
+    return np.stack([calibration.terms(one.log_amplitude, one.log_width) for one in maps])
+
+
+def lump_shape(
+    calibration: BodyCalibration, maps: Sequence[ShapeDraws], sizes: Sequence[FloatArray], prior: ShapePrior
+) -> tuple[Elongation, float]:
+    """Posterior of the lump's shape in the axes the maps share, and the share of it that they show."""
+    excess, covariance, shown = np.zeros(2), np.zeros((2, 2)), 0.0
+    k = len(maps)
+    for one, size in zip(maps, sizes, strict=True):
+        mean, spread = _axis_ratio(one)
+        mean[0] -= float(np.nanmean(calibration.round_excess(one.log_amplitude, one.log_width)))
+        turn = turn_matrix(-one.turn_rad)
+        excess += mean @ turn / k
+        covariance += turn.T @ spread @ turn / k**2
+        shown += shown_share(size, one.log_width) / k
+    balls = calibration.round_lumps
+    whole = balls.map_factor * covariance + (balls.variance(np.zeros(()), maps=k) + 1e-12) * np.eye(2)
+    return elongation(excess, whole, shown=shown, prior=prior), shown
+
+
+def _axis_ratio(one: ShapeDraws) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of q and r; where nobody measured r, it is within twice the SD of q about 0.
+
+    It was left out because the map does not speak for it.
+    """
+    both = np.stack([one.q, one.r], axis=-1)
+    both = both[np.isfinite(both).all(axis=1)]
+    mean, covariance = both.mean(axis=0), np.cov(both.T)
+    if not covariance[1, 1] > 0:
+        mean[1], sd = one.oblique or (0.0, 2.0 * float(np.sqrt(covariance[0, 0])))
+        covariance[1, 1] = sd**2
+    return mean, covariance
 
 
 def pooled_size(
@@ -144,8 +246,7 @@ def pooled_size(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pool:
+class _Pool(Record, eq=False):
     """Draws of the k maps of a mass, before a spread between maps is added.
 
     Parameters
@@ -224,7 +325,7 @@ class _Pool:
         else:
             body_sd, error = self.of_body
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
-        other_sd = self.calibration.other_sd
+        other_sd, site = self.calibration.other_sd, self.calibration.site
         own_sd = self.calibration.own_sd(body_sd)
         left = known_body(self.calibration, self.known, middle_a, middle_width, own_sd)
         return (
@@ -233,7 +334,7 @@ class _Pool:
                 "between_maps": np.sum(weight**2, axis=0) * tau**2,
                 "calibration": error,
                 "body": left.variance + other_sd**2 + self.form_sd**2,
-                **site_variance(self.calibration.site, middle_width),
+                **({} if site is None else {"site": site.variance(middle_width)}),
             },
         )
 
@@ -248,8 +349,7 @@ class _Pool:
         return largest, smallest
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PooledEstimate:
+class PooledEstimate(Record, eq=False):
     """Result of pooling the maps of one mass.
 
     Parameters

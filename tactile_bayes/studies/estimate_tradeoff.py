@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES
-from tactile_bayes.size.calibration import Calibration
+from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.studies.cost_ladder import Clock, Ladder, Reference, Run, Work, climbed, default_run
 from tactile_bayes.studies.size_answers import SizeAnswer, answer_of
 

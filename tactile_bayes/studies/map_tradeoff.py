@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.tactile_map import TactileMap
@@ -13,7 +14,7 @@ from tactile_bayes.mapping.thinning import first_seconds
 from tactile_bayes.posterior.options import EstimateOptions
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE
 from tactile_bayes.scan import Scan
-from tactile_bayes.size.calibration import Calibration
+from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.studies.cost_ladder import Ladder, Reference, Run, Work, climbed, default_run
 from tactile_bayes.studies.estimate_tradeoff import Estimator
 from tactile_bayes.studies.size_answers import SizeAnswer

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.population import BodyPrior
 from tactile_bayes.forward.scene import FLAT_MM, Head, Scene
@@ -19,9 +20,9 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
 from tactile_bayes.scan import Scan
-from tactile_bayes.size.hidden import LOGGED
+from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.learn.regression import PopulationTable
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.terms import LOGGED
 
 UNKNOWNS = ("depth_mm", "stiffness_ratio", "seat", "fat_kpa", "gland_ratio", "thickness_mm")
 SHAPE_COVARIANCE = ("var_log_a", "cov_log_a_p", "cov_log_a_q", "var_p", "cov_p_q", "var_q")

@@ -46,10 +46,9 @@ from tactile_bayes.posterior.lump.posterior import MapPosterior
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.white.fit import WIDEST_IN_RADII
 from tactile_bayes.presets import Method
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.elongation import ShapePrior
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.size.shape_draws import ShapeDraws
 
 HALF_MM = 25.0
 CELL_MM = 1.0

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_bayes.forward.plane.study import StudyRow, learn_as_printed
-from tactile_bayes.size.body_calibration import BodyCalibration, mean_width_mm
-from tactile_bayes.size.calibration import Calibration
+from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.eq6 import SizeCalibration
-from tactile_bayes.size.site_shift import site_log_shift
+from tactile_bayes.size.pooling import Calibration
+from tactile_bayes.size.terms import outside_domain
 from tactile_bayes.studies.forward_tradeoff import Measured
 
 Sizes = Callable[[float, float, float | None], list[float]]
@@ -92,8 +92,8 @@ def _eq6_rule(calibration: SizeCalibration, name: str) -> SizeRule:
         return found
 
     def outside(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[str]:
-        along = [] if sigma_y_mm is None else calibration.y.outside(sigma_y_mm, amplitude)
-        return list(dict.fromkeys([*calibration.x.outside(sigma_x_mm, amplitude), *along]))
+        along = [] if sigma_y_mm is None else outside_domain(calibration.y.domain, amplitude, sigma_y_mm)
+        return list(dict.fromkeys([*outside_domain(calibration.x.domain, amplitude, sigma_x_mm), *along]))
 
     return SizeRule(sizes, float(calibration.x.draws.mean(axis=0)[4]), f"Eq 6 of {name}", outside)
 
@@ -110,7 +110,7 @@ def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
     def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
         width = mean_width_mm(sigma_x_mm, sigma_y_mm)
         log_a, log_width = np.log(np.array(amplitude)), np.log(np.array(width))
-        return [float(np.exp(calibration.log_size(log_a, log_width) + site_log_shift(calibration.site, log_width)))]
+        return [float(np.exp(calibration.corrected_log_size(log_a, log_width)))]
 
-    scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.mean[-3])))
+    scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
     return SizeRule(sizes, float(scatter), f"{calibration.form_name} of {name}", calibration.outside)

@@ -15,7 +15,7 @@ import tactile_bayes
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.pipeline.size_calibration import table_recipe
-from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.terms import Recipe
 
 Run = Callable[..., "CompletedProcess[str]"]
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"

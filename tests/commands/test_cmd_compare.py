@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -15,6 +14,7 @@ from settings_files import settings
 
 import tactile_bayes as tb
 from tactile_bayes.commands.visits_command import numbered
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
@@ -24,7 +24,7 @@ from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare_document import verdict
 from tactile_bayes.report.compare_text import _signed, compare_summary
-from tactile_bayes.size.change import Change
+from tactile_bayes.size.visits import Change
 
 FAST = ("--method", "laplace")
 MASS = (-70.0, 80.0)

@@ -15,7 +15,7 @@ import tactile_bayes as tb
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.bodies import BodyCalibration
 
 DEMO = Path(tb.__file__).parent / "demo"
 RECIPE = {"normalise": "gain", "background": "free", "fit_radius_mm": 20, "noise": "field"}

@@ -17,7 +17,7 @@ from posterior_files import write_calibration, write_maps
 from settings_files import settings
 
 from tactile_bayes.files.schema import check_document, load_schema
-from tactile_bayes.size.eq6 import Recipe
+from tactile_bayes.size.terms import Recipe
 
 Run = Callable[..., "CompletedProcess[str]"]
 FAST = ("--method", "laplace")

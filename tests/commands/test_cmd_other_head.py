@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -16,6 +15,7 @@ from posterior_files import MADE
 from posterior_maps import bump_map
 
 from tactile_bayes.commands import population
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.size_json import read_size_calibration

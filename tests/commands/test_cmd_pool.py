@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from posterior_files import MADE, write_calibration, write_maps
 from posterior_maps import bump_map, correlated_field, grid_map
 from settings_files import settings
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.schema import check_document
 from tactile_bayes.files.shipped import SHIPPED, size_calibration_path

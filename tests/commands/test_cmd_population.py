@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,12 @@ from in_process import run_here
 
 import tactile_bayes
 from tactile_bayes.commands import population
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.population import BodyPrior, centred, draw_mass
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.studies.population import MassRow, head_columns, measure_mass
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,6 +13,7 @@ from in_process import run_here
 from repeated_exams import write_repeats
 
 from tactile_bayes.commands import report as command
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.report import printed

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.arrays_npz import read_arrays
 from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
@@ -35,8 +35,8 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.scan import ElementCalibration, Scan
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.fat_depth import head_profile
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.fat import head_profile
 
 TRUE_FAT_MM = {"s01": 15.0, "s03": 20.0, "s05": 12.0, "s07": 12.0, "s11": 24.0}
 """By truth.csv: depth of the centre where centred; a tenth of a diameter below the ball where resting."""

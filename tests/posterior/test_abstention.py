@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from posterior_maps import bump_map, bump_values, grid_map
 
 from tactile_bayes.abstention import CODES, NO_LUMP
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.posterior import estimate, search
 from tactile_bayes.posterior.abstention import extend_advice, missing_strokes, no_bump, shape_fault

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from posterior_maps import TRUTH, bump_map, correlated_field, grid_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import estimate_map
@@ -16,7 +15,8 @@ from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.report.estimate_document import estimate_document
 from tactile_bayes.report.estimate_text import estimate_text
-from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+from tactile_bayes.size.terms import Recipe
 
 SIZE = 51
 NOISE = 0.02

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+from tactile_bayes.size.terms import Recipe
 
 FIELD = EstimateOptions(method="importance", fit=FitOptions(background="free", noise="field"))
 

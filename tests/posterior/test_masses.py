@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from posterior_maps import bump_values, correlated_field, grid_map
 
 import tactile_bayes as tb
 from tactile_bayes.api.estimates import SizeEstimate
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document
@@ -27,7 +27,7 @@ from tactile_bayes.posterior.masses import by_evidence, with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
 from tactile_bayes.posterior.white.detection import Detection
-from tactile_bayes.size.posterior import SizePosterior
+from tactile_bayes.size.draws import SizePosterior
 
 WIDE, NARROW = (-17.0, 2.0), (16.0, 2.0)
 

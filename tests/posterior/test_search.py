@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from posterior_maps import bump_map, bump_values, grid_map
 from scipy.ndimage import gaussian_filter
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior import search
 from tactile_bayes.posterior.estimate import estimate_map

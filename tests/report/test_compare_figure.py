@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from posterior_maps import bump_values, grid_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import rigid
 from tactile_bayes.report.compare_figure import DrawnMap, draw_comparison
-from tactile_bayes.size.comparison import Compared
+from tactile_bayes.size.visits import Compared
 
 PLACE = np.array([60.0, 90.0])
 BESIDE = np.array([12.0, 6.0])

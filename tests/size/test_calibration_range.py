@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +12,16 @@ from posterior_files import MADE
 from posterior_maps import bump_map
 
 from tactile_bayes.commands.live_view import Turn, live_estimate
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.size.body_calibration import BodyCalibration
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.pooling import SizePriors, pool_maps
-from tactile_bayes.size.shape_draws import ShapeDraws
 
 SHIPPED = size_calibration_path("solid")
 EVEN = (0.0, 0.0, 0.0)

@@ -5,24 +5,30 @@ Reference values are the closed form of a linear model with normal errors.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from plain_calibration import plain_calibration
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.change import JointSizes, joint_sizes, visit_calibrations
-from tactile_bayes.size.elongation import ShapePrior
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.size.shape_draws import ShapeDraws
-from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, STRANGERS, SharedBody
-from tactile_bayes.size.site_shift import SiteShift
-from tactile_bayes.size.trend import doubling_days, straight_line
+from tactile_bayes.size.spread import BetweenMaps
+from tactile_bayes.size.terms import SiteShift
+from tactile_bayes.size.visits import (
+    SHARED_BODY,
+    SHARED_WITHOUT_DEPTH,
+    STRANGERS,
+    JointSizes,
+    SharedBody,
+    doubling_days,
+    joint_sizes,
+    straight_line,
+    visit_calibrations,
+)
 
 BODY_SD, EXAM_SD, NOISE = 0.08, 0.02, 0.01
 ROUND = SizePriors(shape=ShapePrior(oval_probability=1e-9), another_exam=None)

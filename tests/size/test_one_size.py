@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.one_size import (
-    EXAM_SD,
-    LEAST_PROBABILITY,
-    one_place_probability,
-    one_size_probability,
-    spread_tested,
-)
-from tactile_bayes.size.same_mass import Place, apart
+from tactile_bayes.size.spread import EXAM_SD, LEAST_PROBABILITY, BetweenMaps, one_size_probability, spread_tested
+from tactile_bayes.size.visits import Place, apart, one_place_probability
 
 KNOWN = BetweenMaps(EXAM_SD, 0.0)
 NOISE = np.array([0.03, 0.02]) ** 2

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from plain_calibration import plain_calibration
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
-from tactile_bayes.size.between_maps import BetweenMaps, outlying_maps
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.elongation import (
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import (
     OVAL_SD,
     SHOWN,
     SHOWN_CV,
     SHOWN_POWER,
+    ShapeDraws,
     ShapePrior,
     elongation,
     shown_share,
     turn_matrix,
 )
-from tactile_bayes.size.hidden import HiddenTerms
 from tactile_bayes.size.pooling import IRREGULAR_SD, SizePriors, pool_maps, pooled_size
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.spread import BetweenMaps, outlying_maps
+from tactile_bayes.size.terms import HiddenTerms
 
 BODY_SD = 0.08
 
@@ -273,11 +272,12 @@ def test_what_is_known_of_the_body_is_used_and_what_the_calibration_does_not_kno
     left = 1 - 0.024**2 / 0.12 / BODY_SD**2
     assert known.std() == pytest.approx(np.hypot(BODY_SD * np.sqrt(left), 0.01), rel=0.04)
     # where bodies differ twice as much, what is known of one tells twice as much of its size
-    wide = replace(use, mean=use.mean + np.log(2.0) * (np.arange(len(use.mean)) == use.coefficients))
+    twice = replace(use.spread, mean=use.spread.mean + np.log([2.0, *np.ones(len(use.spread.mean) - 1)]))
+    wide = replace(use, spread=twice)
     known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=wide).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(2 * 0.6 * 0.2, abs=0.008)
     # and nothing of bodies of another kind
-    other = replace(use, other_sd=0.1)
+    other = use.with_other_sd(0.1)
     known, unknown = (np.log(pooled([shape(2.7)], priors=p, use=other).max_size_mm) for p in (centred, as_ball))
     assert known.mean() - unknown.mean() == pytest.approx(0.6 * 0.2, abs=0.006)
     assert known.std() == pytest.approx(np.sqrt(BODY_SD**2 * left + 0.01**2 + 0.1**2), rel=0.04)

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.files.size_population_json import write_population
-from tactile_bayes.head_shape import DEFAULT_HEAD
-from tactile_bayes.size.body_calibration import UNLIKE_SD, BodyCalibration
-from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.learn.left_out import learn_other_sd, sized
-from tactile_bayes.size.learn.population import learn_population
+from tactile_bayes.files.size_json import read_size_calibration, write_size_calibration
+from tactile_bayes.size.bodies import UNLIKE_SD, BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.learn.bodies import learn_other_sd, learn_population, sized
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.terms import Recipe
 
 RECIPE = Recipe("gain", "free", 20.0, False, "field", False)
 M, B_MM, E, F = 3.3, -1.5, 0.62, -0.3
@@ -85,7 +82,7 @@ def test_the_constants_of_the_paper_are_found(plain) -> None:
     assert found["b_mm"] == pytest.approx(B_MM, abs=0.8)
     assert found["m"] / found["e"] == pytest.approx(M / E, rel=0.08)
     assert found["e"] == pytest.approx(E, rel=0.1)
-    sd = np.sqrt(np.diag(plain.covariance))
+    sd = np.sqrt(np.diag(plain.eq6.covariance))
     assert sd[1] < 0.02
     assert sd[2] < 0.8
 
@@ -165,7 +162,7 @@ def test_lumps_of_another_origin_tell_how_far_such_sizes_are_off(learned, more: 
     assert found.other_sd == pytest.approx(more, abs=0.05)
     assert found.other_sd <= found.fit["other_sd_most"] < more + 0.12
     assert found.fit["other_standard_sd"] == pytest.approx(1.0, abs=0.15)
-    assert found.other_source == "others"
+    assert found.spread.other_source == "others"
 
 
 def test_a_profile_unlike_the_tables_leaves_room_for_another_kind_of_body(learned) -> None:
@@ -199,10 +196,11 @@ def test_terms_are_derivatives_by_the_coefficients(learned) -> None:
     a, p = np.log([0.15, 0.5]), np.log([3.0, 6.0])
     for one in (learned, learned.at_fat([profile(0.4)])):
         terms = one.terms(a, p)
-        for i in range(one.coefficients):
-            step = np.zeros(len(one.mean))
-            step[i] = 1e-5
-            high, low = (replace(one, mean=one.mean + sign * step).log_size(a, p) for sign in (1, -1))
+        mean = one.eq6.mean
+        for i in range(len(mean)):
+            step = 1e-5 * (np.arange(len(mean)) == i)
+            moved = (replace(one, eq6=replace(one.eq6, mean=mean + sign * step)) for sign in (1, -1))
+            high, low = (other.log_size(a, p) for other in moved)
             np.testing.assert_allclose(terms[:, i], (high - low) / 2e-5, rtol=1e-5, atol=1e-9)
         slope = (one.log_size(a, p + 1e-5) - one.log_size(a, p - 1e-5)) / 2e-5
         np.testing.assert_allclose(one.width_slope(a, p), slope, rtol=1e-6)
@@ -226,13 +224,12 @@ def coverage(calibration: BodyCalibration, *, shrink: float = 1.0) -> float:
     new, held = table(60, seed=9), 0
     for i in range(0, len(new), 2):
         at = calibration.at_fat([tuple(new.profile[i])])
-        mean = at.mean.copy()
-        mean[at.coefficients] += np.log(shrink)
+        mean = at.spread.mean.copy()
+        mean[0] += np.log(shrink)
+        narrow = replace(at, spread=replace(at.spread, mean=mean))
         shape = (np.full(128, one[i]) for one in (new.log_amplitude, new.log_width, new.half_log_ratio))
         draws = ShapeDraws(*shape, np.zeros(128))
-        size = pooled_size(
-            [draws], calibration=replace(at, mean=mean), priors=SizePriors(), rng=np.random.default_rng(i)
-        )
+        size = pooled_size([draws], calibration=narrow, priors=SizePriors(), rng=np.random.default_rng(i))
         low, high = np.quantile(0.5 * (np.log(size.d_x_mm) + np.log(size.d_y_mm)), [0.05, 0.95])
         held += low <= np.log(new.d_mm[i]) <= high
     return held / 60
@@ -269,7 +266,8 @@ def test_a_map_beyond_the_table_is_told(learned, amplitude, sigma, words) -> Non
 
 
 def test_a_negative_size_is_none(learned) -> None:
-    low = replace(learned, mean=np.where(np.arange(len(learned.mean)) == 12, -50.0, learned.mean))
+    mean = np.where(np.arange(13) == 12, -50.0, learned.eq6.mean)
+    low = replace(learned, eq6=replace(learned.eq6, mean=mean))
     assert np.isnan(low.log_size(np.array(-1.0), np.array(1.0)))
 
 
@@ -282,15 +280,15 @@ def test_a_table_without_depths_has_e_one_by_convention() -> None:
 
 def test_a_file_holds_what_was_learned(learned, tmp_path: Path) -> None:
     path = tmp_path / "eq6.json"
-    write_population(path, learned, provenance=Provenance("calibrate size", {}, {}))
+    write_size_calibration(path, learned, provenance=Provenance("calibrate size", {}, {}))
     back = read_size_calibration(path)
     assert isinstance(back, BodyCalibration)
     assert back.constants() == pytest.approx(learned.constants(), rel=1e-7)
     one, other = back.at_fat([profile(0.3)]), learned.at_fat([profile(0.3)])
-    np.testing.assert_allclose(one.mean, other.mean, rtol=1e-7)
+    np.testing.assert_allclose(one.eq6.mean, other.eq6.mean, rtol=1e-7)
+    np.testing.assert_allclose(one.spread.mean, other.spread.mean, rtol=1e-7)
     assert one.unknowns == pytest.approx(other.unknowns, rel=1e-6)
-    # a file without a head is of a version that knew the paper's only
-    assert back.recipe == replace(learned.recipe, head=DEFAULT_HEAD)
+    assert back.recipe == learned.recipe
 
 
 @pytest.mark.parametrize(
@@ -299,13 +297,13 @@ def test_a_file_holds_what_was_learned(learned, tmp_path: Path) -> None:
         ({"eq6": {"powers": [], "mean": [0.0] * 5, "covariance": [], "log_amplitude_one_deep": 0.0}}, "mean"),
         ({"most_leverage": 0}, "most_leverage"),
         ({"surplus": 1}, "surplus"),
-        ({"depth": None}, "mean is no finite array"),
-        ({"form": "eq7"}, "size_calibration.schema.json"),
+        ({"depth": None}, "depth is missing"),
+        ({"form": "eq7"}, "form is 'eq7'; give one of eq6, population, site"),
     ],
 )
 def test_a_broken_file_is_refused(learned, tmp_path: Path, change, words) -> None:
     path = tmp_path / "eq6.json"
-    write_population(path, learned, provenance=Provenance("calibrate size", {}, {}))
+    write_size_calibration(path, learned, provenance=Provenance("calibrate size", {}, {}))
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(BadDataError, match=words):
         read_size_calibration(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.size.same_mass import LEAST_PROBABILITY, Place, apart, contradictions
+from tactile_bayes.size.visits import LEAST_SAME, Place, apart, contradictions
 
 
 def place(x: float, y: float, sd: float = 0.1) -> Place:
@@ -25,7 +25,7 @@ def test_one_mass_is_refused_as_seldom_as_stated_and_another_nearly_always():
     rng = np.random.default_rng(3)
     shifts = rng.normal(0.0, 5.0, (4000, 2))
     refused = np.mean([apart(place(0, 0, 1e-3), place(*s, 1e-3), registration_mm=5.0).doubtful for s in shifts])
-    assert refused == pytest.approx(LEAST_PROBABILITY, abs=0.007)
+    assert refused == pytest.approx(LEAST_SAME, abs=0.007)
     others = 40.0 * np.array([[np.cos(a), np.sin(a)] for a in rng.uniform(0, 6.28, 200)]) + shifts[:200]
     assert np.mean([apart(place(0, 0), place(*s), registration_mm=5.0).doubtful for s in others]) > 0.98
     # the control: a registration that is believed to be better than it is refuses one mass often

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 import tactile_bayes as tb
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.size.between_maps import BetweenMaps
+from tactile_bayes.size.draws import SIZES
 from tactile_bayes.size.pooling import SizePriors
-from tactile_bayes.size.posterior import SIZES
-from tactile_bayes.size.repeatability import Repeatability, size_alone
+from tactile_bayes.size.site import Repeatability, size_alone
+from tactile_bayes.size.spread import BetweenMaps
 
 SITE = Repeatability(0.1, 0.15, 0.098, 0.07, 0.13, masses=12, maps=36)
 

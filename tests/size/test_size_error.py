@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from posterior_maps import bump_map
 from scipy.special import ndtr
 from test_pooling import BODY_SD, calibration, shape
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.inference.draws import ParameterDraws, even_replicates
 from tactile_bayes.inference.normal import normal_cdf
@@ -22,11 +22,11 @@ from tactile_bayes.inference.summary import Quantity, summarise
 from tactile_bayes.posterior import drawn
 from tactile_bayes.posterior.assessment import MapDraws
 from tactile_bayes.posterior.options import EstimateOptions
-from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
-from tactile_bayes.size.posterior import push_sizes
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.spread import BetweenMaps
+from tactile_bayes.size.terms import Recipe
 
 SEEDS = 24
 PROBABILITY = 0.95

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
-from tactile_bayes.size.posterior import SizePosterior, push_sizes
+from tactile_bayes.size.draws import SizePosterior
+from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
+from tactile_bayes.size.terms import Recipe, outside_domain
 
 N = 40_000
 DOMAIN = {"amplitude": (0.05, 0.8), "sigma_mm": (2.0, 9.0), "d_mm": (5.0, 25.0)}
@@ -130,8 +129,8 @@ def test_draws_without_a_size_are_counted_and_empty() -> None:
 
 
 def test_outside_the_table_is_said_with_its_range() -> None:
-    assert X.outside(5.0, 0.3) == []
-    assert X.outside(12.0, 0.9) == ["amplitude 0.9 (table: 0.05 to 0.8)", "sigma 12 mm (table: 2 to 9 mm)"]
+    assert outside_domain(DOMAIN, 0.3, 5.0) == []
+    assert outside_domain(DOMAIN, 0.9, 12.0) == ["amplitude 0.9 (table: 0.05 to 0.8)", "sigma 12 mm (table: 2 to 9 mm)"]
 
 
 @pytest.mark.parametrize(
@@ -157,8 +156,6 @@ def test_a_table_or_a_map_that_does_not_say_differs_from_none() -> None:
     assert Recipe(flat_field=True).differences(**same, flat_field=None) == []
 
 
-def test_shapes_and_ranges_are_checked() -> None:
-    with pytest.raises(BadDataError, match="shape"):
+def test_shapes_are_checked() -> None:
+    with pytest.raises(BadDataError, match="draws has 3x4 numbers for 3x6 finite ones"):
         AxisCalibration(np.zeros((3, 4)), 0.3, DOMAIN)
-    with pytest.raises(BadDataError, match="residual_correlation"):
-        replace(calibration(), residual_correlation=1.5)

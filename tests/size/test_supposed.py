@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from test_pooling import BODY_SD, calibration, pooled, shape
 
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.hidden import HiddenTerms
+from tactile_bayes.declarations import replace
+from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import SizePriors
+from tactile_bayes.size.terms import HiddenTerms
 
 
 def knowing(*, inverted: tuple[str, ...] = ()) -> BodyCalibration:

@@ -8,7 +8,6 @@ import math
 import re
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, correlated_field, grid_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.schema import check_document
@@ -29,8 +29,9 @@ from tactile_bayes.report.ladder_advice import advice
 from tactile_bayes.report.ladder_document import ladder_document
 from tactile_bayes.report.ladder_figure import draw_ladder
 from tactile_bayes.report.ladder_text import ladder_text
-from tactile_bayes.size.calibration import Calibration
-from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+from tactile_bayes.size.pooling import Calibration
+from tactile_bayes.size.terms import Recipe
 from tactile_bayes.studies import estimate_tradeoff as study
 from tactile_bayes.studies.cost_ladder import Ladder, PooledRow, Priced, Reference, Work, priced
 from tactile_bayes.studies.estimate_tradeoff import Estimator, measure

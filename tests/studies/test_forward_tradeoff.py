@@ -24,11 +24,10 @@ from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document, tradeoff_text
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.elongation import ShapePrior
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.size.shape_draws import ShapeDraws
 from tactile_bayes.studies.forward_tradeoff import (
     EMPIRICAL,
     PLANE,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from tactile_bayes.commands.sbc import _shipped
+from tactile_bayes.declarations import replace
 from tactile_bayes.inference.rank_tests import (
     BAND,
     RankTest,

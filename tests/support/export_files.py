@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from subprocess import CompletedProcess
 
@@ -11,6 +10,7 @@ from in_process import run_here
 from posterior_files import write_calibration
 from posterior_maps import bump_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.eq6 import Recipe
-from tactile_bayes.size.hidden import HiddenTerms, RoundLumps, RoundSpread
+from tactile_bayes.size.bodies import QUADRATIC, BodyCalibration, Centre, Spread
+from tactile_bayes.size.eq6 import PLAIN, Eq6Law
+from tactile_bayes.size.terms import HiddenTerms, Recipe, RoundLumps
 
-CENTRE = (-1.0, 1.5, 0.0)
+CENTRE = Centre(-1.0, 1.5)
 
 
 def plain_calibration(
@@ -22,9 +22,12 @@ def plain_calibration(
     """Coefficients known to 1e-3; the variance of f, the slope by ln a, may be larger."""
     return BodyCalibration(
         centre=CENTRE,
-        mean=np.array([2.5, -0.3, 0.0, np.log(body_sd), 0.0, 0.0, 0.0, 0.0, 0.0, np.log(exam_sd)]),
-        covariance=np.diag([1e-6, amplitude_variance, *np.full(8, 1e-6)]),
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), RoundSpread(0.02, 0.01)),
+        eq6=Eq6Law(PLAIN, np.array([2.5, -0.3, 0.0]), np.diag([1e-6, amplitude_variance, 1e-6])),
+        spread=Spread(
+            QUADRATIC[:6], np.array([np.log(body_sd), *np.zeros(5)]), np.eye(6) * 1e-6, float(np.log(exam_sd)), 1e-6
+        ),
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.02, 0.01),
+        feature_powers=QUADRATIC[:6],
         information_inverse=np.eye(6) * 1e-2,
         most_leverage=1.0,
         domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},

@@ -10,7 +10,8 @@ from posterior_maps import bump_map
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import write_size_calibration
-from tactile_bayes.size.eq6 import AxisCalibration, Recipe, SizeCalibration
+from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+from tactile_bayes.size.terms import Recipe
 
 MADE = Provenance("test", {})
 

@@ -15,8 +15,8 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.shape_npz import write_shape
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
 
 MAP_SD = 0.02
 DRAWS = 400

@@ -11,7 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import LEAST_HARD_RATIO
 from tactile_bayes.size.eq6 import AxisCalibration, LeftOutErrors
 from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, StudyCases, axis_at_mode, width_changes
-from tactile_bayes.size.polynomials import monomials, powers
+from tactile_bayes.size.terms import monomials, powers
 
 LEAST_GEOMETRIES = 8
 """A quadratic has six coefficients, and one geometry is missing from each fit."""

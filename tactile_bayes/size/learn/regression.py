@@ -13,21 +13,29 @@ bodies and spread between exams are so told apart, and a patient's map adds its 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
+from scipy.optimize import minimize
 
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.laplace import mode_and_covariance
+from tactile_bayes.size.terms import INVERTED, HiddenTerms, RoundLumps
 
 LEAST_BODIES = 20
+EXPLAINED: Final = 0.75
+"""Of the table's bodies, by SD(B), those of which what is known tells as much as it does of all, in that SD."""
+_ROUND_START = (np.log(0.01), np.log(2.0))
+"""ln s and ln kappa where the search for the spread of balls' maps begins."""
+_ROUND_PRIOR_SD = 1.5
+"""Of either about these: with a dozen bodies they stay near."""
 # Centre and width of the priors on ln(sd between bodies), its slope with ln a, ln(sd between exams).
 _PRIOR = np.array([[np.log(0.1), 1.0], [0.0, 0.3], [np.log(0.03), 1.0]])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PopulationTable:
+class PopulationTable(Record, eq=False):
     """Maps of known lumps, one per row.
 
     Parameters
@@ -74,8 +82,7 @@ class PopulationTable:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class ExamSpread:
+class ExamSpread(Record):
     """How far exams of one body differ in their sizes.
 
     Parameters
@@ -93,8 +100,7 @@ class ExamSpread:
         return float(np.exp(self.log_sd))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BodyRegression:
+class BodyRegression(Record, eq=False):
     """Data of the likelihood: maps as rows, and their means over each body's exams.
 
     Parameters
@@ -136,7 +142,7 @@ class BodyRegression:
         exams = np.bincount(group).astype(np.float64)
         mean_terms = np.stack([np.bincount(group, column) / exams for column in terms.T], axis=1)
         left, mean_u = (np.bincount(group, one) / exams for one in (np.log(table.d_mm) - constant, u))
-        return cls(terms, constant, _map_variance(table, slope), group, exams, mean_terms, left, mean_u)
+        return cls(terms, constant, map_variance(table, slope), group, exams, mean_terms, left, mean_u)
 
     @property
     def groups(self) -> int:
@@ -205,7 +211,7 @@ def leverages(features: FloatArray) -> tuple[FloatArray, FloatArray]:
     return inverse, np.asarray(np.einsum("ni,ij,nj->n", features, inverse, features))
 
 
-def _map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
+def map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
     """(n,) variance of ln d by the maps' own posteriors, for (2, n) slopes by ln a and p."""
     return np.asarray(np.einsum("in,nij,jn->n", slope, table.covariance[:, :2, :2], slope))
 
@@ -252,3 +258,72 @@ def domain_of(table: PopulationTable) -> dict[str, tuple[float, float]]:
     """Ranges of amplitude, mean width and diameter."""
     values = {"amplitude": np.exp(table.log_amplitude), "sigma_mm": np.exp(table.log_width), "d_mm": table.d_mm}
     return {name: (float(v.min()), float(v.max())) for name, v in values.items()}
+
+
+def hidden_terms(
+    table: PopulationTable,
+    data: BodyRegression,
+    *,
+    body: FloatArray,
+    body_sd: FloatArray,
+    features: FloatArray,
+) -> HiddenTerms | None:
+    """Second moments of what was varied, about what the map leads one to expect of it, and with B.
+
+    Parameters
+    ----------
+    body, body_sd : (groups,) arrays
+        B of each body, which took no part in the fit that says so, and SD(B) at its place. Bodies count by their B in
+        that SD: faint and deep lumps, of which B is large, would decide alone otherwise.
+    features : (n, c) array
+        What a map leads one to expect is linear in these.
+    """
+    if not table.unknowns:
+        return None
+    design = np.stack([data.mean(column) for column in features.T], axis=1)
+    inverted = tuple(name for name in INVERTED if name in table.unknowns)
+    entered = [np.exp(-values) if name in inverted else values for name, values in table.unknowns.items()]
+    varied = np.stack([data.mean(values) for values in entered], axis=1)
+    coefficients = np.linalg.lstsq(design, varied, rcond=None)[0]
+    rest = varied - design @ coefficients
+    most_sd = float(np.quantile(body_sd, EXPLAINED))
+    told = np.minimum(1.0, most_sd / body_sd)
+    freedom = max(data.groups - design.shape[1], 1)
+    return HiddenTerms(
+        names=tuple(table.unknowns),
+        expected=np.asarray(coefficients.T),
+        covariance=np.asarray(rest.T @ rest / freedom),
+        with_body=np.asarray(rest.T @ (told * body / body_sd) / (freedom * np.mean(told**2))),
+        body_variance=1.0,
+        inverted=inverted,
+        most_sd=most_sd,
+    )
+
+
+def learn_round(table: PopulationTable, terms: FloatArray) -> RoundLumps:
+    r"""How balls' maps look, by maximum likelihood: :math:`q_i \sim N(q_0(x_i), s^2 + \kappa V_i)`.
+
+    :math:`q_0` is linear in (n, c) terms, V the variance of a map's posterior. Deep and faint lumps have a V a hundred
+    times that of clear ones, so least squares without it fit :math:`q_0` to the faintest maps and take their noise for
+    all.
+    """
+    q, variance = table.half_log_ratio, table.covariance[:, 2, 2]
+
+    def spread_at(values: FloatArray) -> FloatArray:
+        return np.asarray(np.exp(values[0]) ** 2 + np.exp(values[1]) * variance)
+
+    def misfit(values: FloatArray) -> float:
+        whole = spread_at(values)
+        left = q - terms @ _weighted(terms, q, whole)
+        prior = np.sum(((values - _ROUND_START) / _ROUND_PRIOR_SD) ** 2)
+        return float(0.5 * (np.sum(left**2 / whole + np.log(whole)) + prior))
+
+    found = np.asarray(minimize(misfit, _ROUND_START, method="Nelder-Mead").x)
+    body_sd, map_factor = (float(one) for one in np.exp(found))
+    return RoundLumps(_weighted(terms, q, spread_at(found)), body_sd, 0.0, map_factor)
+
+
+def _weighted(terms: FloatArray, values: FloatArray, variance: FloatArray) -> FloatArray:
+    """(c,) coefficients by weighted least squares."""
+    root = 1.0 / np.sqrt(variance)
+    return np.asarray(np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0])

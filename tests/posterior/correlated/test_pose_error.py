@@ -5,7 +5,6 @@ Truth is what the simulated tracker was given, and dense linear algebra.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 from posterior_maps import bump_map
 from scipy.stats import chi2
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate

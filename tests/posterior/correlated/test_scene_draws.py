@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.files.checkpoint_npz import CheckpointFile
 from tactile_bayes.inference.draws import ParameterDraws

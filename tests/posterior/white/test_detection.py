@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from mapping_scans import shared_scan
 from posterior_maps import bump_map, correlated_field, find_bump, grid_map
 
 import tactile_bayes
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map

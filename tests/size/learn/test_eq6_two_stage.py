@@ -10,9 +10,17 @@ import pytest
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.plane.study import StudyRow, learn_as_printed
 from tactile_bayes.report.calibration_text import calibration_text
-from tactile_bayes.size.eq6 import AxisCalibration, Recipe
-from tactile_bayes.size.learn.eq6 import AxisRows, SizeTable, axis_at_mode, width_changes
-from tactile_bayes.size.learn.eq6_two_stage import axis_in_two_stages, learn_two_stage, other_fit
+from tactile_bayes.size.eq6 import AxisCalibration
+from tactile_bayes.size.learn.eq6 import (
+    AxisRows,
+    SizeTable,
+    axis_at_mode,
+    axis_in_two_stages,
+    learn_two_stage,
+    other_fit,
+    width_changes,
+)
+from tactile_bayes.size.terms import Recipe
 
 TRUTH = np.array([6.6, -6.8, 0.59, -0.32])
 DEPTHS = (0.6, 0.8, 1.0, 1.2, 1.5)
@@ -111,7 +119,7 @@ def test_intervals_of_the_two_stage_fit_hold_as_few_diameters_allow(monkeypatch:
         return float(np.mean(inside))
 
     assert 0.85 < held() < 0.96
-    monkeypatch.setattr("tactile_bayes.size.learn.eq6_two_stage._stretch", lambda *_, **__: None)
+    monkeypatch.setattr("tactile_bayes.size.learn.eq6._stretch", lambda *_, **__: None)
     assert held() < 0.83
 
 

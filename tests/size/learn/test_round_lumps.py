@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.size.hidden import RoundSpread
-from tactile_bayes.size.learn.regression import PopulationTable
-from tactile_bayes.size.learn.round_lumps import learn_round
-from tactile_bayes.size.polynomials import monomials, powers
+from tactile_bayes.size.learn.regression import PopulationTable, learn_round
+from tactile_bayes.size.terms import RoundLumps, monomials, powers
 
 TRUE = np.array([0.04, -0.02, 0.06, 0.0, -0.05, -0.04])
 BODY_SD, FACTOR = 0.007, 2.4
@@ -28,11 +26,13 @@ def table(bodies: int = 800) -> tuple[PopulationTable, np.ndarray]:
 
 def test_the_curve_and_both_parts_of_the_spread_are_found():
     rows, terms = table()
-    coefficients, spread = learn_round(rows, terms)
-    np.testing.assert_allclose(coefficients, TRUE, atol=0.004)
+    spread = learn_round(rows, terms)
+    np.testing.assert_allclose(spread.coefficients, TRUE, atol=0.004)
     assert spread.body_sd == pytest.approx(BODY_SD, rel=0.15)
     assert spread.map_factor == pytest.approx(FACTOR, rel=0.2)
-    standardised = (rows.half_log_ratio - terms @ coefficients) / np.sqrt(spread.variance(rows.covariance[:, 2, 2]))
+    standardised = (rows.half_log_ratio - terms @ spread.coefficients) / np.sqrt(
+        spread.variance(rows.covariance[:, 2, 2])
+    )
     assert standardised.std() == pytest.approx(1.0, abs=0.05)
     # least squares without the maps' own variances, as before: clear maps would be taken for ovals three times as long
     plain = rows.half_log_ratio - terms @ np.linalg.lstsq(terms, rows.half_log_ratio, rcond=None)[0]
@@ -41,6 +41,6 @@ def test_the_curve_and_both_parts_of_the_spread_are_found():
 
 
 def test_maps_of_one_mass_average_what_each_is_off_and_not_the_bodys():
-    spread = RoundSpread(0.01, 0.02, 3.0)
+    spread = RoundLumps(TRUE, 0.01, 0.02, 3.0)
     assert spread.variance(np.array(0.0), maps=4) == pytest.approx(0.01**2 + 0.02**2 / 4)
     assert spread.variance(np.array(1e-4)) == pytest.approx(0.01**2 + 0.02**2 + 3e-4)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +12,16 @@ from scipy.integrate import quad
 from scipy.stats import binom, multivariate_normal
 
 import tactile_bayes
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.elongation import ShapePrior
-from tactile_bayes.size.hidden import HiddenTerms
-from tactile_bayes.size.learn.site_shift import (
-    LACK,
-    PhantomMap,
-    Residuals,
-    SitePrior,
-    correct_calibration,
-    shift_posterior,
-)
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws, ShapePrior
+from tactile_bayes.size.learn.site import LACK, PhantomMap, Residuals, SitePrior, correct_calibration, shift_posterior
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.spread import BetweenMaps
+from tactile_bayes.size.terms import HiddenTerms
 
 BODY_SD, EXAM_SD = 0.10, 0.03
 
@@ -47,7 +39,9 @@ def depths_tell_all_but(left: float) -> HiddenTerms:
 
 def point(u: float, v: float, *, n: int = 1) -> ShapeDraws:
     """A map with this u and v, of a ball."""
-    return ShapeDraws(np.full(n, CENTRE[0] + u), np.full(n, CENTRE[1] + v), np.full(n, 0.05), np.zeros(n))
+    return ShapeDraws(
+        np.full(n, CENTRE.log_amplitude + u), np.full(n, CENTRE.log_width + v), np.full(n, 0.05), np.zeros(n)
+    )
 
 
 def phantoms(rng: np.random.Generator, n: int, *, shift: float, slope: float, body_sd: float = BODY_SD):
@@ -141,7 +135,9 @@ def sites(n: int, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert site is not None
         scores.append((np.array([shift, slope]) - site.mean) / np.sqrt(np.diag(site.covariance)))
         new = phantoms(rng, 1, shift=shift, slope=slope)[0]
-        shape = point(new.shape.log_amplitude[0] - CENTRE[0], new.shape.log_width[0] - CENTRE[1], n=400)
+        shape = point(
+            new.shape.log_amplitude[0] - CENTRE.log_amplitude, new.shape.log_width[0] - CENTRE.log_width, n=400
+        )
         draws = (pooled_size([shape], calibration=one, priors=priors, rng=rng).d_x_mm for one in (corrected, use))
         ranks.append([float(np.mean(one < new.d_mm)) for one in draws])
     rank = np.array(ranks)
@@ -170,7 +166,7 @@ def test_the_shift_and_its_uncertainty_enter_a_size_and_its_shares():
     before, after = (
         pooled_size([point(0.0, 0.5, n=4096)], calibration=one, priors=priors, rng=rng) for one in (plain, corrected)
     )
-    p = np.array(CENTRE[1] + 0.5)
+    p = np.array(CENTRE.log_width + 0.5)
     moved = np.log(after.max_size_mm).mean() - np.log(before.max_size_mm).mean()
     assert moved == pytest.approx(float(site.log_shift(p)), abs=0.002)
     wider = np.log(after.max_size_mm).var() - np.log(before.max_size_mm).var()
@@ -188,7 +184,7 @@ def test_maps_of_a_mass_are_pooled_with_the_correction():
     sizes = [pool_maps(maps, calibration=one, priors=SizePriors(), rng=np.random.default_rng(1))
              for one in (calibration(), corrected)]  # fmt: skip
     for i in range(2):
-        expected = sizes[0].centres[i] + float(corrected.site.log_shift(np.array(CENTRE[1] + 0.1)))
+        expected = sizes[0].centres[i] + float(corrected.site.log_shift(np.array(CENTRE.log_width + 0.1)))
         assert sizes[1].centres[i] == pytest.approx(expected)
 
 

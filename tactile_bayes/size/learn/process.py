@@ -1,4 +1,4 @@
-r"""Learning of what Eq 6 leaves of a population's sizes, see `size.residual`, and of the spread between bodies.
+r"""Learning of what Eq 6 leaves of a population's sizes, see `size.process`, and of the spread between bodies.
 
 Given the kernel and the spread of B, the weights have a normal posterior in closed form, and with them each body's
 size as the others predict it. Kernel and spread are those by which bodies left out are most probable, with weak priors
@@ -8,13 +8,15 @@ size as the others predict it. Kernel and spread are those by which bodies left 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.optimize import minimize
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.size.residual import Residual
+from tactile_bayes.inference.laplace import mode_and_covariance
+from tactile_bayes.size.process import Kernel, Residual
 
 POINTS: Final = 100
 """Points of the kernel; with fewer bodies a quarter of their number."""
@@ -32,42 +34,27 @@ _DIFFERENCE = 1e-4
 """Step of the gradient: below it the rounding of the solutions shows."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BodiesLeft:
-    """What Eq 6 leaves of b bodies.
-
-    Parameters
-    ----------
-    x : (b, 3) array
-        Means of u, v and w over each body's exams: they differ little.
-    features : (b, s) array
-        Of ln SD(B).
-    left : (b,) array
-        ln d less Eq 6's, each body left out of its fit.
-    noise : (b,) array
-        Variance of `left` by the body's exams and by the error of Eq 6's coefficients.
-    """
+class BodiesLeft(Record, eq=False):
+    """What Eq 6 leaves of b bodies."""
 
     x: FloatArray
+    """(b, 3) means of u, v and w over each body's exams: they differ little."""
     features: FloatArray
+    """(b, s) of ln SD(B)."""
     left: FloatArray
+    """(b,) ln d less Eq 6's, each body left out of its fit."""
     noise: FloatArray
+    """(b,) variance of `left` by the body's exams and by the error of Eq 6's coefficients."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FittedResidual:
-    """The residual given its kernel and the spread of B.
+class FittedResidual(Record, eq=False):
+    """The residual given its kernel and the spread of B: (m,), (m, m) moments of its weights.
 
-    Parameters
-    ----------
-    residual
-    mean, covariance : (m,), (m, m) arrays
-        Of the weights.
-    predicted, variance : (b,) arrays
-        What the other bodies lead one to expect of each body's residual, and the variance by the weights.
+    `predicted` and `variance` are (b,): what the other bodies lead one to expect of each body's residual, and the
+    variance by the weights.
     """
 
-    residual: Residual
+    kernel: Kernel
     mean: FloatArray
     covariance: FloatArray
     predicted: FloatArray
@@ -75,7 +62,14 @@ class FittedResidual:
 
     def at(self, x: FloatArray) -> FloatArray:
         """(n,) the residual at (n, 3) values."""
-        return np.asarray(self.residual.functions(x) @ self.mean)
+        return np.asarray(self.kernel.functions(x) @ self.mean)
+
+    @property
+    def residual(self) -> Residual:
+        """As part of a calibration."""
+        factor = np.linalg.cholesky(self.covariance).tolist()
+        rows = tuple(tuple(row[: i + 1]) for i, row in enumerate(factor))
+        return Residual(self.kernel.points, self.kernel.lengths, self.kernel.scale, self.mean, rows)
 
 
 def fit_residual(bodies: BodiesLeft) -> FittedResidual:
@@ -110,8 +104,8 @@ def given(bodies: BodiesLeft, points: FloatArray, theta: FloatArray) -> FittedRe
         Logs of the k lengths and of the scale, coefficients of ln SD(B).
     """
     k = bodies.x.shape[1]
-    residual = Residual(points, np.exp(theta[:k]), float(np.exp(theta[k])))
-    terms = residual.functions(bodies.x)
+    kernel = Kernel(points, np.exp(theta[:k]), float(np.exp(theta[k])))
+    terms = kernel.functions(bodies.x)
     total = np.exp(2.0 * bodies.features @ theta[k + 1 :]) + bodies.noise
     scaled = terms / np.sqrt(total)[:, None]
     inverse = np.linalg.inv(np.linalg.cholesky(scaled.T @ scaled + np.eye(len(points))))
@@ -119,7 +113,7 @@ def given(bodies: BodiesLeft, points: FloatArray, theta: FloatArray) -> FittedRe
     mean = covariance @ (scaled.T @ (bodies.left / np.sqrt(total)))
     weight = np.sum(scaled @ covariance * scaled, axis=1)
     off = (bodies.left - terms @ mean) / (1.0 - weight)
-    return FittedResidual(residual, mean, covariance, bodies.left - off, total * weight / (1.0 - weight))
+    return FittedResidual(kernel, mean, covariance, bodies.left - off, total * weight / (1.0 - weight))
 
 
 def left_out_density(features: FloatArray, error: FloatArray, noise: FloatArray) -> Callable[[FloatArray], float]:
@@ -145,8 +139,6 @@ def body_spread(features: FloatArray, error: FloatArray, noise: FloatArray) -> t
     NotConvergedError
         When they have no mode.
     """
-    from tactile_bayes.inference.laplace import mode_and_covariance
-
     density, s = left_out_density(features, error, noise), features.shape[1]
 
     def many(spreads: FloatArray) -> FloatArray:
@@ -165,8 +157,6 @@ def _log_density(features: FloatArray, error: FloatArray, noise: FloatArray, log
 
 def _best(bodies: BodiesLeft, start: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
     """Logs of kernel and spread at the mode next to a start, and the mode's negative log density."""
-    from scipy.optimize import minimize
-
     k = bodies.x.shape[1]
 
     def cost(theta: FloatArray) -> float:

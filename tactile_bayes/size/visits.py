@@ -1,38 +1,207 @@
-r"""Joint posterior of a mass's size at several visits, and of its change between them.
+r"""A mass at several visits: whether it is one, the joint posterior of its sizes, their change and its rate.
 
 As in `pooling`, map i of visit v gives :math:`g_{vi} = \ln d_v - B_v + E_{vi}`. The E of a visit's maps average out.
 The coefficients of the calibration and a site's correction are the same at all visits, and B is to the degree that
 `SharedBody` says: in :math:`\ln d_w - \ln d_v` all three cancel but for what a lump of another size changes of them.
 The lump is taken to keep its form, so that largest and smallest size change by one factor.
+
+Places are in the patient's frame, x and y in mm from the xiphoid (`geometry.patient_from_base`). Between visits one
+mass comes out apart by :math:`\delta \sim N(0, S)`, :math:`S = C_1 + C_2 + s^2 I`: C of the maps' centres, s of the
+posture and of touching the landmarks. The probability that one mass comes out as far apart or farther is
+:math:`\exp(-\tfrac12 \delta^T S^{-1} \delta)`.
+
+The specific growth rate of the volume is :math:`3\, d(\ln d)/dt`, and the doubling time ln 2 over it (Mehrara et al.
+2007, Cancer Research 67:3970). The rate is the better figure: it is zero, not infinite, for a mass that stays, and its
+interval is about as wide on both sides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 
-from tactile_bayes.errors import UsageError
+from tactile_bayes.declarations import Record
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels
 from tactile_bayes.inference.normal import normal_cdf, normal_quantile
 from tactile_bayes.inference.paired import evened, paired_points
 from tactile_bayes.inference.summary import Quantity, summarise
-from tactile_bayes.records import dataclass
-from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.map_sizes import log_sizes, lump_shape, map_terms
-from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors
-from tactile_bayes.size.shape_draws import ShapeDraws, matched_draws
-from tactile_bayes.size.shared_body import SHARED_BODY, SHARED_WITHOUT_DEPTH, SharedBody
+from tactile_bayes.presets import REGISTRATION_MM
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws, matched_draws
+from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors, log_sizes, lump_shape, map_terms
+from tactile_bayes.size.spread import BetweenMaps, above_chi_square
 
-MOST_VISITS = 10
-DIMENSIONS = 5
+MOST_VISITS: Final = 10
+DIMENSIONS: Final = 5
 """Of the points: the spread between exams, that of B, and three for the lump's shape."""
+LEAST_SAME: Final = 0.02
+"""One mass in fifty is refused though it is the same."""
+CODES: Final = {"subject": "patients", "side": "sides", "mass": "masses"}
+"""What scans may say that one mass has only one of, and its name for people."""
+VOLUME: Final = 3.0
+"""d ln V / d ln d of a lump that keeps its form."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class Place(Record, eq=False):
+    """Place of a mass at one visit.
+
+    Parameters
+    ----------
+    centre_mm : (2,) array
+        x and y in the patient's frame.
+    covariance_mm2 : (2, 2) array
+        Of the maps' centres; what posture and landmarks add between visits is no part of it.
+    """
+
+    centre_mm: FloatArray
+    covariance_mm2: FloatArray
+
+    @classmethod
+    def mean_of(cls, places: Sequence[Place]) -> Place | None:
+        """Mean place of a visit's maps; None for none."""
+        if not places:
+            return None
+        centre = np.mean([one.centre_mm for one in places], axis=0)
+        covariance = np.sum([one.covariance_mm2 for one in places], axis=0) / len(places) ** 2
+        return cls(centre, covariance)
+
+
+class Apart(Record):
+    """How far apart the masses of two visits lie.
+
+    Parameters
+    ----------
+    shift_mm
+        From the earlier visit's place to the later one's.
+    sd_mm
+        Of the distance of one mass between visits, in the direction of the shift.
+    probability
+        That one mass comes out as far apart or farther.
+    """
+
+    shift_mm: tuple[float, float]
+    sd_mm: float
+    probability: float
+
+    @property
+    def distance_mm(self) -> float:
+        """Length of the shift."""
+        return float(np.hypot(*self.shift_mm))
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether one mass would come out so far apart in less than `LEAST_SAME`."""
+        return self.probability < LEAST_SAME
+
+    @property
+    def words(self) -> str:
+        """Distance with its SD, for people."""
+        return f"{self.distance_mm:.0f} mm apart (one mass: SD {self.sd_mm:.0f} mm each way)"
+
+
+def apart(earlier: Place, later: Place, *, registration_mm: float = REGISTRATION_MM) -> Apart:
+    """Compare the places of two visits.
+
+    Parameters
+    ----------
+    registration_mm
+        s, the SD each way of one mass's place between two visits.
+    """
+    shift = later.centre_mm - earlier.centre_mm
+    spread = earlier.covariance_mm2 + later.covariance_mm2 + registration_mm**2 * np.eye(2)
+    length = float(np.hypot(*shift))
+    along = shift / length if length > 0 else np.array([1.0, 0.0])
+    probability = float(np.exp(-0.5 * shift @ np.linalg.solve(spread, shift)))
+    return Apart((float(shift[0]), float(shift[1])), float(np.sqrt(along @ spread @ along)), probability)
+
+
+def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
+    """What the scans of all visits contradict each other in, in words; empty where they do not.
+
+    Parameters
+    ----------
+    visits
+        Of each visit what its scans say of the exam, see `files.provenance.EXAM_FACTS`.
+    """
+    found = []
+    for key, plural in CODES.items():
+        said: dict[str, int] = {}
+        for number, scans in enumerate(visits, start=1):
+            for scan in scans:
+                if scan.get(key):
+                    said.setdefault(scan[key], number)
+        if len(said) > 1:
+            listed = ", ".join(f"{value} (visit {number})" for value, number in said.items())
+            found.append(f"the scans name different {plural}: {listed}")
+    return found
+
+
+def one_place_probability(places: Sequence[Place], *, registration_mm: float = REGISTRATION_MM) -> float:
+    r"""Probability that the places of one mass come out as far apart or farther.
+
+    Parameters
+    ----------
+    places
+        Of the maps, by landmarks.
+    registration_mm
+        SD each way of the distance of one mass between two exams, by posture and landmarks.
+
+    Notes
+    -----
+    As `one_size_probability` in the plane, with :math:`S_i = C_i + s^2 I / 2`: for two places it is
+    `same_mass.apart`'s probability.
+    """
+    if len(places) < 2:
+        return 1.0
+    centres = np.stack([one.centre_mm for one in places])
+    weights = np.linalg.inv(np.stack([one.covariance_mm2 + 0.5 * registration_mm**2 * np.eye(2) for one in places]))
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, centres))
+    q = float(np.einsum("ki,kij,kj->", centres - mean, weights, centres - mean))
+    return float(above_chi_square(np.array(q), 2 * (len(places) - 1)))
+
+
+class SharedBody(Record):
+    """Law of the correlation of B between visits of one body.
+
+    Parameters
+    ----------
+    redrawn
+        f, the share of the variance of B that differs between visits of an unchanged lump, 0 to 1.
+    length
+        Lambda: a change in ln d after which the rest of the correlation has fallen to exp(-1/2).
+    """
+
+    redrawn: float
+    length: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.redrawn <= 1.0 and self.length > 0.0):
+            raise BadDataError(
+                f"redrawn is {self.redrawn:g} and length {self.length:g}", way_out="give 0 to 1, and a length above 0"
+            )
+
+    def correlation(self, log_size: FloatArray) -> FloatArray:
+        """(v, v) correlation matrix of visits whose maps give these (v,) log sizes."""
+        apart = (log_size[:, None] - log_size) / self.length
+        shared = (1.0 - self.redrawn) * np.exp(-0.5 * apart**2)
+        np.fill_diagonal(shared, 1.0)
+        return np.asarray(shared)
+
+
+SHARED_BODY: Final = SharedBody(0.11, 0.48)
+"""Learned from simulated visits, see record 0132: ``python -m benchmarks.visits law``."""
+SHARED_WITHOUT_DEPTH: Final = SharedBody(0.19, 0.39)
+"""Where maps tell no depth of fat: most of what they hide is that depth, which stays as the lump grows."""
+STRANGERS: Final = SharedBody(1.0, 1.0)
+"""Nothing shared: each visit's size for itself, as two separate estimates have it."""
+
+
+class Change(Record, eq=False):
     """Change of a mass between two visits.
 
     Parameters
@@ -77,8 +246,7 @@ class Change:
         return summarise(self.log_ratio, probability=probability, replicates=self.replicates)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JointSizes:
+class JointSizes(Record, eq=False):
     """Joint posterior of the sizes of one mass at v visits.
 
     Parameters
@@ -198,8 +366,7 @@ def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: Body
     return [without[0]] * len(fitted) if without else fitted
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Weighted:
+class _Weighted(Record, eq=False):
     """Maps of a visit averaged for each tau: (n,) mean and variance between exams, (n, k) terms, ln a and p."""
 
     mean: FloatArray
@@ -209,8 +376,7 @@ class _Weighted:
     log_width: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Visit:
+class _Visit(Record, eq=False):
     """Draws of the k maps of a visit: (k, n) log sizes, (k,) centres and variances, (k, n, t) terms."""
 
     maps: Sequence[ShapeDraws]
@@ -259,13 +425,13 @@ def _covariance(
     parts: Sequence[_Weighted], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
 ) -> FloatArray:
     """(n, v, v) covariance of ln d at the visits given each draw of the maps."""
-    k, site = fitted[0].coefficients, fitted[0].site
+    site = fitted[0].site
     bodies = np.stack(
         [at.body_sd(one.log_amplitude, one.log_width, score) for one, at in zip(parts, fitted, strict=True)], axis=1
     )
     terms = np.stack([one.terms for one in parts], axis=1)
     found = bodies[:, :, None] * correlation * bodies[:, None, :]
-    found = found + (terms @ fitted[0].covariance[:k, :k]) @ np.swapaxes(terms, 1, 2)
+    found = found + (terms @ fitted[0].coefficient_covariance) @ np.swapaxes(terms, 1, 2)
     exams = np.stack([one.exam_variance for one in parts], axis=1)
     found[:, range(len(parts)), range(len(parts))] += exams
     if site is not None:
@@ -286,3 +452,72 @@ def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: 
     raw = mean + np.einsum("nvw,nw->vn", root, z)
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T
     return np.stack([evened(raw[i], mean[i], sd[i], replicates) for i in range(v)])
+
+
+class Trend(Record):
+    """Straight line of ln d over time.
+
+    Parameters
+    ----------
+    per_day, sd
+        Slope of ln d and its posterior SD.
+    departure
+        Probability that sizes on a straight line come out as far from one or farther; None for two visits, which are
+        always on one.
+    """
+
+    per_day: float
+    sd: float
+    departure: float | None
+
+
+def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[float]) -> Trend:
+    """Fit ln d of several visits by generalised least squares, with flat priors of level and slope.
+
+    Parameters
+    ----------
+    log_size : (v,) array
+    covariance : (v, v) array
+        With what the visits share, so that it cancels in the slope.
+    days
+        Times of the visits.
+    """
+    columns = np.stack([np.ones(len(days)), np.array(days) - np.mean(days)], axis=1)
+    weighted = np.linalg.solve(covariance, columns)
+    spread = np.linalg.inv(columns.T @ weighted)
+    found = spread @ (weighted.T @ log_size)
+    left = log_size - columns @ found
+    square, dof = left @ np.linalg.solve(covariance, left), len(days) - 2
+    departure = float(above_chi_square(square, dof)) if dof > 0 else None
+    return Trend(float(found[1]), float(np.sqrt(spread[1, 1])), departure)
+
+
+def doubling_days(rate_per_day: float) -> float | None:
+    """Doubling time of the volume in days by a specific growth rate; None where the volume does not grow."""
+    return float(np.log(2.0) / rate_per_day) if rate_per_day > 0 else None
+
+
+class Compared(Record, eq=False):
+    """Whether visits are of one mass, and its sizes.
+
+    Parameters
+    ----------
+    status
+        ``"compared"``, ``"not_one_mass"`` or ``"no_estimate"``.
+    reason, advice
+        Why there is no comparison, and what would help; empty where there is one.
+    apart
+        How far the mass of each later visit lies from the first's; None where landmarks do not show it.
+    findings
+        What speaks against the comparison.
+    joint, another
+        Sizes with the calibration's or the site's spread between exams, and with the paper's.
+    """
+
+    status: str
+    reason: str = ""
+    advice: str = ""
+    apart: tuple[Apart | None, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    joint: JointSizes | None = None
+    another: JointSizes | None = None

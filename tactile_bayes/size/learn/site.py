@@ -1,4 +1,4 @@
-r"""Learning of a site's shift from its own phantoms, lumps of known size.
+r"""Learning of a site's own figures: the shift from its phantoms, and the spread from its repeated exams.
 
 Phantom i with known properties :math:`k_i` (depth, seat, stiffness, as far as they are stated) has, over its n_i maps,
 
@@ -10,23 +10,29 @@ expectation of B gets wrong for all of them: it belongs to them, not to the site
 exams over n_i, times k, beside the maps' own noise. k is the phantoms' spread over the calibration's. Given k all is
 linear and normal, so c_0 and c_1 have a posterior in closed form; k is summed over a grid, and the mixture is handed on
 as a normal of its mean and covariance.
+
+Spread between exams of one mass: exam j of mass i gives :math:`g_{ij} = \mu_i + E_{ij} + e_{ij}`, with
+:math:`E_{ij} \sim N(0, \tau^2)` between exams and :math:`e_{ij} \sim N(0, v_{ij})` the map's own error. Nothing is
+supposed of :math:`\mu_i`: the mass's size, and all that its body does to every map of it, cancel. The restricted
+likelihood of tau is the product over masses of that of one mass, `spread.restricted_log_likelihood`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.records import dataclass
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.learn.site_cautions import cautions_of, no_depth
-from tactile_bayes.size.map_sizes import log_sizes
-from tactile_bayes.size.shape_draws import ShapeDraws
-from tactile_bayes.size.site_shift import SiteShift
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws
+from tactile_bayes.size.pooling import log_sizes
+from tactile_bayes.size.site import PROBABILITY, Repeatability
+from tactile_bayes.size.spread import apart_by_chance, restricted_log_likelihood
+from tactile_bayes.size.terms import SiteShift
 
 LEAST_PHANTOMS = 3
 SHARED = ("seat", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
@@ -35,10 +41,16 @@ LACK = 0.5
 """Share of what all properties leave of B that phantoms of a set have in common: B is not linear in its properties, and
 two sets of the same sizes in two seats differ by 7 % (record 0102)."""
 _GRID = np.geomspace(0.1, 10.0, 81)
+FAR = 3.0
+"""Standard deviations of the prior beyond which a shift is named."""
+APART = 3.5
+"""The same of the prediction for a phantom; one of 20 phantoms is named by chance in 1 site of 30 (record 0102)."""
+SLOPE_OPEN, ALIKE = 0.8, 0.2
+"""A slope is open where it keeps this share of the prior's SD, and the SD of the phantoms' ln sigma is below this."""
+MOST_SPREAD = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class SitePrior:
+class SitePrior(Record):
     """Prior of a site's shift, as standard deviations; see docs/decisions/0102 for the figures.
 
     Parameters
@@ -61,8 +73,7 @@ class SitePrior:
         return np.array([self.shift_sd, self.slope_sd])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PhantomMap:
+class PhantomMap(Record, eq=False):
     """One map of a phantom.
 
     Parameters
@@ -83,8 +94,7 @@ class PhantomMap:
     known: Mapping[str, float]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Residuals:
+class Residuals(Record, eq=False):
     """What a calibration leaves of n phantoms, each (n,).
 
     Parameters
@@ -109,7 +119,7 @@ class Residuals:
 
     def without(self, index: int) -> Residuals:
         """All phantoms but one."""
-        return Residuals(*(np.delete(getattr(self, name), index) for name in self.__match_args__))
+        return Residuals(*(np.delete(getattr(self, name), index) for name in self.__struct_fields__))
 
     @property
     def design(self) -> FloatArray:
@@ -117,8 +127,7 @@ class Residuals:
         return np.stack([np.ones_like(self.width), self.width, self.common], axis=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ShiftPosterior:
+class ShiftPosterior(Record, eq=False):
     """Posterior of c_0, c_1 and M, and of k.
 
     Parameters
@@ -198,29 +207,28 @@ def correct_calibration(
             f"{len(rows)} phantom{'' if len(rows) == 1 else 's'} in the range of {base}{why}",
             way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
         )
-    data = Residuals(*(np.array([getattr(row, name) for _, row in rows]) for name in Residuals.__match_args__))
+    data = Residuals(*(np.array([getattr(row, name) for _, row in rows]) for name in Residuals.__struct_fields__))
     uses_fat = 2 * sum(row.uses_fat for _, row in rows) > len(rows)
     found = shift_posterior(data, prior)
     site = SiteShift(
-        centre=calibration.centre[1],
+        centre=calibration.centre.log_width,
         mean=found.mean[:2],
         covariance=found.covariance[:2, :2],
         phantoms=len(rows),
         maps=sum(row.maps for _, row in rows),
         base=base,
         uses_fat=uses_fat,
-        fit=_figures(data, found, calibration.centre[1]),
+        fit=_figures(data, found, calibration.centre.log_width),
         cautions=(
             *no_depth(calibration, [groups[name][0].known for name, _ in rows]),
-            *cautions_of([name for name, _ in rows], data, found, prior, posterior_of=shift_posterior),
+            *cautions_of([name for name, _ in rows], data, found, prior),
         ),
         left_out=tuple(out),
     )
     return replace(calibration, site=site)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Phantom:
+class _Phantom(Record, eq=False):
     residual: float
     width: float
     spread_variance: float
@@ -234,7 +242,7 @@ def _phantom(calibration: BodyCalibration, maps: Sequence[PhantomMap]) -> _Phant
     """What the calibration leaves of a phantom, or why it takes no part."""
     if not all(np.isfinite(one.shape.log_amplitude).any() for one in maps):
         return "a map does not rise above its background"
-    centre, used = calibration.centre[1], calibration.at_fat([one.shape.profile for one in maps])
+    centre, used = calibration.centre.log_width, calibration.at_fat([one.shape.profile for one in maps])
     for one in maps:
         used = used.fitting(*one.shape.middle)
     shapes = [one.shape for one in maps]
@@ -295,3 +303,159 @@ def _figures(data: Residuals, found: ShiftPosterior, centre: float) -> dict[str,
         "sd_before": float(np.sqrt(np.mean(data.residual**2))),
         "sd_after": float(np.sqrt(np.mean(left**2))),
     }
+
+
+def cautions_of(names: Sequence[str], data: Residuals, found: ShiftPosterior, prior: SitePrior) -> tuple[str, ...]:
+    """What is odd about a correction by the phantoms of these names, in words."""
+    lines = []
+    for value, sd, what in zip(found.mean[:2], prior.sd, ("shift", "slope with ln sigma"), strict=True):
+        if abs(value) > FAR * sd:
+            lines.append(
+                f"the {what} of {value:+.2f} in ln d is {abs(value) / sd:.1f} times what sites are expected to differ "
+                "by: check the sizes' unit, the recipe of the maps and the head"
+            )
+    if data.width.std() < ALIKE and np.sqrt(found.covariance[1, 1]) > SLOPE_OPEN * prior.slope_sd:
+        lines.append(
+            "the phantoms' maps are too alike in width to tell whether the shift changes with it: "
+            "add smaller and larger phantoms"
+        )
+    if found.spread > MOST_SPREAD:
+        lines.append(
+            f"the phantoms scatter {found.spread:.1f} times as much as the calibration expects: "
+            "check their sizes, depths, seats and stiffness"
+        )
+    return (*lines, *_apart(names, data, prior))
+
+
+def no_depth(calibration: BodyCalibration, known: Sequence[Mapping[str, float]]) -> tuple[str, ...]:
+    """The caution where the depth of phantoms is not known, though a size depends on it most."""
+    names = () if calibration.hidden is None else calibration.hidden.names
+    without = sum("depth_mm" not in one for one in known)
+    if "depth_mm" not in names or not without:
+        return ()
+    return (
+        f"{without} of {len(known)} phantoms have no depth_ratio: where they lie deeper or shallower than lumps of the "
+        "calibration, this passes for the site's; state depth_ratio, seat and stiffness_ratio",
+    )
+
+
+def _apart(names: Sequence[str], data: Residuals, prior: SitePrior) -> list[str]:
+    """Phantoms that lie far from what the others predict."""
+    lines = []
+    for i, name in enumerate(names):
+        others = shift_posterior(data.without(i), prior)
+        x = data.design[i]
+        variance = x @ others.covariance @ x + others.spread_square * data.spread_variance[i] + data.map_variance[i]
+        score = float((data.residual[i] - x @ others.mean) / np.sqrt(variance))
+        if abs(score) > APART:
+            lines.append(f"{name} lies {abs(score):.1f} SDs from what the other phantoms predict: look at its map")
+    return lines
+
+
+FEWEST_MASSES: Final = 3
+PRIOR_MEDIAN: Final = 0.08
+"""Of tau: between the spread of simulated exams (5 %) and that of the paper's maps (15 %)."""
+PRIOR_LOG_SD: Final = 1.0
+"""95 % of the prior lies between 1.1 and 57 %."""
+FALSE_ALARMS: Final = 0.05
+"""Share of sites with nothing wrong at which some mass is named as outlying."""
+GRID: Final = np.geomspace(1e-3, 1.5, 600)
+
+
+class RepeatedExams(Record, eq=False):
+    """Exams of one mass at one visit.
+
+    Parameters
+    ----------
+    name
+        Of the mass at this visit.
+    mass
+        Of the mass at any visit.
+    centre, noise : (k,) arrays
+        Mean and variance of ln d by each map alone.
+    """
+
+    name: str
+    mass: str
+    centre: FloatArray
+    noise: FloatArray
+
+
+class LearnedSpread(Record, eq=False):
+    """What repeated exams say of the spread.
+
+    Parameters
+    ----------
+    density : (n,) array
+        Posterior weights on `GRID`.
+    by_chance
+        For each of the given exams of a mass: the probability of a spread as large as theirs, by the other masses.
+    repeatability
+        The summary, without the calibration's name.
+    """
+
+    density: FloatArray
+    by_chance: tuple[float, ...]
+    repeatability: Repeatability
+
+
+def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWEST_MASSES) -> LearnedSpread:
+    """Learn the spread between exams of one mass.
+
+    Parameters
+    ----------
+    repeats
+        One for each mass and visit with two exams or more; those of one mass are left out together when its exams are
+        compared with the others'.
+    fewest
+        Masses with repeated exams that it takes.
+
+    Raises
+    ------
+    BadDataError
+        When fewer masses have repeated exams.
+    """
+    repeats = [one for one in repeats if len(one.centre) > 1]
+    masses = sorted({one.mass for one in repeats})
+    if len(masses) < fewest:
+        what = f"{len(masses)} {'mass has' if len(masses) == 1 else 'masses have'} repeated exams with sizes"
+        raise BadDataError(what, way_out=f"give at least {fewest}: {_WHY}")
+    by_exams = np.stack([restricted_log_likelihood(one.centre, one.noise, GRID) for one in repeats])
+    density = _density(by_exams.sum(axis=0))
+    by_chance = []
+    for one in repeats:
+        others = [row for row, other in zip(by_exams, repeats, strict=True) if other.mass != one.mass]
+        by_chance.append(_by_chance(one, _density(np.sum(others, axis=0))))
+    limit = FALSE_ALARMS / len(repeats)
+    outlying = tuple(one.name for one, chance in zip(repeats, by_chance, strict=True) if chance < limit)
+    maps = sum(len(one.centre) for one in repeats)
+    return LearnedSpread(density, tuple(by_chance), _summary(density, len(masses), maps, outlying))
+
+
+_WHY: Final = "one or two masses do not tell an unusual mass from a site's spread"
+
+
+def _density(log_likelihood: FloatArray) -> FloatArray:
+    """(n,) posterior weights on the grid, whose steps in ln tau are even."""
+    log = log_likelihood - 0.5 * (np.log(GRID / PRIOR_MEDIAN) / PRIOR_LOG_SD) ** 2
+    density = np.exp(log - log.max())
+    return np.asarray(density / density.sum())
+
+
+def _summary(density: FloatArray, masses: int, maps: int, outlying: tuple[str, ...]) -> Repeatability:
+    """Quantiles, and the log-normal with the same means of tau^2 and tau^4: a map's size has tau in its variance."""
+    square, fourth = float(density @ GRID**2), float(density @ GRID**4)
+    tails = 0.5 * (1.0 - PROBABILITY)
+    low, median, high = np.interp((tails, 0.5, 1.0 - tails), np.cumsum(density) - 0.5 * density, GRID)
+    log_sd = float(np.sqrt(max(np.log(fourth / square**2), 0.0) / 4.0))
+    return Repeatability(
+        float(np.sqrt(square)), log_sd, float(median), float(low), float(high), masses, maps, outlying=outlying
+    )
+
+
+def _by_chance(one: RepeatedExams, density: FloatArray) -> float:
+    """Probability, given the other masses, that exams of a mass lie as far apart as these or further.
+
+    Given tau the weighted sum of squares about their mean has a chi-squared distribution.
+    """
+    return float(density @ apart_by_chance(one.centre, one.noise, GRID))

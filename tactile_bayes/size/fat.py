@@ -9,15 +9,17 @@ to expect of it, and sizes are averaged over that.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated, Final
 
 import numpy as np
 
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray, Matrix, Vector
 from tactile_bayes.presets import HEAD_PROFILE
-from tactile_bayes.records import dataclass
-from tactile_bayes.size.polynomials import monomials, powers
+from tactile_bayes.size.terms import LEARN_ANEW, Above0, Range, Share, check_shapes, monomials, powers
 
-MOST_LEVERAGE = 1.0
+MOST_LEVERAGE: Final = 1.0
 """A profile is unlike the table's where its leverage exceeds this multiple of the table's largest."""
 NODES = np.sqrt(2.0) * np.array([-2.0201828704560856, -0.9585724646138185, 0.0, 0.9585724646138185, 2.0201828704560856])
 WEIGHTS = np.array([0.011257411327720688, 0.22207592200561263, 8.0 / 15.0, 0.22207592200561263, 0.011257411327720688])
@@ -30,39 +32,26 @@ def head_profile(quality: Mapping[str, float]) -> tuple[float, ...] | None:
     return values if np.isfinite(values).all() else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FatDepth:
-    """Regression of ln F, F the depth of fat in mm.
+class FatDepth(Record, eq=False):
+    """Regression of the ln of the depth of the fat-gland boundary in mm on the head's pressure profile."""
 
-    Parameters
-    ----------
-    centre, scale : (3,) arrays
-        Of `HEAD_PROFILE`.
-    coefficients : (10,) array
-        Of 1, the three, and their products.
-    information_inverse : (10, 10) array
-        For the leverage of a new profile.
-    most_leverage
-        Largest in the table.
-    log_sd
-        How far single exams of the table lie from the truth.
-    fat_mm
-        Range of F in the table.
-    expected : (6,) array
-        Of a full quadratic in u and v: w without a profile.
-    expected_sd
-        Of w about that.
-    """
+    centre: Annotated[Vector, Meta(description="Of the profile.")]
+    scale: Annotated[Vector, Meta(description="Of the profile.")]
+    coefficients: Annotated[Vector, Meta(description="Of 1, the scaled profile, and its products.")]
+    information_inverse: Annotated[Matrix, Meta(description="For the leverage of a new profile.")]
+    most_leverage: Annotated[Above0, Meta(description="Largest in the table.")]
+    log_sd: Annotated[Share, Meta(description="How far single exams of the table lie from the truth.")]
+    fat_mm: Annotated[Range, Meta(description="Range of the depth in the table.")]
+    expected: Annotated[Vector, Meta(description="Of a full quadratic in u and v: w without a profile.")]
+    expected_sd: Annotated[Share, Meta(description="Of w about that.")]
+    profile: tuple[str, ...] = HEAD_PROFILE
 
-    centre: FloatArray
-    scale: FloatArray
-    coefficients: FloatArray
-    information_inverse: FloatArray
-    most_leverage: float
-    log_sd: float
-    fat_mm: tuple[float, float]
-    expected: FloatArray
-    expected_sd: float
+    def __post_init__(self) -> None:
+        check_shapes(self, centre=(3,), scale=(3,), coefficients=(10,), information_inverse=(10, 10), expected=(6,))
+        if self.profile != HEAD_PROFILE:
+            raise BadDataError(f"profile is {', '.join(self.profile)}", way_out=f"give {', '.join(HEAD_PROFILE)}")
+        if not (self.scale > 0).all():
+            raise BadDataError("a scale of the profile is not above 0", way_out=LEARN_ANEW)
 
     def terms(self, profile: FloatArray) -> FloatArray:
         """(..., 10) terms of (..., 3) profiles."""
@@ -78,13 +67,7 @@ class FatDepth:
         return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
 
     def without_profile(self, u: FloatArray, v: FloatArray, *, centre: float) -> FloatArray:
-        """(5, ...) w at the rule's `NODES`, within the table's range.
-
-        Parameters
-        ----------
-        centre
-            w_0.
-        """
+        """(5, ...) w at the rule's `NODES`, within the table's range, for w_0 in `centre`."""
         low, high = np.log(self.fat_mm) - centre
         expected = np.clip(monomials((u, v), powers(2)) @ self.expected, low, high)
         return np.asarray(expected + self.expected_sd * NODES.reshape(-1, *([1] * expected.ndim)))

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field
 from typing import Final
 
 import numpy as np
 
+from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.records import dataclass
-from tactile_bayes.size.between_maps import BetweenMaps
-from tactile_bayes.size.body_calibration import BodyCalibration
-from tactile_bayes.size.map_sizes import corrected_log_size
-from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.size.posterior import SizePosterior
-from tactile_bayes.size.shape_draws import ShapeDraws
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.draws import ShapeDraws, SizePosterior
+from tactile_bayes.size.pooling import SizePriors, log_sizes, pooled_size
+from tactile_bayes.size.spread import BetweenMaps
 
 PROBABILITY: Final = 0.95
 """Of the interval of a learned spread."""
 
 
-@dataclass(frozen=True, slots=True)
-class Repeatability:
+class Repeatability(Record):
     """Spread of ln d between exams of one mass at a site, beyond the maps' own errors.
 
     Parameters
@@ -54,7 +50,7 @@ class Repeatability:
     calibration: str = ""
     calibration_sha256: str = ""
     normalise: str = ""
-    outlying: tuple[str, ...] = field(default=())
+    outlying: tuple[str, ...] = ()
     sha256: str = ""
 
     def __post_init__(self) -> None:
@@ -88,7 +84,7 @@ def for_shape(calibration: BodyCalibration, shape: ShapeDraws) -> BodyCalibratio
 
 def log_size_alone(calibration: BodyCalibration, shape: ShapeDraws) -> tuple[float, float]:
     """Mean and variance of ln d by a map alone, without what no map shows."""
-    log_size = corrected_log_size(for_shape(calibration, shape), shape)
+    (log_size,) = log_sizes(for_shape(calibration, shape), [shape])
     return float(np.nanmean(log_size)), float(np.nanvar(log_size))
 
 

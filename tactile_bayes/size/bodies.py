@@ -1,0 +1,426 @@
+r"""A size calibration learned over a population of bodies.
+
+With u, v and w as in `eq6`,
+
+.. math:: \ln d = \ln\text{Eq 6}(u, v, w) + h(u, v, w) + B + E
+
+Eq 6 has constants that depend on the depth of the fat. h is what it leaves (`process`); a calibration by Eq 6
+alone has none. B differs from body to body by what a map does not show (seat, stiffness, moduli): ln SD(B) is a full
+quadratic in u, v and w. E differs from exam to exam of one body. A body of another origin than the table's departs by
+more, `other_sd`.
+
+w comes from the head's pressure profile. Without one, all of this is averaged over the depths of fat that go with the
+map, and their spread is part of B.
+
+A ball under the oblong head gives an oval map; its half log axis ratio :math:`q_0` is a quadratic in u, v and w, and
+only what exceeds it says that a lump is not round.
+
+No map shows how stiff a lump is, and without frames none shows its seat: sizes are drawn to the middle of the
+calibration's bodies. What is known of a body, or supposed of it, says on which side a size errs, and by how much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Final
+
+import numpy as np
+
+from tactile_bayes.declarations import Meta, Record, field, replace
+from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
+from tactile_bayes.geometry import FloatArray, Matrix, Vector
+from tactile_bayes.size.draws import Supposition
+from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
+from tactile_bayes.size.fat import WEIGHTS, FatDepth
+from tactile_bayes.size.process import Residual
+from tactile_bayes.size.spread import BetweenMaps
+from tactile_bayes.size.terms import (
+    LEARN_ANEW,
+    Above0,
+    HiddenTerms,
+    Range,
+    Recipe,
+    RoundLumps,
+    Share,
+    SiteShift,
+    beyond_lumps,
+    check_shapes,
+    monomials,
+    outside_domain,
+    powers,
+    too_far,
+    unknown_fat,
+    unlike_bodies,
+)
+
+UNLIKE: Final = "is unlike the bodies of the table"
+NO_PROFILE: Final = "the phantoms that correct the calibration have no pressure profile of the head"
+MOST_LEVERAGE: Final = 1.0
+"""A map is outside the table where its leverage exceeds this multiple of the table's largest."""
+FARTHEST_LEVERAGE: Final = 3.0
+"""Beyond this multiple there is no size."""
+UNLIKE_SD: Final = 0.1
+"""SD of ln d by which a body may differ because its map or its head profile is unlike the table's (record 0123)."""
+QUADRATIC: Final[Powers] = tuple((i, j, k) for k in range(3) for i, j in powers(2 - k))
+"""Powers of u, v and w in a full quadratic; the first six are those without w."""
+CUBIC: Final[Powers] = (*QUADRATIC, *((i, j, k) for k in range(4) for i, j in powers(3 - k) if i + j + k == 3))
+SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
+    "soft": ("stiffness_ratio", 11.0),
+    "hard": ("stiffness_ratio", 70.0),
+    "centred": ("seat", 0.0),
+    "resting": ("seat", 1.0),
+}
+"""A property and its value by name: lumps of 8 to 15 and 50 to 100 times the stiffness of fat, centred on the gland's
+surface and resting on it."""
+LIKELY_SDS: Final = 2.5
+"""A value farther than this from what the map leads one to expect is not supposed."""
+_STEP = 1e-4
+
+
+class Centre(Record):
+    """u = ln a - log_amplitude; v = ln of the geometric mean width in mm - log_width; w = ln F in mm - log_fat."""
+
+    log_amplitude: float
+    log_width: float
+    log_fat: float = 0.0
+
+
+class Spread(Record, eq=False):
+    """SDs of ln d: between bodies, its ln linear in powers of u, v and w; between exams; of other bodies."""
+
+    powers: tuple[Power, ...]
+    mean: Vector
+    covariance: Matrix
+    log_exam_sd: Annotated[float, Meta(description="ln SD between exams of a body.")]
+    log_exam_sd_variance: Share
+    other_sd: Annotated[float, Meta(ge=0, description="By which bodies of another origin depart.")] = 0.0
+    other_source: Annotated[str, Meta(description="What told it.")] = ""
+
+    def __post_init__(self) -> None:
+        s = len(self.powers)
+        check_shapes(self, mean=(s,), covariance=(s, s))
+        if not np.isfinite([self.log_exam_sd, self.log_exam_sd_variance, self.other_sd]).all():
+            raise BadDataError("a spread between exams or bodies is not finite", way_out=LEARN_ANEW)
+
+
+class BodyLaw(Record, eq=False, kw_only=True):
+    """What is learned over a population: Eq 6 by the depth of the fat, its residual, and what a map does not show."""
+
+    source: Annotated[str, Meta(description="What the table was made of.")] = ""
+    bodies: Annotated[
+        Mapping[str, tuple[float, float]], Meta(description="Ranges of its lumps and bodies, by its columns.")
+    ] = field(default_factory=dict)
+    recipe: Recipe
+    centre: Centre
+    eq6: Eq6Law
+    residual: Annotated[Residual | None, Meta(description="null for Eq 6 alone.")] = None
+    spread: Spread
+    round_lumps: RoundLumps
+    depth: Annotated[FatDepth | None, Meta(description="null where the table's maps did not tell it.")] = None
+    feature_powers: Annotated[tuple[Power, ...], Meta(description="Of u, v and w in the features of a map.")]
+    information_inverse: Annotated[Matrix, Meta(description="For the leverage of a map, over its features.")]
+    most_leverage: Annotated[Above0, Meta(description="Of maps inside the table.")]
+    domain: Annotated[Mapping[str, Range], Meta(description="Ranges of amplitude, sigma_mm and d_mm in the table.")]
+    hidden: Annotated[HiddenTerms | None, Meta(description="What B is made of.")] = None
+    hidden_any: Annotated[HiddenTerms | None, Meta(description="The same where the depth is not known.")] = None
+    fit: Annotated[Mapping[str, float], Meta(description="Figures of the fit.")] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        s, c = len(self.spread.powers), len(self.feature_powers)
+        check_shapes(self, information_inverse=(c, c))
+        check_shapes(self.round_lumps, coefficients=(s,))
+        for hidden in (self.hidden, self.hidden_any):
+            if hidden is not None and hidden.expected.shape[1] != c:
+                raise BadDataError("hidden has arrays of other sizes than its names", way_out=LEARN_ANEW)
+        by_depth = any(one[2] for one in (*self.eq6.powers, *self.spread.powers, *self.feature_powers))
+        if self.depth is None and (by_depth or self.residual is not None):
+            raise BadDataError("depth is missing, on which other parts depend", way_out=LEARN_ANEW)
+
+
+class BodyCalibration(BodyLaw, eq=False, kw_only=True):
+    """A calibration over a population, for any mass or one whose depth of fat is known."""
+
+    fat_mm: float | None = None
+    """Depth F of the mass that this calibration is for; None where it is not known."""
+    fat_note: str = ""
+    """Why the depth is not used though the calibration could; empty otherwise."""
+    site: SiteShift | None = None
+    """Correction by a site's own phantoms."""
+
+    def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
+        """The calibration for a mass whose maps have these `presets.HEAD_PROFILE`, None for a map without one.
+
+        Where they tell no depth it is averaged over depths, with the reason in `fat_note`; wider where the profiles
+        are of another body than the table's.
+        """
+        if self.depth is None or self.fat_mm is not None or self.fat_note:
+            return self
+        if self.site is not None and not self.site.uses_fat:
+            return self._at_any_depth(NO_PROFILE)
+        if all(one is None for one in profiles):
+            return self._at_any_depth("the map has no pressure profile of the head")
+        fat_mm, why_not = self.depth.of_mass(profiles)
+        if fat_mm is None:
+            return self._at_any_depth(why_not).for_another_kind()
+        return replace(self, fat_mm=fat_mm)
+
+    def fitting(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> BodyCalibration:
+        """This calibration, or the one for any depth where no body of the table looks like the map at this depth."""
+        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
+        if self.fat_mm is None or self.leverage(amplitude, sigma_mm) <= MOST_LEVERAGE:
+            return self
+        what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
+        return self._at_any_depth(f"{what} {UNLIKE}").for_another_kind()
+
+    def for_another_kind(self) -> BodyCalibration:
+        """This calibration with room for a body unlike any of the table's: intervals without it held 38 of 48."""
+        return self.with_other_sd(float(np.hypot(self.other_sd, UNLIKE_SD)))
+
+    def with_other_sd(self, other_sd: float, **source: str) -> BodyCalibration:
+        """This calibration for bodies that depart by so much."""
+        return replace(self, spread=replace(self.spread, other_sd=other_sd, **source))
+
+    @property
+    def other_sd(self) -> float:
+        """SD of ln d by which bodies of another origin than the table's depart; part of SD(B)."""
+        return self.spread.other_sd
+
+    @property
+    def between_exams(self) -> BetweenMaps:
+        """How ln d differs between exams of one body of the table."""
+        return BetweenMaps(float(np.exp(self.spread.log_exam_sd)))
+
+    @property
+    def unknowns(self) -> dict[str, float]:
+        """Share of the variance between bodies that knowing each property alone would take away."""
+        return {} if self.hidden is None else {name: self.hidden.share(name) for name in self.hidden.names}
+
+    @property
+    def form_name(self) -> str:
+        """The form, for people."""
+        return "Eq 6" if self.residual is None else "Eq 6 and its residual"
+
+    def constants(self, sigma_mm: float | None = None, *, fat_mm: float | None = None) -> dict[str, float]:
+        """m, b in mm, e and f of Eq 6 as it is printed, at the mean of the posterior.
+
+        Parameters
+        ----------
+        sigma_mm
+            Mean width of the map; the table's middle where left out.
+        fat_mm
+            Depth of fat; the mass's where left out, or else the table's middle.
+        """
+        v = np.array(0.0 if sigma_mm is None else np.log(sigma_mm) - self.centre.log_width)
+        fat_mm = fat_mm or self.fat_mm
+        w = np.array(0.0 if fat_mm is None or self.depth is None else np.log(fat_mm) - self.centre.log_fat)
+        mu, f, b = (float(one) for one in eq6_coefficients(self.eq6.mean, self.eq6.powers, v, w))
+        log_e = -f * self.eq6.log_amplitude_one_deep
+        log_m = mu - self.centre.log_width + f * self.centre.log_amplitude + log_e
+        return {"m": float(np.exp(log_m)), "b_mm": b, "e": float(np.exp(log_e)), "f": f}
+
+    def terms(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(..., k + m) derivatives of ln d by the coefficients; NaN where Eq 6 has no positive size."""
+        values = self._values(log_amplitude, log_width)
+        found = eq6_terms(*values, self.eq6.mean, self.eq6.powers)
+        if self.residual is not None:
+            functions = self.residual.functions(np.stack(np.broadcast_arrays(*values), axis=-1))
+            found = np.concatenate([found, functions], axis=-1)
+        return self._averaged(found)
+
+    def features(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(..., c) features, in which a map's leverage and what it leads one to expect of a body are linear."""
+        return self._averaged(self._monomials(log_amplitude, log_width, self.feature_powers))
+
+    def log_size(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(...,) ln d without B and E, with the mean coefficients; NaN where Eq 6 has no positive size."""
+        return self._averaged(self._log_sizes(log_amplitude, log_width))
+
+    def corrected_log_size(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(...,) the same with the site's correction where there is one."""
+        size = self.log_size(log_amplitude, log_width)
+        return size if self.site is None else size + self.site.log_shift(log_width)
+
+    def width_slope(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(...,) derivative of ln d by p: how much longer a lump is for a wider map."""
+        high, low = (self.log_size(log_amplitude, log_width + step) for step in (_STEP, -_STEP))
+        return np.asarray((high - low) / (2 * _STEP))
+
+    def round_excess(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        """(...,) q0, the half log axis ratio of a ball's map."""
+        x = self._monomials(log_amplitude, log_width, self.spread.powers)
+        return np.asarray(self._averaged(x) @ self.round_lumps.coefficients)
+
+    def body_sd(self, log_amplitude: FloatArray, log_width: FloatArray, score: FloatArray) -> FloatArray:
+        """(n,) SD(B) of maps, with `other_sd` and the spread of depths of fat that are not known.
+
+        `score` holds (n,) standard normal scores of the uncertain ln SD(B).
+        """
+        x = self._monomials(log_amplitude, log_width, self.spread.powers)
+        sd = np.sqrt(np.maximum(np.sum(x @ self.spread.covariance * x, axis=-1), 0.0))
+        variance = self._averaged(np.exp(2.0 * (x @ self.spread.mean + sd * score)))
+        if self._averages:
+            sizes = self._log_sizes(log_amplitude, log_width)
+            variance = variance + self._averaged((sizes - self._averaged(sizes)) ** 2)
+        return np.sqrt(variance + self.other_sd**2)
+
+    def own_sd(self, body_sd: FloatArray) -> FloatArray:
+        """(n,) SD(B) without `other_sd`, of which nothing that is known of a body tells anything."""
+        return np.asarray(np.sqrt(np.maximum(body_sd**2 - self.other_sd**2, 0.0)))
+
+    @property
+    def coefficient_covariance(self) -> FloatArray:
+        """(k + m, k + m) of Eq 6's coefficients and the residual's weights, which are independent."""
+        k, m = len(self.eq6.mean), 0 if self.residual is None else len(self.residual.mean)
+        found = np.zeros((k + m, k + m))
+        found[:k, :k] = self.eq6.covariance
+        if self.residual is not None:
+            found[k:, k:] = self.residual.covariance
+        return found
+
+    def coefficient_variance(self, terms: FloatArray) -> FloatArray:
+        """(n,) variance of ln d by the coefficients' error, for (n, k + m) terms."""
+        return np.asarray(np.maximum(np.sum(terms @ self.coefficient_covariance * terms, axis=-1), 0.0))
+
+    def leverage(self, amplitude: float, sigma_mm: float) -> float:
+        """Leverage of a map over the largest in the table; infinite without a rise."""
+        if not (amplitude > 0 and sigma_mm > 0):
+            return float("inf")
+        x = self.features(np.log(np.array(amplitude)), np.log(np.array(sigma_mm)))
+        return float(x @ self.information_inverse @ x) / self.most_leverage
+
+    def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
+        """In what a map lies outside the table, in words; empty when it lies inside."""
+        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
+        found = outside_domain(self.domain, amplitude, sigma_mm)
+        found = found or self._unlike(amplitude, sigma_mm, MOST_LEVERAGE)
+        return [*found, f"{self.fat_note}, so that depth is not used"] if self.fat_note.endswith(UNLIKE) else found
+
+    def too_far(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
+        """In what a map lies so far outside the table that there is no size, in words."""
+        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
+        return too_far(self.domain, amplitude, sigma_mm) or self._unlike(amplitude, sigma_mm, FARTHEST_LEVERAGE)
+
+    def beyond_lumps(self, largest_mm: float) -> list[str]:
+        """In what a size lies beyond the table's lumps, in words; empty when it lies within."""
+        return beyond_lumps(self.domain, largest_mm)
+
+    def omissions(self) -> list[str]:
+        """What a size does not contain, in words."""
+        notes = [unknown_fat(self.fat_note, other_sd=self.other_sd)] if self.fat_note else []
+        return [*notes, unlike_bodies(self.bodies)] if self.bodies else notes
+
+    def _at_any_depth(self, why: str) -> BodyCalibration:
+        return replace(self, fat_mm=None, fat_note=why, hidden=self.hidden_any)
+
+    @property
+    def _averages(self) -> bool:
+        """Whether sizes are averaged over depths of fat."""
+        return self.depth is not None and self.fat_mm is None
+
+    def _values(self, log_amplitude: FloatArray, log_width: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """u, v and w; w has one axis more before the others where sizes are averaged over depths of fat."""
+        w0 = self.centre.log_fat
+        u, v = np.asarray(log_amplitude - self.centre.log_amplitude), np.asarray(log_width - self.centre.log_width)
+        if self.depth is None:
+            return u, v, np.zeros_like(u)
+        if self.fat_mm is None:
+            return u, v, self.depth.without_profile(u, v, centre=w0)
+        return u, v, np.full_like(u, np.log(self.fat_mm) - w0)
+
+    def _averaged(self, values: FloatArray) -> FloatArray:
+        """Over the depths of fat where these are not known."""
+        return np.asarray(np.tensordot(WEIGHTS, values, 1)) if self._averages else values
+
+    def _monomials(self, log_amplitude: FloatArray, log_width: FloatArray, exponents: Powers) -> FloatArray:
+        return monomials(np.broadcast_arrays(*self._values(log_amplitude, log_width)), exponents)
+
+    def _log_sizes(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
+        values = self._values(log_amplitude, log_width)
+        found = eq6_log_size(*values, self.eq6.mean, self.eq6.powers)
+        if self.residual is None:
+            return found
+        return found + self.residual.at(np.stack(np.broadcast_arrays(*values), axis=-1))
+
+    def _unlike(self, amplitude: float, sigma_mm: float, most: float) -> list[str]:
+        """The map's pair of amplitude and width where its leverage exceeds this multiple of the limit."""
+        leverage = self.leverage(amplitude, sigma_mm)
+        if leverage <= most:
+            return []
+        pair = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike those of the table"
+        return [f"{pair} (leverage {leverage:.1f} times the limit)"]
+
+
+def mean_width_mm(sigma_x_mm: float, sigma_y_mm: float | None) -> float:
+    """The geometric mean of two widths; one alone stands for both."""
+    return float(np.sqrt(sigma_x_mm * (sigma_x_mm if sigma_y_mm is None else sigma_y_mm)))
+
+
+class BodyLeft(Record, eq=False):
+    """(n,) mean and variance of B given what is known of the body."""
+
+    expected: FloatArray
+    variance: FloatArray
+
+
+def known_body(
+    calibration: BodyCalibration,
+    known: Mapping[str, float],
+    log_amplitude: FloatArray,
+    log_width: FloatArray,
+    own_sd: FloatArray,
+) -> BodyLeft:
+    """B given known properties, for (n,) ln a and p of maps and SD(B) there as `BodyCalibration.own_sd` gives it.
+
+    Raises
+    ------
+    UsageError
+        When the calibration knows nothing of a property.
+    """
+    hidden, none = calibration.hidden, np.zeros(len(log_width))
+    if not known:
+        return BodyLeft(none, own_sd**2)
+    names = () if hidden is None else hidden.names
+    for name, value in known.items():
+        if name not in names:
+            raise UsageError(f"the calibration has no property {name}; {meant(name, names or ('none',))}")
+        check_number(f"known {name}", value, 0, open_ends=name != "seat")
+    assert hidden is not None
+    expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
+    explained_sd = np.minimum(own_sd, hidden.most_sd)
+    return BodyLeft(expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2)
+
+
+def suppositions(
+    calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], *, variance: float
+) -> dict[str, Supposition]:
+    """Of `SUPPOSED` those that the calibration's bodies hold, that the map leaves open and that nobody knows, by name.
+
+    Parameters
+    ----------
+    middle
+        Mean ln a and p of the maps.
+    variance
+        Of ln d as it is.
+    """
+    hidden, found = calibration.hidden, {}
+    if hidden is None:
+        return {}
+    at = np.array([middle[0]]), np.array([middle[1]])
+    own_sd = calibration.own_sd(calibration.body_sd(*at, np.zeros(1)))
+    before, features = known_body(calibration, known, *at, own_sd), calibration.features(*at)[0]
+    for label, (name, value) in SUPPOSED.items():
+        low, high = calibration.bodies.get(name, (value, value))
+        if name not in hidden.names or name in known or not low <= value <= high:
+            continue
+        if hidden.score(name, value, features) <= LIKELY_SDS:
+            left = known_body(calibration, {**known, name: value}, *at, own_sd)
+            found[label] = _supposition(name, value, before, left, variance=variance)
+    return found
+
+
+def _supposition(name: str, value: float, before: BodyLeft, left: BodyLeft, *, variance: float) -> Supposition:
+    """What one more known property does to a size whose logarithm has this variance without it."""
+    gone = float((before.variance - left.variance)[0])
+    variances = variance, float(np.clip(variance - gone, 0.0, variance))
+    sds = float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
+    return Supposition(name, value, float((left.expected - before.expected)[0]), sds)

@@ -1,0 +1,256 @@
+"""Draws of a map's amplitude and shape, of the lump's elongation, and of the sizes that are made from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from tactile_bayes.declarations import Record, field, replace
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import Labels, even_replicates, picked_rows
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.summary import Quantity, summarise
+
+EXTREMES: Final = ("max_size_mm", "min_size_mm")
+SIZES: Final = (*EXTREMES, "d_x_mm", "d_y_mm")
+"""Names of the sizes that a posterior has, in the order of reports."""
+SHOWN, SHOWN_POWER = 0.083, 1.5
+"""Share of a lump's half log axis ratio that its map shows: factor, and power of d in map widths (record 0107)."""
+SHOWN_CV: Final = 0.2
+"""Coefficient of variation of that between lumps."""
+OVAL_SD: Final = 0.4
+"""SD of the log mean diameter by which an oval lump is off the calibration for balls, over its half log axis ratio."""
+
+
+class ShapeDraws(Record, eq=False):
+    """Joint draws of one map's amplitude and shape, each (n,).
+
+    ln a; p, the log of the geometric mean width in mm; half the log axis ratio along the map's x axis (`q`) and 45
+    degrees from it (`r`).
+    """
+
+    log_amplitude: FloatArray
+    log_width: FloatArray
+    q: FloatArray
+    r: FloatArray
+    turn_rad: float = 0.0
+    """From the axes that the maps of a mass share to this map's."""
+    profile: tuple[float, ...] | None = None
+    """`presets.HEAD_PROFILE` of the map; None where it has none."""
+    labels: Labels | None = None
+    """Of the draws' independent replicates, as `ParameterDraws.labels`."""
+    oblique: tuple[float, float] | None = None
+    """Mean and SD of r where the draws have none, as `MapPosterior`'s."""
+    irregular: bool = False
+    """Whether the map is that of an irregular lump."""
+
+    @property
+    def replicates(self) -> Labels:
+        """(n,) label of the independent replicate of each draw."""
+        return even_replicates(len(self.q)) if self.labels is None else self.labels
+
+    @property
+    def order(self) -> tuple[float, ...]:
+        """Sort key of maps before pooling."""
+        return tuple(float(np.nansum(v)) for v in (self.log_width, self.log_amplitude, self.q, self.r))
+
+    @classmethod
+    def of(
+        cls,
+        amplitude: FloatArray,
+        sigma_x_mm: FloatArray,
+        sigma_y_mm: FloatArray,
+        angle_rad: FloatArray,
+        *,
+        turn_rad: float = 0.0,
+        profile: tuple[float, ...] | None = None,
+        labels: Labels | None = None,
+        oblique: tuple[float, float] | None = None,
+        irregular: bool = False,
+    ) -> ShapeDraws:
+        """Prepare from draws of Eq 7 of any shape; a draw without a rise becomes NaN."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            log_a = np.log(np.where(amplitude > 0, amplitude, np.nan)).ravel()
+        half, angle = 0.5 * np.log(sigma_x_mm / sigma_y_mm).ravel(), angle_rad.ravel()
+        p = 0.5 * np.log(sigma_x_mm * sigma_y_mm).ravel()
+        q, r = half * np.cos(2 * angle), half * np.sin(2 * angle)
+        return cls(log_a, p, q, r, turn_rad, profile, labels, oblique, irregular)
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Medians of the amplitude and of the geometric mean width, mm."""
+        amplitude, sigma_mm = (float(np.exp(np.nanmedian(v))) for v in (self.log_amplitude, self.log_width))
+        return amplitude, sigma_mm
+
+    def rows(self, index: Labels) -> ShapeDraws:
+        """Subset of the draws, treated as independent."""
+        drawn = {name: getattr(self, name)[index] for name in ("log_amplitude", "log_width", "q", "r")}
+        return replace(self, **drawn, labels=None)
+
+
+def matched_draws(
+    maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
+) -> tuple[Sequence[ShapeDraws], Labels]:
+    """As many draws of each map, matched by replicate, with their labels; one map's own where no number is given."""
+    if number is None and len(maps) == 1:
+        return maps, maps[0].replicates
+    replicates = even_replicates(len(maps[0].q) if number is None else number)
+    return [m.rows(picked_rows(m.replicates, replicates, rng)) for m in maps], replicates
+
+
+class ShapePrior(Record):
+    """Prior of a lump's half log axis ratio, as a vector along and 45 degrees from the head's x axis.
+
+    `oval_sd` is of each component of a lump that is not round: 0.15 is an axis ratio of 1.35 (the paper's Figure 9:
+    16 by 12 mm, 0.14).
+    """
+
+    oval_probability: float = 0.3
+    oval_sd: float = 0.2
+
+
+class Elongation(Record, eq=False):
+    """Posterior of a lump's half log axis ratio: oval with a probability, then normal; else round.
+
+    A ball's map is oval under an oblong head; only a larger axis ratio is evidence.
+    """
+
+    probability: float
+    mean: FloatArray
+    covariance: FloatArray
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """(n, 2) draws from (n, 3) uniform points: the first decides between oval and round, which is (0, 0)."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        normal = normal_quantile(points[:, 1:]) @ (vectors * np.sqrt(np.clip(values, 0.0, None))).T
+        return np.where(points[:, :1] < self.probability, self.mean + normal, 0.0)
+
+    @property
+    def magnitude(self) -> float:
+        """Posterior mean half log axis ratio of an oval lump."""
+        return float(np.hypot(*self.mean))
+
+
+def shown_share(log_size: FloatArray, log_width: FloatArray) -> float:
+    """Share of a lump's half log axis ratio that its map shows, from (n,) draws of ln d and of the log mean width."""
+    return SHOWN * float(np.exp(SHOWN_POWER * np.nanmean(log_size - log_width)))
+
+
+def elongation(excess: FloatArray, covariance: FloatArray, *, shown: float, prior: ShapePrior) -> Elongation:
+    """Compare a round lump with an oval one.
+
+    Parameters
+    ----------
+    excess : (2,) array
+        Half log axis ratio of the map beyond a ball's, along and 45 degrees from the head's x axis.
+    covariance : (2, 2) array
+        Of the map's noise and of balls about their own curve.
+    shown
+        Share of the lump's half log axis ratio that the map shows, see `shown_share`.
+
+    Notes
+    -----
+    Conjugate normal model; the odds are the ratio of the two marginal densities at the measured excess. The share is
+    known to `SHOWN_CV` only, which matters to an oval lump alone: to first order it adds to the noise along the excess.
+    """
+    measured, noise = excess / shown, covariance / shown**2
+    wide = noise + prior.oval_sd**2 * np.eye(2)
+    log_odds = _log_normal(measured, wide) - _log_normal(measured, noise)
+    log_odds += np.log(prior.oval_probability) - np.log1p(-prior.oval_probability)
+    probability = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -700, 700))))
+    wide = wide + SHOWN_CV**2 * np.outer(measured, measured)
+    gain = prior.oval_sd**2 * np.linalg.inv(wide)
+    return Elongation(probability, gain @ measured, prior.oval_sd**2 * (np.eye(2) - gain))
+
+
+def turn_matrix(angle_rad: float) -> FloatArray:
+    """(2, 2) matrix T that takes a half log axis ratio h to rotated axes as h @ T: half a turn changes nothing."""
+    c, s = np.cos(2 * angle_rad), np.sin(2 * angle_rad)
+    return np.array([[c, s], [-s, c]])
+
+
+def _log_normal(x: FloatArray, covariance: FloatArray) -> float:
+    _, log_det = np.linalg.slogdet(covariance)
+    return float(-0.5 * (x @ np.linalg.solve(covariance, x) + log_det))
+
+
+class Supposition(Record):
+    """What the size would be if one more property of the body, by the names of `HiddenTerms`, had this value."""
+
+    name: str
+    value: float
+    log_shift: float
+    """By which the median of ln d moves."""
+    sds: tuple[float, float]
+    """Of ln d without and with it."""
+
+    @property
+    def sd_ratio(self) -> float:
+        """SD of ln d with it, over that without."""
+        return self.sds[1] / self.sds[0] if self.sds[0] > 0 else 1.0
+
+    @property
+    def change(self) -> float:
+        """Change of the size, as a share."""
+        return float(np.expm1(self.log_shift))
+
+    def moved(self, size_mm: float, *, median_mm: float) -> float:
+        """Size where one of a distribution with this median comes to lie: the median itself, or an interval's end."""
+        return float(median_mm * np.exp(self.log_shift) * (size_mm / median_mm) ** self.sd_ratio)
+
+
+class SizePosterior(Record, eq=False):
+    """Draws of the lump's size: (chain, draw) diameters along the axes nearest to the head's x and y, mm.
+
+    An invalid draw, whose amplitude or diameter is not positive, is NaN.
+    """
+
+    d_x_mm: FloatArray
+    d_y_mm: FloatArray
+    variance_share: dict[str, float]
+    """Percent of the variance of ln(max size) by source; they sum to 100."""
+    invalid: int
+    replicates: Labels
+    """(chain * draw,) label of the independent replicate of each draw: their spread is the Monte-Carlo error."""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    """What else was found: the probability of a lump that is not round, the spread between maps..."""
+    outliers: tuple[int, ...] = ()
+    """Of several maps, those that lie apart from the rest, by their place in the list."""
+    another_exam: SizePosterior | None = None
+    """The same if another exam of the mass may come out as far apart as in the paper's trial; None where not told."""
+    supposing: Mapping[str, Supposition] = field(default_factory=dict)
+    """What the size would be if something more were known of the body, by the names of `bodies.SUPPOSED`."""
+
+    @property
+    def max_size_mm(self) -> FloatArray:
+        """(chain, draw) larger diameter of each draw. For a round lump its median lies above the true diameter."""
+        return np.maximum(self.d_x_mm, self.d_y_mm)
+
+    @property
+    def min_size_mm(self) -> FloatArray:
+        """(chain, draw) smaller diameter of each draw."""
+        return np.minimum(self.d_x_mm, self.d_y_mm)
+
+    @property
+    def median_mm(self) -> float:
+        """Median of the largest diameter over the draws that gave one; NaN where none did."""
+        given = self.max_size_mm[np.isfinite(self.max_size_mm)]
+        return float(np.median(given)) if given.size else float("nan")
+
+    def reshaped(self, shape: tuple[int, ...]) -> SizePosterior:
+        """The same draws as arrays of another shape, (chain, draw)."""
+        another = None if self.another_exam is None else self.another_exam.reshaped(shape)
+        d_x_mm, d_y_mm = self.d_x_mm.reshape(shape), self.d_y_mm.reshape(shape)
+        return replace(self, d_x_mm=d_x_mm, d_y_mm=d_y_mm, another_exam=another)
+
+    def summarise(self, name: str, *, probability: float) -> Quantity:
+        """Summary of one of `SIZES`, with the Monte-Carlo error of its interval."""
+        return summarise(getattr(self, name), probability=probability, replicates=self.replicates)
+
+
+def shares(variances: Mapping[str, float]) -> dict[str, float]:
+    """Percent of the sum of some variances."""
+    total = float(sum(variances.values()))
+    return {name: float(100.0 * value / total) if total > 0 else 0.0 for name, value in variances.items()}

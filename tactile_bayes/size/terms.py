@@ -1,0 +1,315 @@
+"""Parts that size calibrations are made of: their maps' recipe and range, what no map shows, a site's correction.
+
+Bodies simulated beyond the ranges of a table decide what follows outside (docs/decisions/0069): not far outside,
+intervals hold and the size is given with a caution; farther out nothing is known of them, and there is no size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Final, Literal
+
+import numpy as np
+
+from tactile_bayes.abstention import Abstention
+from tactile_bayes.declarations import Meta, Record, field
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.geometry import FloatArray, Matrix, Vector
+from tactile_bayes.head_shape import HeadShape
+from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.presets import INTERVAL, Background, Noise
+
+LEARN_ANEW: Final = "learn the calibration anew"
+Normalise = Literal["mean", "gain", "none"]
+Range = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
+Domain = Mapping[str, tuple[float, float]]
+Share = Annotated[float, Meta(ge=0)]
+Above0 = Annotated[float, Meta(gt=0)]
+FARTHEST: Final = {"amplitude": 2.0, "sigma_mm": 1.2}
+"""Sizes are given up to this multiple of the largest value in the table, and down to its smallest over it."""
+UNLIKE_ON_PAPER: Final = "nothing by this exam: the lump is unlike those that sizes were learned from"
+ONE_WIDTH: Final = "a difference between the head's axes: the calibration has one width"
+SPREAD: Final = "spread between maps of one mass (15 % in the paper): this is one map"
+LOGGED: Final = ("depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio")
+"""Properties that vary and enter by their logarithm, but for those that enter by their inverse."""
+INVERTED: Final = ("stiffness_ratio",)
+"""Properties by whose inverse a size goes: 50 times as stiff as fat and 100 times are both nearly rigid."""
+MOST_SHARE: Final = 0.9
+"""Share of B's variance that all properties together tell at most.
+
+In the second moments it comes out above 1, because SD(B) is learned apart from them. They explain 95 % of held-out
+bodies' departures without and 76 % with the depth of fat, with the exams' own errors in the rest (record 0118).
+"""
+
+
+def check_shapes(record: object, *, finite: bool = True, **shapes: tuple[int, ...]) -> None:
+    """Refuse arrays of a record, by name, that have another shape or hold a number that is not finite."""
+    for name, shape in shapes.items():
+        values = getattr(record, name)
+        if values.shape != shape or (finite and not np.isfinite(values).all()):
+            there, wanted = ("x".join(map(str, one)) for one in (values.shape, shape))
+            raise BadDataError(f"{name} has {there} numbers for {wanted} finite ones", way_out=LEARN_ANEW)
+
+
+def powers(order: int) -> tuple[tuple[int, int], ...]:
+    """Powers of two variables up to an order in all, lower orders first: 1, u, v, u2, uv, v2, u3..."""
+    return tuple((total - j, j) for total in range(order + 1) for j in range(total + 1))
+
+
+def monomials(values: Sequence[FloatArray], exponents: Sequence[tuple[int, ...]]) -> FloatArray:
+    """(..., terms) products of the (...) values' powers."""
+    highest = max(max(one) for one in exponents)
+    raised = [_raised(np.asarray(value, dtype=np.float64), highest) for value in values]
+    found = np.stack([raised[0][one[0]] for one in exponents], axis=-1)
+    for i in range(1, len(values)):
+        found *= np.stack([raised[i][one[i]] for one in exponents], axis=-1)
+    return found
+
+
+def _raised(value: FloatArray, highest: int) -> list[FloatArray]:
+    """Powers from 0 up, by multiplication."""
+    found = [np.ones_like(value)]
+    for _ in range(highest):
+        found.append(found[-1] * value)
+    return found
+
+
+class Recipe(Record):
+    """How a table's maps were built and fitted; a patient's map must agree."""
+
+    normalise: Annotated[Normalise, Meta(description="As the option of `map`.")] = "mean"
+    background: Annotated[Background, Meta(description="Whether the fit had a level of its own.")] = "fixed"
+    radius_mm: Annotated[float, Meta(gt=0, description="Of the fitted window.")] = 20.0
+    declared: Annotated[
+        bool, Meta(description="true: stated for a table made elsewhere; false: the program made the maps.")
+    ] = True
+    noise: Annotated[Noise, Meta(description="independent: least squares; field: correlated noise.")] = "independent"
+    flat_field: Annotated[
+        bool | None, Meta(description="Whether the head's own response was taken off; null where nobody says.")
+    ] = None
+    head: Annotated[
+        HeadShape | None, Meta(description="Head that the maps were made with; null where nobody says.")
+    ] = None
+
+    def differences(
+        self,
+        *,
+        normalise: str,
+        background: str,
+        radius_mm: float,
+        noise: str,
+        flat_field: bool | None = None,
+        head: HeadShape | None = None,
+    ) -> list[str]:
+        """Differences from another recipe in words; empty without any. Unknown settings do not differ."""
+        pairs = [
+            ("normalise", self.normalise, normalise),
+            ("background", self.background, background),
+            ("fit radius", f"{self.radius_mm:g} mm", f"{radius_mm:g} mm"),
+            ("noise", self.noise, noise),
+        ]
+        if self.flat_field is not None and flat_field is not None:
+            pairs.append(("flat field", _ON[self.flat_field], _ON[flat_field]))
+        found = [f"{name} {theirs} (the calibration: {ours})" for name, ours, theirs in pairs if ours != theirs]
+        return found + self.head_differences(head)
+
+    def head_differences(self, head: HeadShape | None) -> list[str]:
+        """In what a map's head departs from the calibration's; empty where one of them is unknown."""
+        return [] if self.head is None or head is None else self.head.differences(head)
+
+    @property
+    def map_command(self) -> str:
+        """The command that makes maps of this recipe from a scan."""
+        return f"`map --normalise {self.normalise}{' --flat-field' if self.flat_field else ''}`"
+
+    def __str__(self) -> str:
+        """The recipe in one line."""
+        parts = [f"normalise {self.normalise}", f"background {self.background}", f"fit radius {self.radius_mm:g} mm"]
+        parts += [f"noise {self.noise}"]
+        parts += [] if self.flat_field is None else [f"flat field {_ON[self.flat_field]}"]
+        return ", ".join(parts if self.head is None else [*parts, f"head {self.head}"])
+
+
+_ON: Final = {True: "on", False: "off"}
+
+
+class RoundLumps(Record, eq=False):
+    """Half log axis ratio of a ball's map, and how far maps are from it."""
+
+    coefficients: Annotated[Vector, Meta(description="Of the powers of the spread.")]
+    body_sd: Annotated[float, Meta(ge=0, description="Between bodies.")]
+    exam_sd: Annotated[float, Meta(ge=0, description="Between exams of a body.")]
+    map_factor: Annotated[
+        float, Meta(ge=0, description="Variance over that of a map's posterior: deep and faint lumps are off by more.")
+    ] = 1.0
+
+    def variance(self, of_maps: FloatArray, *, maps: int = 1) -> FloatArray:
+        """Variance of the mean excess over some maps of a mass, whose posteriors give its mean this variance."""
+        return np.asarray(self.body_sd**2 + self.exam_sd**2 / maps + self.map_factor * of_maps)
+
+
+class HiddenTerms(Record, eq=False, omit_defaults=True):
+    """Properties of a body that no map shows, jointly normal with its departure B given the map.
+
+    Each is about what a map leads one to expect of it, which is linear in the map's features.
+    """
+
+    names: Annotated[tuple[str, ...], Meta(min_length=1)]
+    expected: Annotated[Matrix, Meta(description="Coefficients of a map's features in what is expected of each.")]
+    covariance: Annotated[Matrix, Meta(description="About that.")]
+    with_body: Annotated[Vector, Meta(description="Covariance with B over its SD.")]
+    body_variance: Annotated[float, Meta(gt=0, description="Of B in the units of with_body.")]
+    inverted: Annotated[tuple[str, ...], Meta(description="Properties that enter by their inverse.")] = ()
+    most_sd: Annotated[
+        float, Meta(gt=0, description="SD of B beyond which they explain no more: there the map is unlike.")
+    ] = float("inf")
+
+    def __post_init__(self) -> None:
+        k = len(self.names)
+        features = self.expected.shape[-1] if self.expected.ndim else 0
+        check_shapes(self, finite=False, expected=(k, features), covariance=(k, k), with_body=(k,))
+
+    def share(self, *names: str) -> float:
+        """Share of B's variance removed by knowing these properties, at most `MOST_SHARE`."""
+        at = [self.names.index(name) for name in names]
+        gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
+        return float(np.clip(gain @ self.with_body[at] / self.body_variance, 0.0, MOST_SHARE))
+
+    def expected_body(self, known: Mapping[str, float], features: FloatArray) -> FloatArray:
+        """(...,) mean of B over its SD, given known properties, for (..., c) features of the map."""
+        at = [self.names.index(name) for name in known]
+        gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at]) / np.sqrt(self.body_variance)
+        given = np.array([self._entered(name, value) for name, value in known.items()])
+        return np.asarray((given - features @ self.expected[at].T) @ gain)
+
+    def score(self, name: str, value: float, features: FloatArray) -> float:
+        """How far a value is from what a map's (c,) features lead one to expect of a property, in SDs."""
+        at = self.names.index(name)
+        off = self._entered(name, value) - features @ self.expected[at]
+        return float(abs(off) / np.sqrt(self.covariance[at, at]))
+
+    def _entered(self, name: str, value: float) -> float:
+        if name in self.inverted:
+            return 1.0 / value
+        return float(np.log(value)) if name in LOGGED else value
+
+
+PARAMETERS: Final = ("c0", "c1")
+
+
+class SiteShift(Record, eq=False):
+    r"""Correction of a calibration over bodies by a site's own lumps of known size, its posterior taken as normal.
+
+    .. math:: \ln d = g(\text{map}) + c_0 + c_1 (p - p_0) + B + E
+
+    with p the log of the map's mean width in mm and :math:`p_0` that of the calibration's table; g, B and E are the
+    calibration's. `size.learn.site` learns :math:`c_0` and :math:`c_1`: how a site's array, head and technique differ
+    from the simulation.
+    """
+
+    centre: Annotated[float, Meta(description="p_0.")] = field(name="centre_log_width")
+    mean: Annotated[Vector, Meta(description="Of c0 and c1.")]
+    covariance: Matrix
+    phantoms: Annotated[int, Meta(ge=3, description="Distinct lumps.")]
+    maps: Annotated[int, Meta(ge=3)]
+    base: Annotated[str, Meta(description="Name of the calibration that is corrected.")] = ""
+    uses_fat: Annotated[
+        bool,
+        Meta(description="Whether the phantoms were sized with the depth of fat; if not, no size with this is."),
+    ] = True
+    fit: Annotated[
+        Mapping[str, float],
+        Meta(description="log_width: mean p of the phantoms; spread_factor; sd_before and sd_after: RMS of ln d."),
+    ] = field(default_factory=dict)
+    cautions: Annotated[tuple[str, ...], Meta(description="Why it should be looked at.")] = ()
+    left_out: Annotated[tuple[str, ...], Meta(description="Phantoms that took no part, and why.")] = ()
+    parameters: tuple[Literal["c0"], Literal["c1"]] = ("c0", "c1")
+
+    def __post_init__(self) -> None:
+        check_shapes(self, mean=(2,), covariance=(2, 2))
+        if not np.isfinite(self.centre) or np.linalg.eigvalsh(self.covariance)[0] < -1e-12:
+            raise BadDataError("the site's correction is not finite or has no covariance", way_out="learn it anew")
+
+    def log_shift(self, log_width: FloatArray) -> FloatArray:
+        """(...,) mean of what is added to ln d for maps with this p."""
+        return np.asarray(self.mean[0] + self.mean[1] * (log_width - self.centre))
+
+    def variance(self, log_width: FloatArray) -> FloatArray:
+        """(...,) variance of the same."""
+        v, c = log_width - self.centre, self.covariance
+        return np.asarray(c[0, 0] + 2.0 * v * c[0, 1] + v**2 * c[1, 1])
+
+    def percent(self, log_width: float, *, probability: float = INTERVAL) -> tuple[float, float, float]:
+        """Median of the shift at p in percent of d, and the ends of its equal-tailed interval."""
+        p = np.array(log_width)
+        z = float(normal_quantile(np.array(0.5 + probability / 2)))
+        middle, half = float(self.log_shift(p)), float(np.sqrt(self.variance(p))) * z
+        low, high = (float(100 * np.expm1(end)) for end in (middle - half, middle + half))
+        return float(100 * np.expm1(middle)), low, high
+
+    @property
+    def phantoms_log_width(self) -> float:
+        """Mean p of the phantoms, where the shift is known best; p_0 where the file does not say."""
+        return float(self.fit.get("log_width", self.centre))
+
+
+def outside_domain(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
+    """Quantities outside their ranges in a table, in words."""
+    return _beyond(domain, amplitude, sigma_mm, factors=dict.fromkeys(FARTHEST, 1.0))
+
+
+def too_far(domain: Domain, amplitude: float, sigma_mm: float) -> list[str]:
+    """Quantities so far outside that no size is given, in words."""
+    return _beyond(domain, amplitude, sigma_mm, factors=FARTHEST)
+
+
+def _beyond(domain: Domain, amplitude: float, sigma_mm: float, *, factors: Mapping[str, float]) -> list[str]:
+    found = []
+    for name, value, unit in (("amplitude", amplitude, ""), ("sigma_mm", sigma_mm, " mm")):
+        (low, high), factor = domain[name], factors[name]
+        if not low / factor <= value <= high * factor:
+            found.append(f"{name.removesuffix('_mm')} {value:.3g}{unit} (table: {low:.3g} to {high:.3g}{unit})")
+    return found
+
+
+def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:
+    """A size beyond the lumps of a table, in words; empty within. There it is the form that speaks, not the table."""
+    low, high = domain.get("d_mm", (0.0, float("inf")))
+    if not (largest_mm < low or largest_mm > high):
+        return []
+    return [f"largest size {largest_mm:.3g} mm (the table's lumps: {low:.3g} to {high:.3g} mm)"]
+
+
+def extrapolated(far: Sequence[str]) -> Abstention:
+    """Reason for no size: the map is too far outside the calibration's table to know the size's error."""
+    advice = (
+        "learn a calibration whose table holds such lumps (`population`, `calibrate size`), or give "
+        "--size-calibration none for amplitude and widths"
+    )
+    reason = f"too far outside the calibration's range for a size: {'; '.join(far)}"
+    return Abstention("extrapolated", reason, advice, UNLIKE_ON_PAPER)
+
+
+def unknown_head(calibration_head: object) -> str:
+    """An unknown head as a source of error left out, where the calibration names its own."""
+    return f"whether the map's head is the calibration's ({calibration_head}): the map does not name its head"
+
+
+def unknown_fat(why: str, *, other_sd: float = 0.0) -> str:
+    """The depth of fat as a source left out, and the SD of ln d that is allowed because the body is unlike others."""
+    left_out = f"the depth of the fat, which would narrow the size: {why}"
+    return f"{left_out}; for such a body the interval allows {100 * other_sd:.0f} % (SD) more" if other_sd else left_out
+
+
+def unlike_bodies(ranges: Mapping[str, tuple[float, float]]) -> str:
+    """Bodies unlike those that a calibration was learned over as a source left out; these by their columns."""
+    words = {
+        "stiffness_ratio": "lumps {:.3g} to {:.3g} times as stiff as fat",
+        "gland_ratio": "gland {:.3g} to {:.3g} times",
+        "fat_kpa": "fat of {:.3g} to {:.3g} kPa",
+    }
+    parts = [text.format(*ranges[name]) for name, text in words.items() if name in ranges]
+    return (
+        f"bodies unlike the calibration's ({', '.join(parts)}, even layers, tissue that does not stiffen where it is "
+        "pressed), whose sizes may lie outside the interval"
+    )
