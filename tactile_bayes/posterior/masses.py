@@ -24,7 +24,6 @@ from tactile_bayes.posterior.white.detection import Detection
 
 OF_A_LUMP = ("seat", "depth_mm", "stiffness_ratio")
 """Known properties that are of one lump, not of the whole body."""
-FLANK_IN_WIDTHS = 2.5
 LEAST_SHARE = 0.15
 """Of the first lump's amplitude, for a size from the map less the first lump: of two with less, 21 mm from a lump 13
 times as high, one came out twice as large as it was, and what a lump leaves of itself is some per cent of it."""
@@ -144,8 +143,7 @@ def _sized_at(
         return Mass(rise.x_mm, rise.y_mm, rise.probability, _beyond(rise))
     given = replace(options, fit=replace(options.fit, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None))
     found = _estimated(tactile_map, given, estimator)
-    near = first.map_posterior is not None and _reaches(first, rise, options)
-    if first.map_posterior is not None and near and not _stays(found, rise, first):
+    if first.map_posterior is not None and not _stays(found, rise, first):
         less = _estimated(without(tactile_map, first.map_posterior), given, estimator)
         found = less if less.size is None or _stands(less, first) else _in_the_flank(less)
     if found.code in (*NO_LUMP, "coarse"):
@@ -169,16 +167,6 @@ def _stays(found: Estimate, rise: Rise, first: Estimate) -> bool:
         return found.map_posterior is not None
     moved, apart = ((np.hypot(x - rise.x_mm, y - rise.y_mm)) for x, y in (_place(found), _place(first)))
     return bool(moved < apart / 2.0)
-
-
-def _reaches(first: Estimate, rise: Rise, options: EstimateOptions) -> bool:
-    """Whether the first lump bears on the window of a rise: by its flank, or by the residuals of independent errors."""
-    if not options.fit.correlated:
-        return True
-    assert first.bump is not None
-    away = np.hypot(rise.x_mm - first.bump.x_mm, rise.y_mm - first.bump.y_mm)
-    wide = max(first.bump.sigma_x_mm, first.bump.sigma_y_mm)
-    return bool(away < options.fit.radius_mm + FLANK_IN_WIDTHS * wide)
 
 
 def _stands(found: Estimate, first: Estimate) -> bool:

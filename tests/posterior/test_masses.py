@@ -23,6 +23,7 @@ from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.pipeline.one_map import Outcome, answer_of, estimate_one
 from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.posterior import masses as masses_module
+from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import by_evidence, with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
@@ -187,6 +188,25 @@ def test_a_fit_that_moves_to_the_first_lump_gives_no_size() -> None:
     assert places(masses) == [WIDE, NARROW]
     assert masses[1].largest_mm is None
     assert "does not tell them apart" in masses[1].estimate.reason
+
+
+def test_a_mass_that_the_whole_map_does_not_show_has_the_size_of_the_map_less_the_first() -> None:
+    """Also far from the first lump, which moves the least-squares start of the whole map."""
+    two = scene(narrow=0.2, away=45.0, half_mm=45.0)
+    options = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "auto", None, "field"), draws=400)
+    first = found_on(two).estimate
+    unseen = Estimate("no_estimate", "errors explain it", code="undetected")
+
+    def on_the_rest(a_map: TactileMap, given: EstimateOptions) -> Estimate:
+        if a_map is two:
+            return unseen
+        return estimate_map(a_map, calibration=None, options=given, rng=np.random.default_rng(1))
+
+    masses = with_masses(two, first, options, on_the_rest).masses
+    assert places(masses) == [WIDE, (28, 2)]
+    assert masses[1].estimate.map_posterior is not None
+    # the control: what neither shows is not listed
+    assert places(with_masses(two, first, options, lambda *_: unseen).masses) == [WIDE]
 
 
 def test_json_text_figure_and_python_list_them(tmp_path: Path) -> None:
