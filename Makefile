@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: bench-posterior calibrations relearn bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
+.PHONY: schemas bench-posterior calibrations relearn bench-forward bench-record demo test check slow bench bench-map bench-trial docs clean
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -74,6 +74,10 @@ relearn: $(VENV)/.installed
 $(VENV)/.docs-installed: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	touch $@
+
+# Schemas of files, command reference and columns, from the program; a test holds them together.
+schemas: $(VENV)/.installed
+	$(BIN)/python docs/make_reference.py
 
 # The site, in build/site: a broken link, a page that is in no table of contents or any other warning fails.
 docs: $(VENV)/.docs-installed

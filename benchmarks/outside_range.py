@@ -20,7 +20,7 @@ import argparse
 import csv
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -289,9 +289,11 @@ def eq6(path: Path) -> list[str]:
     for name, (low, high) in {"amplitude": (0.06, 1.0), "sigma_x_mm": (2.5, 6.0)}.items():
         values = np.asarray(getattr(whole, name))
         inside = (values >= low) & (values <= high)
-        columns = {f.name: getattr(whole, f.name) for f in fields(whole) if f.name != "cases"}
+        columns = {name: getattr(whole, name) for name in whole.__struct_fields__ if name != "cases"}
         kept = SizeTable(**{column: None if v is None else v[inside] for column, v in columns.items()})
-        learned = learn_size_calibration(kept, recipe=Recipe(), rng=np.random.default_rng(3))
+        learned = learn_size_calibration(
+            kept, recipe=Recipe("mean", "fixed", 20.0, declared=True), rng=np.random.default_rng(3)
+        )
         for i in np.flatnonzero(~inside):
             times = values[i] / (high if values[i] > high else low)
             lines.append(_beyond_eq6(learned, whole, int(i), f"{name} {times:.2f}"))

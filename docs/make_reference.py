@@ -1,4 +1,4 @@
-"""Write docs/commands.md and docs/columns-and-keys.md from the program: `python docs/make_reference.py`."""
+"""Write schemas, docs/commands.md and docs/columns-and-keys.md from the program: `python docs/make_reference.py`."""
 
 from __future__ import annotations
 
@@ -84,13 +84,15 @@ def _default(facts: dict[str, Any]) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """What each generated page has to hold."""
+    """What each generated schema and page has to hold."""
     sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
     from make_schema_page import render_schemas
+    from make_schemas import schemas
 
     from tactile_bayes.cli import cli
 
-    return {COMMANDS_PAGE: render(cli), SCHEMAS_PAGE: render_schemas()}
+    generated = schemas()
+    return {**generated, COMMANDS_PAGE: render(cli), SCHEMAS_PAGE: render_schemas(generated)}
 
 
 def main() -> None:

@@ -39,13 +39,15 @@ files are for is in [formats](formats.md).
 _LIMITS = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
 
 
-def render_schemas() -> str:
-    """The whole page."""
-    return "\n".join([HEAD, *(_section(heading, name) for heading, name in SECTIONS.items())])
+def render_schemas(generated: Mapping[Path, str]) -> str:
+    """The whole page; schemas that are generated from records are given, the others read."""
+    texts = {name: generated.get(SCHEMAS / name) for name in SECTIONS.values()}
+    texts = {name: text or (SCHEMAS / name).read_text(encoding="utf-8") for name, text in texts.items()}
+    return "\n".join([HEAD, *(_section(heading, name, texts[name]) for heading, name in SECTIONS.items())])
 
 
-def _section(heading: str, name: str) -> str:
-    schema = json.loads((SCHEMAS / name).read_text(encoding="utf-8"))
+def _section(heading: str, name: str, text: str) -> str:
+    schema = json.loads(text)
     words = [f"{schema[part].rstrip('.')}." for part in ("title", "description") if part in schema]
     intro = f"## {heading}\n\n{' '.join(words)} Schema: [{name}](../data_schema/{name}).\n"
     if "fields" in schema:

@@ -179,13 +179,21 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
         found["properties"] = {key: _inlined(one, definitions) for key, one in schema["properties"].items()}
     if "prefixItems" in found:
         parts = found.pop("prefixItems")
-        alike = all(part == parts[0] for part in parts)
-        found |= {"items": parts[0]} if alike else {"items": parts, "additionalItems": False}
+        if all(part == parts[0] for part in parts):
+            found["items"] = parts[0]
+        elif all("const" in part for part in parts):
+            found = {"const": [part["const"] for part in parts]} | _meaning(found)
+        else:
+            found |= {"items": parts, "additionalItems": False}
     if len(found.get("enum", ())) == 1:
         found = {"const" if key == "enum" else key: one[0] if key == "enum" else one for key, one in found.items()}
     if "discriminator" in found:
         del found["discriminator"]
     return found
+
+
+def _meaning(schema: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: schema[name] for name in ("title", "description", "default") if name in schema}
 
 
 # Errors

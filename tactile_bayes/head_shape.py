@@ -27,13 +27,13 @@ Count = Annotated[int, Meta(ge=1)]
 class HeadShape(Record):
     """Grid and curvature of a scan head's taxels."""
 
-    rows: Annotated[Count, Meta(description="Taxels across the head.")] = HEAD_ROWS
-    columns: Annotated[Count, Meta(description="Taxels along the head.")] = HEAD_COLUMNS
-    pitch_mm: Annotated[float, Meta(gt=0, description="Distance between neighbours, mm.")] = HEAD_PITCH_MM
+    rows: Annotated[Count, Meta(description="Taxels across the head.")]
+    columns: Annotated[Count, Meta(description="Taxels along the head.")]
+    pitch_mm: Annotated[float, Meta(gt=0, description="Distance between neighbours, mm.")]
     radius_mm: Annotated[
         float | None,
         Meta(description="Radius of the arc across the head, mm; null where it is flat, negative where it is hollow."),
-    ] = HEAD_RADIUS_MM
+    ]
     radius_along_mm: Annotated[float | None, Meta(description="The same along the head.")] = None
     uneven_mm: Annotated[
         float, Meta(ge=0, description="Root mean square departure of the taxels from these arcs, mm.")
@@ -138,7 +138,7 @@ class HeadShape(Record):
             raise BadDataError(f"head.{error.what}", way_out=error.way_out) from None
 
 
-DEFAULT_HEAD: Final = HeadShape()
+DEFAULT_HEAD: Final = HeadShape(HEAD_ROWS, HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM)
 """That of the paper and of the shipped calibrations."""
 
 

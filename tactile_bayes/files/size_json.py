@@ -65,6 +65,7 @@ class AxisFile(AxisCalibration, eq=False, kw_only=True):
     """Coefficients of Eq 6 along one axis; mean and covariance are those of the draws."""
 
     coefficients: Coefficients
+    fit: Mapping[str, float]
     mean: Vector
     covariance: Matrix
 
@@ -83,6 +84,7 @@ class Eq6File(SizeCalibration, eq=False, kw_only=True):
     ]
     x: AxisFile
     y: AxisFile
+    axes: Annotated[tuple[Literal["x", "y", "both"], ...], Meta(min_length=1, max_length=2)]
     provenance: dict[str, Any]
     research_use: str = RESEARCH_USE
 

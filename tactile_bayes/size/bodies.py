@@ -26,7 +26,7 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field, replace
+from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
 from tactile_bayes.geometry import FloatArray, Matrix, Vector
 from tactile_bayes.size.draws import Supposition
@@ -37,8 +37,8 @@ from tactile_bayes.size.spread import BetweenMaps
 from tactile_bayes.size.terms import (
     LEARN_ANEW,
     Above0,
+    Domain,
     HiddenTerms,
-    Range,
     Recipe,
     RoundLumps,
     Share,
@@ -82,7 +82,7 @@ class Centre(Record):
 
     log_amplitude: float
     log_width: float
-    log_fat: float = 0.0
+    log_fat: float
 
 
 class Spread(Record, eq=False):
@@ -93,8 +93,8 @@ class Spread(Record, eq=False):
     covariance: Matrix
     log_exam_sd: Annotated[float, Meta(description="ln SD between exams of a body.")]
     log_exam_sd_variance: Share
-    other_sd: Annotated[float, Meta(ge=0, description="By which bodies of another origin depart.")] = 0.0
-    other_source: Annotated[str, Meta(description="What told it.")] = ""
+    other_sd: Annotated[float, Meta(ge=0, description="By which bodies of another origin depart.")]
+    other_source: Annotated[str, Meta(description="What told it.")]
 
     def __post_init__(self) -> None:
         s = len(self.powers)
@@ -106,24 +106,24 @@ class Spread(Record, eq=False):
 class BodyLaw(Record, eq=False, kw_only=True):
     """What is learned over a population: Eq 6 by the depth of the fat, its residual, and what a map does not show."""
 
-    source: Annotated[str, Meta(description="What the table was made of.")] = ""
+    source: Annotated[str, Meta(description="What the table was made of.")]
     bodies: Annotated[
         Mapping[str, tuple[float, float]], Meta(description="Ranges of its lumps and bodies, by its columns.")
-    ] = field(default_factory=dict)
+    ]
     recipe: Recipe
     centre: Centre
     eq6: Eq6Law
-    residual: Annotated[Residual | None, Meta(description="null for Eq 6 alone.")] = None
+    residual: Annotated[Residual | None, Meta(description="null for Eq 6 alone.")]
     spread: Spread
     round_lumps: RoundLumps
-    depth: Annotated[FatDepth | None, Meta(description="null where the table's maps did not tell it.")] = None
+    depth: Annotated[FatDepth | None, Meta(description="null where the table's maps did not tell it.")]
     feature_powers: Annotated[tuple[Power, ...], Meta(description="Of u, v and w in the features of a map.")]
     information_inverse: Annotated[Matrix, Meta(description="For the leverage of a map, over its features.")]
     most_leverage: Annotated[Above0, Meta(description="Of maps inside the table.")]
-    domain: Annotated[Mapping[str, Range], Meta(description="Ranges of amplitude, sigma_mm and d_mm in the table.")]
-    hidden: Annotated[HiddenTerms | None, Meta(description="What B is made of.")] = None
-    hidden_any: Annotated[HiddenTerms | None, Meta(description="The same where the depth is not known.")] = None
-    fit: Annotated[Mapping[str, float], Meta(description="Figures of the fit.")] = field(default_factory=dict)
+    domain: Domain
+    hidden: Annotated[HiddenTerms | None, Meta(description="What B is made of.")]
+    hidden_any: Annotated[HiddenTerms | None, Meta(description="The same where the depth is not known.")]
+    fit: Annotated[Mapping[str, float], Meta(description="Figures of the fit.")]
 
     def __post_init__(self) -> None:
         s, c = len(self.spread.powers), len(self.feature_powers)

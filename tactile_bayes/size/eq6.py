@@ -33,7 +33,7 @@ from tactile_bayes.size.terms import (
     LEARN_ANEW,
     ONE_WIDTH,
     Above0,
-    Range,
+    Domain,
     Recipe,
     Share,
     beyond_lumps,
@@ -62,7 +62,7 @@ class Eq6Law(Record, eq=False):
     covariance: Matrix
     log_amplitude_one_deep: Annotated[
         float, Meta(description="ln a of lumps one diameter deep, where Delta sigma is 1: e = exp(-f times this).")
-    ] = 0.0
+    ]
 
     def __post_init__(self) -> None:
         k = len(self.powers)
@@ -112,7 +112,7 @@ class AxisCalibration(Record, eq=False):
 
     draws: Annotated[Matrix, Meta(description="m, b (mm), e, f, scatter and its slope in each row.")]
     reference_amplitude: Annotated[Above0, Meta(description="Of the scatter.")]
-    domain: Annotated[Mapping[str, Range], Meta(description="Ranges of amplitude, sigma_mm and d_mm in the table.")]
+    domain: Domain
     fit: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -160,8 +160,8 @@ class LeftOutErrors(Record):
     cases: Annotated[int, Meta(ge=1)]
     geometries: Annotated[int, Meta(ge=1)]
     least_stiffness_ratio: Annotated[Share, Meta(description="Softer lumps took no part.")]
-    eq6: Mapping[str, Share]
-    log_quadratic: Mapping[str, Share]
+    eq6: Annotated[Mapping[str, Share], Meta(extra_json_schema={"required": ["both"]})]
+    log_quadratic: Annotated[Mapping[str, Share], Meta(extra_json_schema={"required": ["both"]})]
 
     def __post_init__(self) -> None:
         if not {"both"} <= set(self.eq6) <= {"x", "y", "both"} or set(self.log_quadratic) != set(self.eq6):

@@ -20,9 +20,11 @@ from tactile_bayes.inference.normal import normal_quantile
 from tactile_bayes.presets import INTERVAL, Background, Noise
 
 LEARN_ANEW: Final = "learn the calibration anew"
+_NEEDED: Final = {"required": ["amplitude", "sigma_mm", "d_mm"]}
 Normalise = Literal["mean", "gain", "none"]
 Range = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
-Domain = Mapping[str, tuple[float, float]]
+Domain = Annotated[Mapping[str, Range], Meta(description="Ranges in the table.", extra_json_schema=_NEEDED)]
+"""Of amplitude, sigma_mm (geometric mean) and d_mm."""
 Share = Annotated[float, Meta(ge=0)]
 Above0 = Annotated[float, Meta(gt=0)]
 FARTHEST: Final = {"amplitude": 2.0, "sigma_mm": 1.2}
@@ -77,12 +79,12 @@ def _raised(value: FloatArray, highest: int) -> list[FloatArray]:
 class Recipe(Record):
     """How a table's maps were built and fitted; a patient's map must agree."""
 
-    normalise: Annotated[Normalise, Meta(description="As the option of `map`.")] = "mean"
-    background: Annotated[Background, Meta(description="Whether the fit had a level of its own.")] = "fixed"
-    radius_mm: Annotated[float, Meta(gt=0, description="Of the fitted window.")] = 20.0
+    normalise: Annotated[Normalise, Meta(description="As the option of `map`.")]
+    background: Annotated[Background, Meta(description="Whether the fit had a level of its own.")]
+    radius_mm: Annotated[float, Meta(gt=0, description="Of the fitted window.")]
     declared: Annotated[
         bool, Meta(description="true: stated for a table made elsewhere; false: the program made the maps.")
-    ] = True
+    ]
     noise: Annotated[Noise, Meta(description="independent: least squares; field: correlated noise.")] = "independent"
     flat_field: Annotated[
         bool | None, Meta(description="Whether the head's own response was taken off; null where nobody says.")
@@ -141,7 +143,7 @@ class RoundLumps(Record, eq=False):
     exam_sd: Annotated[float, Meta(ge=0, description="Between exams of a body.")]
     map_factor: Annotated[
         float, Meta(ge=0, description="Variance over that of a map's posterior: deep and faint lumps are off by more.")
-    ] = 1.0
+    ]
 
     def variance(self, of_maps: FloatArray, *, maps: int = 1) -> FloatArray:
         """Variance of the mean excess over some maps of a mass, whose posteriors give its mean this variance."""
@@ -212,15 +214,15 @@ class SiteShift(Record, eq=False):
     covariance: Matrix
     phantoms: Annotated[int, Meta(ge=3, description="Distinct lumps.")]
     maps: Annotated[int, Meta(ge=3)]
-    base: Annotated[str, Meta(description="Name of the calibration that is corrected.")] = ""
+    base: Annotated[str, Meta(description="Name of the calibration that is corrected.")]
     uses_fat: Annotated[
         bool,
         Meta(description="Whether the phantoms were sized with the depth of fat; if not, no size with this is."),
-    ] = True
+    ]
     fit: Annotated[
         Mapping[str, float],
         Meta(description="log_width: mean p of the phantoms; spread_factor; sd_before and sd_after: RMS of ln d."),
-    ] = field(default_factory=dict)
+    ]
     cautions: Annotated[tuple[str, ...], Meta(description="Why it should be looked at.")] = ()
     left_out: Annotated[tuple[str, ...], Meta(description="Phantoms that took no part, and why.")] = ()
     parameters: tuple[Literal["c0"], Literal["c1"]] = ("c0", "c1")

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 from in_process import run_here
+from plain_calibration import RECIPE
 from posterior_files import write_calibration, write_maps
 from settings_files import settings
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.schema import check_document, load_schema
-from tactile_bayes.size.terms import Recipe
 
 Run = Callable[..., "CompletedProcess[str]"]
 FAST = ("--method", "laplace")
@@ -28,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("estimate")
     write_maps(place)
     write_calibration(place / "size.json")
-    write_calibration(place / "other.json", Recipe(normalise="gain", radius_mm=15.0))
+    write_calibration(place / "other.json", replace(RECIPE, normalise="gain", radius_mm=15.0))
     return place
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plain_calibration import RECIPE
 from posterior_maps import TRUTH, bump_map, correlated_field, grid_map
 
 from tactile_bayes.declarations import replace
@@ -30,7 +31,7 @@ def calibration(recipe: Recipe | None = None, *, b: float = 1.0) -> SizeCalibrat
         0.05 * np.random.default_rng(72).standard_normal((200, 6))
     )
     axis = AxisCalibration(rows, 0.3, DOMAIN)
-    return SizeCalibration(axis, axis, 0.8, recipe or Recipe())
+    return SizeCalibration(axis, axis, 0.8, recipe or RECIPE)
 
 
 def run(
@@ -122,8 +123,8 @@ def test_the_size_is_equation_6_of_the_map() -> None:
 @pytest.mark.parametrize(
     ("recipe", "words"),
     [
-        (Recipe(normalise="gain"), "normalise mean (the calibration: gain)"),
-        (Recipe(background="free"), "background fixed (the calibration: free)"),
+        (replace(RECIPE, normalise="gain"), "normalise mean (the calibration: gain)"),
+        (replace(RECIPE, background="free"), "background fixed (the calibration: free)"),
         (Recipe(radius_mm=15.0), "fit radius 20 mm (the calibration: 15 mm)"),
     ],
 )

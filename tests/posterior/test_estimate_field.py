@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plain_calibration import RECIPE
 from posterior_maps import TRUTH, bump_map, bump_values, correlated_field, grid_map
 
 from tactile_bayes.declarations import replace
@@ -12,7 +13,6 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
-from tactile_bayes.size.terms import Recipe
 
 FIELD = EstimateOptions(method="importance", fit=FitOptions(background="free", noise="field"))
 
@@ -33,7 +33,7 @@ def calibration(noise: str) -> SizeCalibration:
         0.3,
         {"amplitude": (0.02, 4.0), "sigma_mm": (1.4, 12.0), "d_mm": (5.0, 25.0)},
     )
-    return SizeCalibration(axis, axis, 0.8, Recipe(background="free", noise=noise))
+    return SizeCalibration(axis, axis, 0.8, replace(RECIPE, background="free", noise=noise))
 
 
 @pytest.mark.parametrize("method", ["laplace", "importance", pytest.param("ensemble", marks=pytest.mark.slow)])

@@ -107,7 +107,7 @@ def test_an_uncertain_coefficient_matters_by_what_changes_of_its_term(growth):
 
 
 def test_a_sites_correction_is_shared_too():
-    site = SiteShift(1.5, np.array([0.1, 0.0]), np.diag([0.05**2, 0.1**2]), phantoms=5, maps=10)
+    site = SiteShift(1.5, np.array([0.1, 0.0]), np.diag([0.05**2, 0.1**2]), 5, 10, "b", True, {})
     use = replace(calibration(), site=site)
     apart = joint([shape(2.6)], [shape(3.0, seed=1)], use=use)
     expected = 2 * (EXAM_SD**2 + NOISE**2) + (0.1 * 0.4) ** 2

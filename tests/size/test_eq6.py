@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_calibration import RECIPE
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
@@ -38,7 +39,7 @@ def synthetic(
 
 
 def learned(seed: int, **options: Any) -> SizeCalibration:
-    return learn_size_calibration(synthetic(seed, **options), recipe=Recipe(), rng=np.random.default_rng(seed))
+    return learn_size_calibration(synthetic(seed, **options), recipe=RECIPE, rng=np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +114,7 @@ def test_faint_and_sunken_rows_are_left_out() -> None:
     sunken = table.amplitude.copy()
     sunken[:10] = [-0.1, 0.0] * 5
     changed = SizeTable(table.d_mm, sunken, table.sigma_x_mm, None)
-    found = learn_size_calibration(changed, recipe=Recipe(), rng=np.random.default_rng(3))
+    found = learn_size_calibration(changed, recipe=RECIPE, rng=np.random.default_rng(3))
     assert found.x.fit["rows"] == 50.0
     assert found.x.domain["amplitude"][0] > 0
 
@@ -134,13 +135,13 @@ def cut(table: SizeTable, rows: slice, **changes: np.ndarray) -> SizeTable:
 )
 def test_a_table_that_cannot_teach_is_refused(table: SizeTable, words: str) -> None:
     with pytest.raises(BadDataError, match=words):
-        learn_size_calibration(table, recipe=Recipe(), rng=np.random.default_rng(1))
+        learn_size_calibration(table, recipe=RECIPE, rng=np.random.default_rng(1))
 
 
 def test_one_amplitude_leaves_f_to_its_prior() -> None:
     table = synthetic(5, depths=False, lumps=4)
     flat = cut(table, slice(24), amplitude=np.full(24, 0.3))
-    f = learn_size_calibration(flat, recipe=Recipe(), rng=np.random.default_rng(1)).x.draws[:, 3]
+    f = learn_size_calibration(flat, recipe=RECIPE, rng=np.random.default_rng(1)).x.draws[:, 3]
     assert f.mean() == pytest.approx(-0.3, abs=0.1)
     assert f.std() == pytest.approx(0.5, rel=0.2)
 
@@ -206,6 +207,8 @@ def put(value: Any, *where: Any) -> Callable[[dict[str, Any]], None]:
     [
         (drop("x"), "has no x"),
         (drop("recipe"), "has no recipe"),
+        (lambda document: document["recipe"].pop("normalise"), "recipe has no normalise"),
+        (lambda document: document["x"]["domain"].pop("d_mm"), "domain has no d_mm"),
         (put("tactile-bayes/size-calibration/2", "schema"), "schema"),
         (put("log-quadratic", "form"), "form"),
         (put("median", "recipe", "normalise"), "recipe.normalise"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import run_here
+from plain_calibration import RECIPE
 from posterior_files import MADE
 from posterior_maps import bump_map
 from scipy.special import ndtr
@@ -26,7 +27,6 @@ from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.spread import BetweenMaps
-from tactile_bayes.size.terms import Recipe
 
 SEEDS = 24
 PROBABILITY = 0.95
@@ -87,7 +87,7 @@ def test_ends_of_a_size_by_eq_6_stray_by_no_more_than_is_told() -> None:
     axis = AxisCalibration(
         rows, reference_amplitude=0.3, domain={"amplitude": (0, 1), "sigma_mm": (1, 9), "d_mm": (5, 25)}
     )
-    eq6 = SizeCalibration(axis, axis, 0.5, Recipe())
+    eq6 = SizeCalibration(axis, axis, 0.5, RECIPE)
 
     def make(rng: np.random.Generator):
         a, sx, sy = (m * np.exp(0.02 * rng.standard_normal((1, 4000))) for m in (0.3, 5.0, 4.5))

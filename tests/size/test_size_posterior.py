@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from plain_calibration import RECIPE
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
-from tactile_bayes.size.terms import Recipe, outside_domain
+from tactile_bayes.size.terms import outside_domain
 
 N = 40_000
 DOMAIN = {"amplitude": (0.05, 0.8), "sigma_mm": (2.0, 9.0), "d_mm": (5.0, 25.0)}
@@ -25,7 +27,7 @@ X, Y = axis(), axis(m=1.5, b=2.0)
 
 
 def calibration(x: AxisCalibration = X, y: AxisCalibration = Y, *, correlation: float = 0.0) -> SizeCalibration:
-    return SizeCalibration(x, y, correlation, Recipe())
+    return SizeCalibration(x, y, correlation, RECIPE)
 
 
 def push(
@@ -145,15 +147,15 @@ def test_outside_the_table_is_said_with_its_range() -> None:
 )
 def test_another_recipe_is_named(changes: dict[str, object], words: str) -> None:
     same = {"normalise": "mean", "background": "fixed", "radius_mm": 20.0, "noise": "independent", "flat_field": False}
-    recipe = Recipe(flat_field=False)
+    recipe = replace(RECIPE, flat_field=False)
     assert recipe.differences(**same) == []
     assert recipe.differences(**(same | changes)) == [words]
 
 
 def test_a_table_or_a_map_that_does_not_say_differs_from_none() -> None:
     same = {"normalise": "mean", "background": "fixed", "radius_mm": 20.0, "noise": "independent"}
-    assert Recipe().differences(**same, flat_field=True) == []
-    assert Recipe(flat_field=True).differences(**same, flat_field=None) == []
+    assert RECIPE.differences(**same, flat_field=True) == []
+    assert replace(RECIPE, flat_field=True).differences(**same, flat_field=None) == []
 
 
 def test_shapes_are_checked() -> None:

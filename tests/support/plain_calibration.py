@@ -8,7 +8,9 @@ from tactile_bayes.size.bodies import QUADRATIC, BodyCalibration, Centre, Spread
 from tactile_bayes.size.eq6 import PLAIN, Eq6Law
 from tactile_bayes.size.terms import HiddenTerms, Recipe, RoundLumps
 
-CENTRE = Centre(-1.0, 1.5)
+RECIPE = Recipe("mean", "fixed", 20.0, declared=True)
+"""As tables are made that do not say how."""
+CENTRE = Centre(-1.0, 1.5, 0.0)
 
 
 def plain_calibration(
@@ -20,17 +22,22 @@ def plain_calibration(
     normalise: str = "mean",
 ) -> BodyCalibration:
     """Coefficients known to 1e-3; the variance of f, the slope by ln a, may be larger."""
+    spread = np.array([np.log(body_sd), *np.zeros(5)])
     return BodyCalibration(
         centre=CENTRE,
-        eq6=Eq6Law(PLAIN, np.array([2.5, -0.3, 0.0]), np.diag([1e-6, amplitude_variance, 1e-6])),
-        spread=Spread(
-            QUADRATIC[:6], np.array([np.log(body_sd), *np.zeros(5)]), np.eye(6) * 1e-6, float(np.log(exam_sd)), 1e-6
-        ),
-        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.02, 0.01),
+        eq6=Eq6Law(PLAIN, np.array([2.5, -0.3, 0.0]), np.diag([1e-6, amplitude_variance, 1e-6]), 0.0),
+        spread=Spread(QUADRATIC[:6], spread, np.eye(6) * 1e-6, float(np.log(exam_sd)), 1e-6, 0.0, ""),
+        round_lumps=RoundLumps(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.02, 0.01, 1.0),
         feature_powers=QUADRATIC[:6],
         information_inverse=np.eye(6) * 1e-2,
         most_leverage=1.0,
         domain={"amplitude": (0.01, 5.0), "sigma_mm": (1.0, 12.0), "d_mm": (5.0, 30.0)},
         recipe=Recipe(normalise, "free", 20.0, False, "field"),
         hidden=hidden,
+        hidden_any=None,
+        source="",
+        bodies={},
+        residual=None,
+        depth=None,
+        fit={},
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from plain_calibration import RECIPE
 from posterior_maps import bump_map
 
 from tactile_bayes.files.map_nc import write_map
@@ -30,4 +31,4 @@ def write_calibration(path: Path, recipe: Recipe | None = None) -> None:
     spread = np.exp(0.05 * np.random.default_rng(92).standard_normal((100, 6)))
     domain = {"amplitude": (0.05, 0.8), "sigma_mm": (2.0, 9.0), "d_mm": (5.0, 25.0)}
     axis = AxisCalibration(np.array([[1.6, 1.0, 0.6, -0.35, 0.1, 0.2]]) * spread, 0.3, domain, {"r2": 0.9})
-    write_size_calibration(path, SizeCalibration(axis, axis, 0.8, recipe or Recipe()), provenance=MADE)
+    write_size_calibration(path, SizeCalibration(axis, axis, 0.8, recipe or RECIPE), provenance=MADE)

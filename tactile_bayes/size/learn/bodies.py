@@ -100,7 +100,7 @@ class TableRows(Record, eq=False):
             known = table.rows(np.isfinite(table.profile.sum(axis=1)))
             known = known if len(np.unique(known.body)) >= LEAST_BODIES else None
         if known is None or known.profile is None or known.log_fat is None:
-            centre = Centre(_rounded_mean(table.log_amplitude), _rounded_mean(table.log_width))
+            centre = Centre(_rounded_mean(table.log_amplitude), _rounded_mean(table.log_width), 0.0)
             u, v = table.log_amplitude - centre.log_amplitude, table.log_width - centre.log_width
             return cls(table, None, centre, np.column_stack([u, v, np.zeros(len(table))]))
         depth = learn_depth(known.profile, known.log_fat)
@@ -209,7 +209,7 @@ def _calibration(rows: TableRows, learned: Learned, *, recipe: Recipe, source: s
         centre=rows.centre,
         eq6=Eq6Law(eq6.rows.powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
         residual=None if fitted is None else fitted.residual,
-        spread=Spread(rows.spread_powers, spread, of_spread, exam.log_sd, exam.variance),
+        spread=Spread(rows.spread_powers, spread, of_spread, exam.log_sd, exam.variance, 0.0, ""),
         round_lumps=learn_round(maps, monomials(list(rows.values.T), rows.spread_powers)),
         feature_powers=rows.feature_powers,
         information_inverse=inverse,
@@ -218,8 +218,10 @@ def _calibration(rows: TableRows, learned: Learned, *, recipe: Recipe, source: s
         recipe=recipe,
         depth=rows.depth,
         hidden=hidden_terms(maps, data, body=learned.left, body_sd=body_sd, features=features),
+        hidden_any=None,
         fit=error_figures(maps, data, spreads, -learned.left, held),
         source=source,
+        bodies={},
     )
     return found if rows.depth is None else replace(found, hidden_any=_hidden_at_any_depth(found, maps, data))
 

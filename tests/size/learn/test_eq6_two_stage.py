@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from plain_calibration import RECIPE
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.plane.study import StudyRow, learn_as_printed
@@ -20,7 +21,6 @@ from tactile_bayes.size.learn.eq6 import (
     other_fit,
     width_changes,
 )
-from tactile_bayes.size.terms import Recipe
 
 TRUTH = np.array([6.6, -6.8, 0.59, -0.32])
 DEPTHS = (0.6, 0.8, 1.0, 1.2, 1.5)
@@ -90,7 +90,7 @@ def test_draws_are_about_the_fit_of_the_study() -> None:
     assert table.depth_ratio is not None
     columns = zip(table.d_mm, table.depth_ratio, table.amplitude, table.sigma_x_mm, strict=True)
     printed = learn_as_printed([StudyRow("centred", d, h, 100.0, a, s, 0.001, True) for d, h, a, s in columns])
-    calibration = learn_two_stage(table, recipe=Recipe(), rng=np.random.default_rng(1))
+    calibration = learn_two_stage(table, recipe=RECIPE, rng=np.random.default_rng(1))
     draws = calibration.x.draws
     assert printed is not None
     assert draws.shape == (1000, 6)
@@ -98,7 +98,7 @@ def test_draws_are_about_the_fit_of_the_study() -> None:
     assert (draws[:, [2, 4]] > 0).all()
     assert (draws[:, :4].std(axis=0) > 0).all()
     # from exact rows there is next to nothing to be unsure of
-    exact = learn_two_stage(known_eq6(4, scatter=1e-6), recipe=Recipe(), rng=np.random.default_rng(1)).x.draws
+    exact = learn_two_stage(known_eq6(4, scatter=1e-6), recipe=RECIPE, rng=np.random.default_rng(1)).x.draws
     assert (exact.std(axis=0)[:4] < 1e-3 * draws.std(axis=0)[:4]).all()
 
 
@@ -111,7 +111,7 @@ def test_intervals_of_the_two_stage_fit_hold_as_few_diameters_allow(monkeypatch:
     def held() -> float:
         inside = []
         for i in range(80):
-            draws = learn_two_stage(known_eq6(i, scatter=0.17), recipe=Recipe(), rng=np.random.default_rng(i)).x.draws[
+            draws = learn_two_stage(known_eq6(i, scatter=0.17), recipe=RECIPE, rng=np.random.default_rng(i)).x.draws[
                 :, :4
             ]
             low, high = np.quantile(draws, [0.05, 0.95], axis=0)
@@ -125,7 +125,7 @@ def test_intervals_of_the_two_stage_fit_hold_as_few_diameters_allow(monkeypatch:
 
 def test_the_report_tells_how_far_the_other_fit_lies() -> None:
     table = known_eq6(4, scatter=0.1)
-    calibration = learn_two_stage(table, recipe=Recipe(), rng=np.random.default_rng(1))
+    calibration = learn_two_stage(table, recipe=RECIPE, rng=np.random.default_rng(1))
     other = other_fit(calibration, table)
     assert other is not None
     assert other.name == "joint"
@@ -138,7 +138,7 @@ def test_the_report_tells_how_far_the_other_fit_lies() -> None:
     assert f"joint fit of all rows: m {other.coefficients[0][0]:.2f}" in text
     # an exact table leaves nothing between them
     exact = known_eq6(4, scatter=1e-3)
-    same = other_fit(learn_two_stage(exact, recipe=Recipe(), rng=np.random.default_rng(1)), exact)
+    same = other_fit(learn_two_stage(exact, recipe=RECIPE, rng=np.random.default_rng(1)), exact)
     assert same is not None
     assert same.difference[0] < 0.01
 
@@ -147,10 +147,10 @@ def test_without_depths_two_stages_are_refused_and_not_told() -> None:
     table = known_eq6(2, scatter=0.05)
     bare = SizeTable(table.d_mm, table.amplitude, table.sigma_x_mm, None)
     with pytest.raises(BadDataError, match="no depth_ratio"):
-        learn_two_stage(bare, recipe=Recipe(), rng=np.random.default_rng(1))
+        learn_two_stage(bare, recipe=RECIPE, rng=np.random.default_rng(1))
     few = SizeTable(
         table.d_mm, table.amplitude, table.sigma_x_mm, None, table.width_change_x, None, None,
         np.where(table.d_mm > 10, 2.0, table.depth_ratio),
     )  # fmt: skip
     with pytest.raises(BadDataError, match="2 diameters at depth_ratio 1"):
-        learn_two_stage(few, recipe=Recipe(), rng=np.random.default_rng(1))
+        learn_two_stage(few, recipe=RECIPE, rng=np.random.default_rng(1))
