@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from tactile_bayes.trial import accuracy, method_comparison, origin_line, patient_limits
-from tactile_bayes.trial.bland_altman import limits
-from tactile_bayes.trial.bootstrap import Intervals, Method
-from tactile_bayes.trial.check_intervals import ErrorModel, simulate
-from tactile_bayes.trial.concordance import concordance
-from tactile_bayes.trial.figures import Figure
-from tactile_bayes.trial.lines import deming, least_squares
+from tactile_bayes.trial import accuracy, method_comparison
+from tactile_bayes.trial import accuracy as origin_line
+from tactile_bayes.trial import limits as patient_limits
+from tactile_bayes.trial.figures import Figure, Intervals, Method
+from tactile_bayes.trial.limits import limits
+from tactile_bayes.trial.lines import concordance, deming, least_squares
 from tactile_bayes.trial.method_comparison import compare_methods
+from tactile_bayes.trial.planning import ErrorModel, simulate
 from tactile_bayes.trial.readings import ModalitySizes
 
 Ends = tuple[float, float]
@@ -103,7 +103,9 @@ def _truth(sizes: ModalitySizes) -> dict[str, float]:
 
 
 def _figures(sizes: ModalitySizes, confidence: float) -> dict[str, Figure]:
-    found = accuracy.figures(sizes, confidence=confidence) | origin_line.figures(sizes, confidence=confidence)
+    found = accuracy.accuracy_figures(sizes, confidence=confidence) | origin_line.origin_line_figures(
+        sizes, confidence=confidence
+    )
     return found | dict(compare_methods(sizes, confidence=confidence).figures)
 
 

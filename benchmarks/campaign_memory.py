@@ -23,13 +23,12 @@ from pathlib import Path
 
 import psutil
 
-from tactile_bayes.batch import run_batch
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.batch import LocalWorkers, open_executor, run_batch
+from tactile_bayes.campaign.settings import put_in_place
+from tactile_bayes.campaign.steps import Task, run_step
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.executors import LocalWorkers, open_executor
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.pipeline.campaign_staging import put_in_place
-from tactile_bayes.pipeline.campaign_steps import Task, run_step
-from tactile_bayes.pipeline.settings import Settings
 
 FIRST, SHOWN = 30, (1, 10, 30, 60, 100, 150, 200, 250, 300)
 

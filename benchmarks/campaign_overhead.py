@@ -25,16 +25,16 @@ from unittest import mock
 import psutil
 
 from benchmarks.campaign_scale import PORT, Cluster, Watch, entries
-from tactile_bayes.batch import run_batch
-from tactile_bayes.executors import open_executor
+from tactile_bayes.batch import open_executor, run_batch
+from tactile_bayes.campaign import report as campaign_report
+from tactile_bayes.campaign import run as campaigns
+from tactile_bayes.campaign import stages as campaign_stages
+from tactile_bayes.campaign import tables as campaign_tables
+from tactile_bayes.campaign.inputs import Sources, open_campaign
+from tactile_bayes.campaign.settings import CampaignSettings
+from tactile_bayes.campaign.steps import Task
 from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, JOURNAL
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.pipeline import campaign as campaigns
-from tactile_bayes.pipeline import campaign_report, campaign_stages, campaign_tables
-from tactile_bayes.pipeline.campaign_folder import open_campaign
-from tactile_bayes.pipeline.campaign_inputs import Sources
-from tactile_bayes.pipeline.campaign_settings import CampaignSettings
-from tactile_bayes.pipeline.campaign_steps import Task
 
 
 @contextmanager

@@ -11,10 +11,9 @@ from typing import get_args
 
 import numpy as np
 
-from tactile_bayes.trial.bootstrap import Intervals, Method
-from tactile_bayes.trial.check_intervals import ErrorModel, check_intervals, simulate
-from tactile_bayes.trial.comparison import mape_ratio
-from tactile_bayes.trial.proportion import clopper_pearson
+from tactile_bayes.trial.accuracy import mape_ratio
+from tactile_bayes.trial.figures import Intervals, Method, clopper_pearson
+from tactile_bayes.trial.planning import ErrorModel, check_intervals, simulate
 from tactile_bayes.trial.readings import ModalitySizes
 
 METHODS = get_args(Method)

@@ -19,11 +19,11 @@ import numpy as np
 
 from benchmarks.masses_scenes import KINDS
 from benchmarks.scene_rates import ROWS, draw_map
+from tactile_bayes.api.estimating import answer_of, estimate_one
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.mapping.map import TactileMap
 
 RESULTS, EACH, SEED = "exam_time.jsonl", 12, 20261124
 RIBBED = ("round and a rib", "a rib and no lump")

@@ -36,10 +36,9 @@ from benchmarks.measure import environment
 from tactile_bayes.commands.study import fit_line
 from tactile_bayes.forward.body import Body
 from tactile_bayes.forward.contact import Head, solve_contact
-from tactile_bayes.forward.plane.condense import condense
-from tactile_bayes.forward.plane.line import MEAN_KPA, build_line, head_positions, press
-from tactile_bayes.forward.plane.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
-from tactile_bayes.forward.plane.strain import assemble, skin_average
+from tactile_bayes.forward.line import MEAN_KPA, build_line, head_positions, press
+from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
+from tactile_bayes.forward.plane_strain import assemble, condense, skin_average
 
 SCHEMA = "tactile-bayes/benchmark-forward/2"
 BODY = Body(15.0, 1.0)

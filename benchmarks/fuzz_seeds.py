@@ -81,7 +81,7 @@ def _npz(arrays: dict[str, np.ndarray[Any, Any]], *, packed: bool = False) -> by
 
 
 def _scan(folder: Path, frames: int) -> bytes:
-    from tactile_bayes.files.arrays_npz import read_arrays
+    from tactile_bayes.files.imports import read_arrays
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.files.scan_mcap import write_scan
 
@@ -182,7 +182,7 @@ def _jsons(folder: Path) -> list[bytes]:
 
 
 def _map(folder: Path) -> bytes:
-    from tactile_bayes.files.grid_import import read_grid
+    from tactile_bayes.files.imports import read_grid
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import Provenance
 
@@ -204,8 +204,8 @@ def _posterior() -> bytes:
 
 
 def _checkpoint(folder: Path) -> bytes:
-    from tactile_bayes.files.checkpoint_npz import CheckpointFile
-    from tactile_bayes.inference.chain_state import ChainState
+    from tactile_bayes.files.npz import CheckpointFile
+    from tactile_bayes.inference.ensemble import ChainState
 
     rng = np.random.default_rng(3)
     state = ChainState(
@@ -236,21 +236,21 @@ def _read_scan(path: Path) -> object:
 
 def _describe(path: Path) -> object:
     from tactile_bayes.commands.show import shown
+    from tactile_bayes.files.documents import dump_json
     from tactile_bayes.files.identify import describe
-    from tactile_bayes.files.schema import dump_json
 
     found = describe(path)
     return dump_json(found), shown(found)
 
 
 def _read_arrays(path: Path) -> object:
-    from tactile_bayes.files.arrays_npz import read_arrays
+    from tactile_bayes.files.imports import read_arrays
 
     return read_arrays(path)
 
 
 def _read_grid(path: Path) -> object:
-    from tactile_bayes.files.grid_import import read_grid
+    from tactile_bayes.files.imports import read_grid
 
     return read_grid(path, spacing_mm=None if path.suffix == ".npz" else 1.0)
 
@@ -274,19 +274,17 @@ def _read_wide(path: Path) -> object:
 
 def _read_tomls(path: Path) -> object:
     from tactile_bayes.files.column_map import read_mapping
-    from tactile_bayes.files.protocol import read_protocol
+    from tactile_bayes.files.documents import read_protocol, read_settings
     from tactile_bayes.files.scene_toml import read_scene
-    from tactile_bayes.files.settings_toml import read_settings
 
     return _first([lambda read=read: read(path) for read in (read_settings, read_protocol, read_mapping, read_scene)])
 
 
 def _read_jsons(path: Path) -> object:
-    from tactile_bayes.files.head_json import read_head_geometry
-    from tactile_bayes.files.instrument_json import read_array_calibration, read_landmarks
+    from tactile_bayes.files.estimate_json import read_stated_size
+    from tactile_bayes.files.instrument_json import read_array_calibration, read_head_geometry, read_landmarks
     from tactile_bayes.files.repeatability_json import read_repeatability
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.files.size_posterior import read_stated_size
 
     readers = (
         read_size_calibration, read_stated_size, read_head_geometry, read_array_calibration, read_landmarks,
@@ -318,13 +316,13 @@ def _read_map(path: Path) -> object:
 
 
 def _read_size(path: Path) -> object:
-    from tactile_bayes.files.size_posterior import read_stated_size
+    from tactile_bayes.files.estimate_json import read_stated_size
 
     return read_stated_size(path)
 
 
 def _read_checkpoint(path: Path) -> object:
-    from tactile_bayes.files.checkpoint_npz import CheckpointFile
+    from tactile_bayes.files.npz import CheckpointFile
 
     return CheckpointFile(path).load("key")
 

@@ -38,18 +38,18 @@ from benchmarks.own_trial import draw_mass_like_trial
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
-from tactile_bayes.forward.population import draw_mass
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white.fit import default_errors, fit_bump
+from tactile_bayes.posterior.white import default_errors, fit_bump
 from tactile_bayes.presets import FIELD_COSINES, POSE_NOISE
 from tactile_bayes.size.draws import SizePosterior
+from tactile_bayes.studies.population import draw_mass
 
 NOMINAL = 0.9
 AXIS = np.arange(-28.0, 28.5)

@@ -25,13 +25,13 @@ from scipy.stats import binomtest
 
 from benchmarks.lump_probability_scenes import JUDGE_SEED, LEARN_SEED, draw
 from benchmarks.smallest_lump import place_on_map
-from tactile_bayes.abstention import NO_LUMP
+from tactile_bayes.api.estimating import estimate_one
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.errors import NO_LUMP
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import estimate_one
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import Estimate
 
 LEARN, JUDGE = 160, 146

@@ -14,11 +14,11 @@ import numpy as np
 
 from benchmarks.stress import STRESSES
 from benchmarks.stress_frames import stressed_scan
-from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_body, draw_exam
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import Rib, fat_thickness
 from tactile_bayes.scan import Scan
+from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam
 
 LEARN_SEED, JUDGE_SEED = 20261126, 20261127
 BODIES: Final = BodyPrior(d_mm=(5.0, 25.0), depth_ratio=(0.56, 2.4))

@@ -28,12 +28,10 @@ from tactile_bayes.forward.scene import Head, Scene, Strokes
 from tactile_bayes.forward.simulate import head_positions
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid
-from tactile_bayes.mapping.cells import CellSums
-from tactile_bayes.mapping.frames import chunks
-from tactile_bayes.mapping.poses import FramePoses
-from tactile_bayes.mapping.project import ProjectedTaxels, Projection, Projector
-from tactile_bayes.mapping.readout import Readout
+from tactile_bayes.mapping.cells import CellSums, ProjectedTaxels, Projection, Projector, Readout
+from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.mapping.scatter import add_frames, chunk_frames
+from tactile_bayes.mapping.select import chunks
 from tactile_bayes.scan import ElementCalibration, HeadGeometry
 
 RATE_HZ = 200

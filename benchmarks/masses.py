@@ -26,12 +26,12 @@ from scipy.stats import binomtest
 
 from benchmarks.masses_scenes import KINDS, SEED, Exam, exams, make
 from benchmarks.scene_rates import ROWS, draw_map
+from tactile_bayes.api.estimating import answer_of, estimate_one
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.mapping.map import TactileMap
 
 RESULTS = "masses.jsonl"
 DRAWN = 150

@@ -17,10 +17,10 @@ import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_body, draw_exam, draw_mass
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
+from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam, draw_mass
 
 Kind = Literal["two", "one", "empty", "faint", "ribbed", "near", "single"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)

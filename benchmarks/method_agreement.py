@@ -20,18 +20,18 @@ import numpy as np
 
 from benchmarks.scene_rates import AXIS, gaussian, ridge
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.forward.population import ExamPrior, draw_exam
 from tactile_bayes.forward.scene import Lump
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
-from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.draw import Sampled, importance_draws
+from tactile_bayes.posterior.fit import FieldFit, fit_scene
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.search import search
+from tactile_bayes.studies.population import ExamPrior, draw_exam
 from tactile_bayes.studies.sbc import draw_field
 
 PROBABILITIES = (0.025, 0.5, 0.975)

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import tactile_bayes.trial.next_mass as model
+from tactile_bayes.api.trial_sampler import draw
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.pipeline.trial_sampler import draw
-from tactile_bayes.trial.check_intervals import ErrorModel
-from tactile_bayes.trial.proportion import clopper_pearson
+from tactile_bayes.trial.figures import clopper_pearson
+from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import MassKey, Reading
 
 LEVELS = (0.5, 0.8, 0.95)

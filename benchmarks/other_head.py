@@ -21,11 +21,11 @@ import numpy as np
 
 import tactile_bayes as tb
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.files.bodies_toml import read_bodies
-from tactile_bayes.files.head_json import read_simulated_head
-from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_mass
+from tactile_bayes.files.documents import read_bodies
+from tactile_bayes.files.instrument_json import read_simulated_head
 from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
+from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_mass
 
 SEED, TRIAL_SEED = 7, 20261215
 

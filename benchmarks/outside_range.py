@@ -27,17 +27,16 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.api.size_calibration import size_table
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.forward.population import BodyPrior, draw_mass
 from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.size_calibration import size_table
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import calibration_for, estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.size.bodies import BodyCalibration
@@ -46,6 +45,7 @@ from tactile_bayes.size.eq6 import SizeCalibration, push_sizes
 from tactile_bayes.size.learn.eq6 import SizeTable, learn_size_calibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.size.terms import Recipe
+from tactile_bayes.studies.population import BodyPrior, draw_mass
 
 SEED = 20261123
 FRAME_RATE_HZ = 40.0

@@ -36,14 +36,13 @@ Draw = Callable[[np.random.Generator], np.ndarray]
 def simulated_fit() -> Any:
     """The mode of a bump of 6 by 4.5 mm with white errors of 0.01 and a field of 0.01 and 4 mm, seed 1."""
     from tactile_bayes.forward.gaussian import cell_mean_gaussian
-    from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-    from tactile_bayes.posterior.correlated.fit import fit_scene
-    from tactile_bayes.posterior.correlated.marginal import independent_variance
-    from tactile_bayes.posterior.correlated.problem import Problem
-    from tactile_bayes.posterior.correlated.scene import Scene
-    from tactile_bayes.posterior.correlated.window import Window
-    from tactile_bayes.posterior.lump.bump import BumpPrior
-    from tactile_bayes.posterior.lump.cells import window_cells
+    from tactile_bayes.mapping.map import MapRecipe, TactileMap
+    from tactile_bayes.posterior.bump import BumpPrior
+    from tactile_bayes.posterior.field import Window
+    from tactile_bayes.posterior.fit import fit_scene
+    from tactile_bayes.posterior.fit_window import window_cells
+    from tactile_bayes.posterior.marginal import independent_variance
+    from tactile_bayes.posterior.scene import Problem, Scene
 
     rng = np.random.default_rng(1)
     axis = np.arange(-HALF_MM, HALF_MM + 1.0)
@@ -65,21 +64,21 @@ def simulated_fit() -> Any:
 
 def importance(fit: Any) -> Draw:
     """The program's default method, to the wanted accuracy."""
-    from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
+    from tactile_bayes.posterior.draw import Sampled, importance_draws
 
     return lambda rng: importance_draws(Sampled.of(fit), rng=rng, accuracy_sd=WANTED_SD).flat
 
 
 def laplace(fit: Any) -> Draw:
     """The program's Gaussians."""
-    from tactile_bayes.posterior.correlated.fit import laplace_mixture
+    from tactile_bayes.posterior.fit import laplace_mixture
 
     return lambda rng: laplace_mixture(fit, rng=rng).flat
 
 
 def ensemble(fit: Any) -> Draw:
     """The program's MCMC with its own stopping rule."""
-    from tactile_bayes.posterior.correlated.draw import Sampled, ensemble_draws
+    from tactile_bayes.posterior.draw import Sampled, ensemble_draws
     from tactile_bayes.posterior.options import EstimateOptions
 
     return lambda rng: ensemble_draws(Sampled.of(fit), rng=rng, options=EstimateOptions("ensemble")).flat

@@ -215,8 +215,8 @@ def run_scans(folder: Path, masses: int, spread: float, workers: int) -> None:
 def _write_scans(folder: Path, masses: int, spread: float) -> None:
     from tactile_bayes.files.provenance import Provenance
     from tactile_bayes.files.scan_mcap import write_scan
-    from tactile_bayes.forward.population import BodyPrior, draw_mass
     from tactile_bayes.forward.simulate import simulate
+    from tactile_bayes.studies.population import BodyPrior, draw_mass
 
     bodies = BodyPrior(d_mm=(9.0, 20.0), depth_ratio=(0.56, 1.2))
     rows, truth = ["file,patient,visit,mass,replicate"], {}

@@ -22,12 +22,12 @@ from scipy.stats import binomtest
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-from tactile_bayes.posterior.correlated.noise import LENGTHS_MM
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.field import LENGTHS_MM
+from tactile_bayes.posterior.masses import other_rises
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.other_rises import other_rises
 from tactile_bayes.studies.sbc import draw_field, draw_truth
 
 HALF_MM, RADIUS_MM = 35.0, 20.0

@@ -24,20 +24,20 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from tactile_bayes.api.estimating import estimate_inputs, estimate_one
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_body, draw_exam
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SolidLump
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import estimate_inputs, estimate_one
-from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.posterior import smallest_lump as model
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior import lump_probability as model
 from tactile_bayes.posterior.options import DETECTED
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.search import search
+from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam
 
 SEED, CHECK_SEED, EXAMS = 20261128, 20261129, 110
 FRAME_RATE_HZ = 50.0

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.forward.axisymmetric import CondensedLump, Tissue, condense_lump
+from tactile_bayes.forward.contact import ContactStiffness, press
+from tactile_bayes.forward.layers import LayeredBody, taxel_compliance
+from tactile_bayes.forward.mesh import LumpGeometry, MeshSize, lump_mesh
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.solid.axisymmetric import CondensedLump, Tissue, condense_lump
-from tactile_bayes.forward.solid.contact import ContactStiffness, press
-from tactile_bayes.forward.solid.frames import PlacedLump, SolidHead, skin_perturbation, solid_head
-from tactile_bayes.forward.solid.layers import LayeredBody, taxel_compliance
-from tactile_bayes.forward.solid.mesh import LumpGeometry, MeshSize, lump_mesh
-from tactile_bayes.forward.solid.scan import face_of
+from tactile_bayes.forward.solid import PlacedLump, SolidHead, skin_perturbation, solid_head
+from tactile_bayes.forward.solid_scan import face_of
 
 SCHEMA = "tactile-bayes/benchmarks/solid/1"
 LUMPS = {

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.stress_frames import Physics, VaryingLayers, stressed_scan
+from tactile_bayes.api.estimating import answer_of, estimate_one
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.errors import BadDataError, TactileBayesError
-from tactile_bayes.forward.population import BodyPrior, draw_mass
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.assumptions import broken_assumptions, skewed
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.pipeline.one_map import answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.mapping.map import broken_assumptions, skewed
 from tactile_bayes.scan import Scan
+from tactile_bayes.studies.population import BodyPrior, draw_mass
 
 SEED = 31
 BODIES = replace(BodyPrior(), d_mm=(8.0, 25.0), depth_ratio=(0.56, 1.2))

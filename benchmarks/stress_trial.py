@@ -19,13 +19,13 @@ import numpy as np
 
 from benchmarks.stress import BODIES, CONTROL, FRAME_RATE_HZ, STRESSES
 from benchmarks.stress_frames import stressed_scan
+from tactile_bayes.api.estimating import Answer, answer_of, estimate_one
+from tactile_bayes.api.pooled import pool_answers
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.forward.population import draw_mass
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.pipeline.one_map import Answer, answer_of, estimate_one
-from tactile_bayes.pipeline.pooled import pool_answers
-from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.scan import Scan
+from tactile_bayes.studies.population import draw_mass
 
 EXAMS = 3
 

@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
+from tactile_bayes.api.estimating import estimate_one, pooling_shape
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.errors import TactileBayesError
-from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_body, draw_exam
 from tactile_bayes.forward.scene import Scene, SceneLandmarks
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.pipeline.one_map import estimate_one, pooling_shape
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_body, draw_exam
 
 GROWTHS = (1.10, 1.20, 1.35, 0.80)
 VISITS, EXAMS = 3, 2

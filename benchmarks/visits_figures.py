@@ -14,7 +14,7 @@ from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray, apply, patient_from_base
-from tactile_bayes.report.compare_document import verdict
+from tactile_bayes.report.compare import verdict
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.pooling import SizePriors, pool_maps

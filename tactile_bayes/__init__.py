@@ -48,8 +48,8 @@ __all__ = [
 ]
 
 _HOME = {
-    "Comparison": "api.comparisons",
-    "Draws": "api.draws",
+    "Comparison": "api.comparing",
+    "Draws": "api.sized",
     "ExportedFiles": "api.exporting",
     "Map": "api.maps",
     "PooledSize": "api.estimates",
@@ -58,11 +58,11 @@ _HOME = {
     "build_map": "api.maps",
     "calibrate_repeatability": "api.trials",
     "calibrate_size": "api.trials",
-    "compare": "api.comparisons",
+    "compare": "api.comparing",
     "demo_map": "api.maps",
     "demo_scan": "api.maps",
     "estimate": "api.estimates",
-    "exam_report": "api.reports",
+    "exam_report": "api.estimates",
     "export": "api.exporting",
     "pool": "api.estimates",
     "read_map": "api.maps",

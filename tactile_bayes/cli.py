@@ -12,8 +12,7 @@ import click
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
-from tactile_bayes.interruption import ended_in_order
-from tactile_bayes.printing import ReaderGoneError, protect_streams, release_streams
+from tactile_bayes.shell import ReaderGoneError, ended_in_order, protect_streams, release_streams
 
 # name -> (module under tactile_bayes.commands, one line of help). A module is imported when its command runs.
 COMMANDS: dict[str, tuple[str, str]] = {

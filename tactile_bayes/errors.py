@@ -1,14 +1,17 @@
-"""Every error the program can explain in one line, each with the exit code it ends in.
-
-Exit codes: 0 done, 1 fault, 2 usage, 3 bad data, 4 device, 5 not converged, 6 no estimate, 130 interrupted, 141 the
-reader of the output has gone.
-"""
+"""Errors that a user can meet, their exit codes, and the reasons for giving no estimate."""
 
 from __future__ import annotations
 
 import math
 import numbers
 from collections.abc import Collection
+
+from tactile_bayes.records import dataclass
+
+# --- Every error the program can explain in one line, each with the exit code it ends in.
+#
+# Exit codes: 0 done, 1 fault, 2 usage, 3 bad data, 4 device, 5 not converged, 6 no estimate, 130 interrupted, 141
+# the reader of the output has gone.
 
 EXIT_DONE = 0
 EXIT_FAULT = 1
@@ -158,3 +161,35 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, TactileBayesError) and text:
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+# --- Reasons for giving no number: a sentence, a code for programs, and what would help.
+
+CODES = ("empty", "undetected", "ridge", "coarse", "unresolved", "window", "prior", "extrapolated", "method")
+NO_LUMP = ("empty", "undetected", "ridge")
+"""Codes of maps that show no lump; the others show one that cannot be measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Abstention:
+    """The reason for giving no number.
+
+    Parameters
+    ----------
+    code
+        One of `CODES`.
+    reason
+        With the figure and the limit.
+    advice
+        What would fix it, at the command line; empty when nothing would.
+    on_paper
+        The same for a reader of the exam's page, who has no command line.
+    about_mm
+        The place on the map that the reason is about; None where it is about no one place.
+    """
+
+    code: str
+    reason: str
+    advice: str = ""
+    on_paper: str = ""
+    about_mm: tuple[float, float] | None = None

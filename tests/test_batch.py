@@ -20,12 +20,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes import batch, executors
-from tactile_bayes.batch import BatchInterrupted, fault_lines, run_batch
+from tactile_bayes import batch
+from tactile_bayes import batch as executors
+from tactile_bayes.batch import (
+    BatchInterrupted,
+    InlineExecutor,
+    cluster_executor,
+    fault_lines,
+    local_executor,
+    open_executor,
+    run_batch,
+)
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.executors import InlineExecutor, cluster_executor, local_executor, open_executor
-from tactile_bayes.interruption import ended_in_order
+from tactile_bayes.shell import ended_in_order
 
 
 def draw(seed: int) -> tuple[int, float]:
@@ -158,7 +166,7 @@ def test_a_worker_killed_while_it_hands_over_its_result_holds_up_nobody(tmp_path
             import os, sys, time
             from pathlib import Path
             from tactile_bayes.batch import run_batch
-            from tactile_bayes.executors import local_executor
+            from tactile_bayes.batch import local_executor
 
             def large(item):
                 (Path(sys.argv[1]) / "writing").write_text(str(os.getpid()))
@@ -499,7 +507,7 @@ def test_a_killed_batch_resumes_and_its_workers_end(tmp_path, child_environment)
             from pathlib import Path
             from tactile_bayes.batch import run_batch
             from tactile_bayes.batch_store import BatchStore, open_store
-            from tactile_bayes.executors import local_executor
+            from tactile_bayes.batch import local_executor
 
             def slow(item):
                 (Path(sys.argv[1]) / f"pid-{os.getpid()}").touch()
@@ -622,7 +630,7 @@ def test_a_scheduler_killed_in_the_middle_is_one_line_and_what_is_done_is_kept(c
             """
             import sys, time
             from tactile_bayes.batch import fault_lines, run_batch
-            from tactile_bayes.executors import open_executor
+            from tactile_bayes.batch import open_executor
 
             def slow(item):
                 time.sleep(0.3)

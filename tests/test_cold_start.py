@@ -10,7 +10,7 @@ import pytest
 from tactile_bayes.cli import COMMANDS
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
 DEMO = Path(__file__).resolve().parent.parent / "tactile_bayes" / "demo"
 HEAVY = (
@@ -105,7 +105,7 @@ def test_the_laplace_estimate_imports_only_what_it_uses(run_python, estimate_inp
     map_path, calibration = estimate_inputs
     options = ("--size-calibration", calibration, "--method", "laplace", "--json")
     modules = imported_by(run_python("-c", RUN, "estimate", map_path, *options))
-    assert "tactile_bayes.inference.laplace" in modules
+    assert "tactile_bayes.inference.modes" in modules
     assert not modules & set(NOT_FOR_LAPLACE)
 
 

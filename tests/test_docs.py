@@ -20,7 +20,7 @@ import tactile_bayes as tb
 from tactile_bayes import errors
 from tactile_bayes.cli import COMMANDS, cli
 from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL, in_words
-from tactile_bayes.report.size_text import SOURCES
+from tactile_bayes.report.estimate_text import SOURCES
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

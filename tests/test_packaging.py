@@ -16,7 +16,7 @@ MOST_BYTES = 3_000_000
 
 LOAD = """
 import sys, tactile_bayes
-from tactile_bayes.files.schema import load_schema
+from tactile_bayes.files.documents import load_schema
 for name in sys.argv[1:]:
     assert load_schema(name)
 print(tactile_bayes.__file__)

@@ -1,4 +1,4 @@
-"""Estimates of a lump's size: from one map, or from several maps of one mass."""
+"""Estimates in Python: `estimate`, `pool`, `exam_report`, and what they return."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, in_keywords, plain, sequence_of
-from tactile_bayes.api.draws import Draws
-from tactile_bayes.api.maps import Map, map_of
-from tactile_bayes.api.paths import PathLike, output_path, path_of
-from tactile_bayes.api.sized import MassEstimate, Sized
+from tactile_bayes.api.estimating import Answer, Outcome, answer_of, estimate_one
+from tactile_bayes.api.exam_report import EstimatedMap, ExamFiles, Given, make_exam, read_exam
+from tactile_bayes.api.maps import Map, PathLike, map_of, output_path, path_of
+from tactile_bayes.api.settings import Settings, refuse_checkpoint
+from tactile_bayes.api.sized import Draws, MassEstimate, Sized
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.findings import Finding, findings_in
-from tactile_bayes.pipeline.one_map import Answer, Outcome, answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
+from tactile_bayes.report.exam_page import PageFiles
+from tactile_bayes.report.exam_words import Exam, headline
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tactile_bayes.pipeline.pooled import PooledOutcome
+    from tactile_bayes.api.pooled import PooledOutcome
     from tactile_bayes.size.draws import SizePosterior
     from tactile_bayes.size.site import Repeatability
+
+
+# --- Estimates of a lump's size: from one map, or from several maps of one mass.
 
 _SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 
@@ -47,8 +51,6 @@ class SizedExam(Sized):
         force: bool = False,
     ) -> None:
         """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
-        from tactile_bayes.api.reports import exam_report
-
         exam_report(self, path, pdf=pdf, title=title, name=name, day=day, force=force)
 
 
@@ -134,7 +136,7 @@ class SizeEstimate(SizedExam):
     @property
     def masses(self) -> tuple[MassEstimate, ...]:
         """All masses of the map, the surest first; this estimate is of the one that is `reported`."""
-        from tactile_bayes.report.masses_document import patient_mm
+        from tactile_bayes.report.estimate_document import patient_mm
 
         found, tactile_map = self.outcome.estimate, self.outcome.tactile_map
         return tuple(
@@ -216,7 +218,7 @@ class SizeEstimate(SizedExam):
     @property
     def _titled(self) -> str:
         """Name for the titles of figures, with the subject's code and the scan's digest."""
-        from tactile_bayes.report.figure_title import named_exam
+        from tactile_bayes.report.figure_file import named_exam
 
         return named_exam(self.name, self.outcome.provenance.scans)
 
@@ -357,7 +359,7 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     progress
         Called with effective draws done and wanted.
     **settings
-        As of `tactile_bayes.pipeline.settings.Settings`, by default as on the command line; `size_calibration` is a
+        As of `tactile_bayes.api.settings.Settings`, by default as on the command line; `size_calibration` is a
         name, a path or a calibration from `calibrate_size`, `known` a mapping such as ``{"seat": 1.2}``,
         `repeatability` a path or what `calibrate_repeatability` returns.
 
@@ -409,7 +411,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     BadDataError
         As of `estimate`, and when the maps were normalised in several ways.
     """
-    from tactile_bayes.pipeline.pooled import pool_answers
+    from tactile_bayes.api.pooled import pool_answers
 
     used = settings_of(settings)
     refuse_checkpoint(used)
@@ -435,7 +437,7 @@ def of_one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
 
     Estimates of a place that somebody gave stay as they are.
     """
-    from tactile_bayes.pipeline.one_mass import elsewhere
+    from tactile_bayes.api.pooled import elsewhere
 
     same = list(found)
     for i, place in elsewhere([one.answer.document for one in found]).items():
@@ -471,3 +473,80 @@ def _signature() -> inspect.Signature:
 
 
 estimate.__signature__ = _signature()  # type: ignore[attr-defined]
+
+
+# --- The page of an exam from Python.
+
+
+@door
+def exam_report(
+    files: Any,
+    path: PathLike,
+    *,
+    pdf: PathLike | None = None,
+    title: str = "",
+    name: str = "",
+    day: str = "",
+    force: bool = False,
+    **settings: Any,
+) -> str:
+    """Write one page of an exam as HTML, as ``tactile-bayes report`` does.
+
+    Parameters
+    ----------
+    files
+        Maps, estimates and pooled sizes, or the paths of their files; one, or a list. Several maps are repeats of one
+        mass and are pooled. A path of an estimate (JSON or posterior) goes alone, or with the path of its map.
+    path
+        Usually ``*.html``.
+    pdf
+        Also print the page there, by an installed Chromium or WeasyPrint.
+    title, name, day
+        To print on the page; nothing is where they are not given. The day as YEAR-MONTH-DAY.
+    **settings
+        As of `estimate`; estimates that are given keep their own.
+
+    Returns
+    -------
+    str
+        The page's headline.
+
+    Raises
+    ------
+    UsageError
+        When files do not fit each other, settings are given for an estimate's file, nothing is installed that prints,
+        or a file exists and `force` is false.
+    BadDataError
+        When a file is damaged or of another kind, or the maps are of different exams.
+    """
+    page = PageFiles(path_of(path), path_of(pdf), force)
+    page.check()
+    given = listed(files)
+    if not given:
+        raise UsageError("nothing was given to report; give maps, or an estimate")
+    exam = _exam(given, Given(title, name, day), settings)
+    page.write(exam)
+    return headline(exam)
+
+
+def _exam(given: Sequence[Any], words: Given, settings: dict[str, Any]) -> Exam:
+    """The exam of files alone, or of what Python holds."""
+    if all(isinstance(one, str | Path) for one in given):
+        files = ExamFiles.sort([path_of(one) for one in given])
+        if files.estimates and settings:
+            raise UsageError(f"an estimate has settings of its own; leave out {next(iter(settings))}, or give the map")
+        return read_exam(files, settings_of(settings), words)
+    found, used = _estimates(given, settings)
+    maps = [EstimatedMap(one.outcome.tactile_map, one.answer, one.outcome.provenance.scans) for one in found]
+    return make_exam(maps, used, words)
+
+
+def _estimates(given: Sequence[Any], settings: dict[str, Any]) -> tuple[tuple[SizeEstimate, ...], Settings]:
+    """Estimates of all maps, and the settings that pool them."""
+    if len(given) == 1 and isinstance(given[0], PooledSize):
+        return given[0].maps, given[0].settings
+    used = settings_of(settings)
+    if len(given) > 1:
+        refuse_checkpoint(used)
+    found = of_one_mass(estimated(given, settings))
+    return found, found[0].outcome.settings if len(found) == 1 else used

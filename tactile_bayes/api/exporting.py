@@ -10,14 +10,13 @@ from typing import Any
 
 from tactile_bayes.api.arguments import check_keywords, door
 from tactile_bayes.api.estimates import PooledSize, SizeEstimate, listed
-from tactile_bayes.api.maps import Map
-from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.maps import Map, PathLike, path_of
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, read_exam, shared_facts
-from tactile_bayes.exports.run import FORMATS, TAKES, Format, refuse_untaken
+from tactile_bayes.exports.identity import identity_of
+from tactile_bayes.exports.run import FORMATS, TAKES, Outputs, refuse_untaken
+from tactile_bayes.exports.run import ExportFormat as Format
 from tactile_bayes.exports.run import export as exported_files
-from tactile_bayes.exports.worklist import identity_of
-from tactile_bayes.exports.writing import Outputs
 from tactile_bayes.files.atomic import sha256
 
 _IN_PYTHON = Path("what was given in Python")

@@ -1,19 +1,20 @@
-"""Scans and tactile maps: read, simulate, build, show."""
+"""Scans and maps in Python: read, simulate, build."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
-from tactile_bayes.api.paths import PathLike, output_path, path_of, required_path
 from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.files.atomic import Format, check_suffix
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -25,8 +26,96 @@ if TYPE_CHECKING:
     from tactile_bayes.findings import Finding
     from tactile_bayes.forward.instrument import SimulatedScan
     from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.mapping.map import TactileMap
     from tactile_bayes.scan import Scan
+
+
+# --- Conversion of paths that Python callers give as str or Path.
+
+PathLike = str | os.PathLike[str]
+
+
+@overload
+def path_of(given: PathLike) -> Path: ...
+
+
+@overload
+def path_of(given: None) -> None: ...
+
+
+def path_of(given: PathLike | None) -> Path | None:
+    """Convert to a path, with ``~`` as the home folder; None stays None.
+
+    Raises
+    ------
+    UsageError
+        When it is neither text nor a path.
+    """
+    if given is None:
+        return None
+    if not isinstance(given, str | os.PathLike):
+        raise UsageError(f"a path is wanted, not {type(given).__name__}; give it as text or pathlib.Path")
+    return Path(given).expanduser()
+
+
+def required_path(given: PathLike, name: str) -> Path:
+    """Convert to the path of an input.
+
+    Raises
+    ------
+    UsageError
+        As `path_of`, and when it is None.
+    """
+    if given is None:
+        raise UsageError(f"{name} is None; give the path of a file")
+    return path_of(given)
+
+
+def output_path(given: PathLike, written: Format) -> Path:
+    """Convert to the path of an output.
+
+    Raises
+    ------
+    UsageError
+        As `path_of`, and when it has the suffix of another format than the one written.
+    """
+    path = required_path(given, "the path")
+    check_suffix(path, written)
+    return path
+
+
+# --- The provenance of a map of scan files.
+
+
+def map_provenance(paths: Sequence[Path], scans: Sequence[Scan], settings: Mapping[str, Any]) -> Provenance:
+    """Provenance of a map: its settings, the scans' digests, and what the scans say of their exam.
+
+    Parameters
+    ----------
+    paths, scans
+        The files, and what was read from each.
+    settings
+        By the names of the command's options.
+    """
+    from tactile_bayes.files.provenance import Provenance
+
+    facts = exam_facts(paths, scans)
+    inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
+    return Provenance("map", settings, inputs, scans=facts)
+
+
+def exam_facts(paths: Sequence[Path], scans: Sequence[Scan]) -> list[dict[str, str]]:
+    """Digests of each scan and what it says of its exam, for `Provenance.scans`."""
+    from tactile_bayes.files.atomic import sha256
+    from tactile_bayes.files.provenance import scan_facts
+
+    return [
+        scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path))
+        for path, scan in zip(paths, scans, strict=True)
+    ]
+
+
+# --- Scans and tactile maps: read, simulate, build, show.
 
 _DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
 
@@ -166,7 +255,6 @@ def build_map(scans: Any, **options: Any) -> Map:
     """
     from tactile_bayes.files.provenance import repeated_scans, scan_facts
     from tactile_bayes.mapping import build_map as build
-    from tactile_bayes.pipeline.scans import exam_facts
 
     check_keywords("build_map", options, set(inspect.signature(build).parameters) - {"scans"})
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
@@ -245,7 +333,7 @@ def map_of(given: Any) -> Map:
     UsageError
         When it is none of them.
     """
-    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.mapping.map import TactileMap
 
     if isinstance(given, Map):
         return given

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tactile_bayes.api.arguments import check_keywords, door
-from tactile_bayes.api.paths import PathLike, path_of
+from tactile_bayes.api.maps import PathLike, path_of
 from tactile_bayes.errors import DeviceError, UsageError, check_number
 
 if TYPE_CHECKING:
-    from tactile_bayes.hardware.account import Report
+    from tactile_bayes.hardware.recorder import Report
 
 _PATHS = ("like", "head_geometry", "array_calibration", "landmarks", "tracker_rom", "session_file")
 _RENAMED = {"head": "head_url", "tracker": "tracker_url", "session": "session_file"}
@@ -47,8 +47,7 @@ def record(output: PathLike, *, head: str, duration_s: float, **options: Any) ->
     UsageError
         When options contradict each other, or the file exists and `force` is false.
     """
-    from tactile_bayes.commands.record import command, make_recording
-    from tactile_bayes.commands.record_request import Request
+    from tactile_bayes.commands.record import Request, command, make_recording
 
     words = ["-o", str(path_of(output)), "--head", head]
     context = command.make_context("record", words)

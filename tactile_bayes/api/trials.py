@@ -1,25 +1,99 @@
-"""Size calibrations from lumps of known size, and reports of trials, from tables or DataFrames."""
+"""A trial's tables to its report, and tables of scans to a calibration."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from tactile_bayes.api.arguments import check_keywords, door, plain
-from tactile_bayes.api.paths import PathLike, output_path, path_of, required_path
+from tactile_bayes.api.maps import PathLike, output_path, path_of, required_path
 from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
     import pandas
 
-    from tactile_bayes.files.tables import Sheet
-    from tactile_bayes.pipeline.size_calibration import EqSixFit, PopulationForm
-    from tactile_bayes.pipeline.trial import TrialOutcome
+    from tactile_bayes.api.size_calibration import EqSixFit, PopulationForm
+    from tactile_bayes.api.trial_report import TrialOutcome
+    from tactile_bayes.files.tables import Sheet, Table
     from tactile_bayes.size.pooling import Calibration
     from tactile_bayes.size.site import Repeatability
+    from tactile_bayes.trial.readings import MassKey, Reading
+    from tactile_bayes.trial.visits import OtherVisits
+
+
+# --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.
+
+
+@dataclass(frozen=True, slots=True)
+class TrialInputs:
+    """Input of a trial's analysis, with every file read, by role.
+
+    The readings are those of each mass's last visit before excision; `other_visits` counts what that leaves out.
+    """
+
+    readings: list[Reading]
+    other_visits: OtherVisits
+    ex_vivo_mm: Mapping[MassKey, float]
+    ex_vivo_sd_mm: Mapping[MassKey, float | None]
+    files: dict[str, Path]
+
+
+def load_trial(
+    trial: Path | Sheet, excision: Path | Sheet, columns: Path | None, *, tidy_trial: bool = False
+) -> TrialInputs:
+    """Read and check both tables.
+
+    Parameters
+    ----------
+    columns
+        The mapping file of a wide table; None where both are tidy. One without ``[[reading]]`` is for the excision
+        sizes alone.
+    tidy_trial
+        Whether the trial is tidy whatever the mapping holds.
+    """
+    from tactile_bayes.files.column_map import read_mapping, read_wide
+    from tactile_bayes.files.estimate_json import fill_from_posteriors
+    from tactile_bayes.files.tables import Sheet, check_references, read_table
+    from tactile_bayes.trial.readings import readings_from_columns
+    from tactile_bayes.trial.visits import at_excision
+
+    sizes = read_excision(excision, columns)
+    if columns is None or tidy_trial or isinstance(trial, Sheet) or "reading" not in read_mapping(columns):
+        table = read_table(trial, "trial.table.json")
+    else:
+        table = read_wide(trial, columns)
+    check_references(table, "trial.table.json", targets={"excision": sizes})
+    filled, posteriors = fill_from_posteriors(table.columns, table.path.parent, fault=table.error)
+    keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
+    readings = readings_from_columns(filled, fault=table.error)
+    excised_on = dict(zip(keys, sizes.columns["date"], strict=True))
+    analysed, other_visits = at_excision(readings, excised_on, fault=table.error)
+    given = {"trial": trial, "excision": excision, "columns": columns}
+    files = {role: path for role, path in given.items() if isinstance(path, Path)}
+    return TrialInputs(
+        readings=analysed,
+        other_visits=other_visits,
+        ex_vivo_mm=dict(zip(keys, sizes.columns["ex_vivo_mm"], strict=True)),
+        ex_vivo_sd_mm=dict(zip(keys, sizes.columns["sd_mm"], strict=True)),
+        files=files | {f"posterior_{number}": path for number, path in enumerate(posteriors, start=1)},
+    )
+
+
+def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
+    """Sizes after excision: from a wide table where the mapping has ``[excision]``, otherwise from a tidy one."""
+    from tactile_bayes.files.column_map import read_mapping, read_wide_excision
+    from tactile_bayes.files.tables import read_table
+
+    if columns is None or not isinstance(excision, Path) or "excision" not in read_mapping(columns):
+        return read_table(excision, "excision.table.json")
+    return read_wide_excision(excision, columns)
+
+
+# --- Size calibrations from lumps of known size, and reports of trials, from tables or DataFrames.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,7 +116,7 @@ class TrialResult:
     @property
     def text(self) -> str:
         """What ``validate --methods`` prints."""
-        from tactile_bayes.report.trial_text import trial_text
+        from tactile_bayes.report.trial import trial_text
 
         more = [] if self.outcome.next_mass is None else self.outcome.next_mass.lines()
         return trial_text(self.outcome.report, methods=True, checks=self.outcome.checks, more=more)
@@ -89,15 +163,14 @@ def validate(
     columns
         For a wide CSV file: a TOML file that says which column holds which reading.
     **settings
-        As of `tactile_bayes.pipeline.trial.TrialSettings`, by default as on the command line.
+        As of `tactile_bayes.api.trial_report.TrialSettings`, by default as on the command line.
 
     Raises
     ------
     BadDataError
         Naming the table, the line (1 is the header), the column, the value and the way out.
     """
-    from tactile_bayes.pipeline.trial import TrialSettings, analyse
-    from tactile_bayes.pipeline.trial_inputs import load_trial
+    from tactile_bayes.api.trial_report import TrialSettings, analyse
 
     check_keywords("validate", settings, [one.name for one in fields(TrialSettings)])
     used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
@@ -154,11 +227,11 @@ def calibrate_size(
     UsageError
         When a keyword's value cannot be one, or goes with another form.
     """
+    from tactile_bayes.api.site_correction import correct_size
+    from tactile_bayes.api.size_calibration import FORMS, is_population, learn_eq6, learn_population
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.size_json import write_size_calibration
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.pipeline.site_correction import correct_size
-    from tactile_bayes.pipeline.size_calibration import FORMS, is_population, learn_eq6, learn_population
 
     check_choice("form", form, FORMS)
     check_choice("fit", fit, ("joint", "two-stage"))
@@ -223,7 +296,7 @@ def calibrate_repeatability(
     UsageError
         When the calibration's file is not found.
     """
-    from tactile_bayes.pipeline.repeatability import exams_in, learn_from_exams
+    from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 
     target = None if path is None else output_path(path, "JSON")
     given = None if size_calibration is None else str(size_calibration)

@@ -9,18 +9,26 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.options import FORCE, WORKERS, FiniteRange, scheduler_option, seed_option
-from tactile_bayes.commands.paths import FilePath, also_read, refuse_same
+from tactile_bayes.commands.options import (
+    FORCE,
+    WORKERS,
+    FilePath,
+    FiniteRange,
+    also_read,
+    refuse_same,
+    scheduler_option,
+    seed_option,
+)
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import DEFAULT_NORMALISE, METHODS, NORMALISE, RESEARCH_USE
 
 if TYPE_CHECKING:
+    from tactile_bayes.campaign.exams import Found
+    from tactile_bayes.campaign.report import Written
+    from tactile_bayes.campaign.run import Campaign
+    from tactile_bayes.campaign.settings import CampaignSettings
+    from tactile_bayes.campaign.stages import CampaignState
     from tactile_bayes.files.manifest_csv import Exam
-    from tactile_bayes.pipeline.campaign import Campaign
-    from tactile_bayes.pipeline.campaign_init import Found
-    from tactile_bayes.pipeline.campaign_report import Written
-    from tactile_bayes.pipeline.campaign_settings import CampaignSettings
-    from tactile_bayes.pipeline.campaign_stages import CampaignState
 
 _FILE = FilePath()
 _MOST_NAMED = 5
@@ -51,9 +59,9 @@ def init(folder: Path | str, output: Path, add: bool, force: bool) -> None:
 
     Example: tactile-bayes campaign init scans -o exams.csv
     """
+    from tactile_bayes.campaign.exams import find_exams
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.manifest_csv import add_rows, read_rows, write_manifest
-    from tactile_bayes.pipeline.campaign_init import find_exams
 
     if add and force:
         raise UsageError("--add keeps the rows of a table, --force writes it anew; give one of them")
@@ -183,16 +191,16 @@ def run(
     """
     from functools import partial
 
+    from tactile_bayes.batch import open_executor
+    from tactile_bayes.campaign.inputs import open_campaign, tidy
+    from tactile_bayes.campaign.report import WRITTEN, Excision, check_inputs, copy_outputs, write_outputs
+    from tactile_bayes.campaign.run import Campaign
+    from tactile_bayes.campaign.settings import CampaignSettings
+    from tactile_bayes.commands.options import repeatability_in, settings_of
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
-    from tactile_bayes.executors import open_executor
     from tactile_bayes.files.manifest_csv import read_manifest
     from tactile_bayes.files.remote import check_address
     from tactile_bayes.files.shipped import NONE
-    from tactile_bayes.pipeline.campaign import Campaign
-    from tactile_bayes.pipeline.campaign_folder import open_campaign, tidy
-    from tactile_bayes.pipeline.campaign_report import WRITTEN, Excision, check_inputs, copy_outputs, write_outputs
-    from tactile_bayes.pipeline.campaign_settings import CampaignSettings
 
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
     also_read(given)
@@ -273,7 +281,7 @@ def _few(found: CampaignState, step: str) -> bool:
 
 
 def _say_done(campaign: Campaign, written: Written, output: Path, left: Sequence[str]) -> None:
-    from tactile_bayes.pipeline.campaign_report import counts_words, repeatability_words
+    from tactile_bayes.campaign.report import counts_words, repeatability_words
 
     found = campaign.found
     counts = counts_words(written.sized, written.unsized, written.failed)

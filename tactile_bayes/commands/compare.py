@@ -1,25 +1,79 @@
-"""`compare`: change of a mass's size between visits."""
+"""`compare`: the maps of two visits and more."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath, also_read
-from tactile_bayes.commands.visits_command import VisitsCommand, groups_of
+from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
+from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, FiniteRange, also_read, seed_option
 from tactile_bayes.errors import UsageError
-from tactile_bayes.pipeline.comparing import GROWN_BY, Comparing, times_of
-from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 from tactile_bayes.presets import METHODS, REGISTRATION_MM
 
 if TYPE_CHECKING:
-    from tactile_bayes.pipeline.compared import ComparedOutcome
+    from tactile_bayes.api.comparing import ComparedOutcome
+
+
+# --- A command with groups of files: what follows ``--with`` up to the next option is one group.
+
+WITH: Final = "--with"
+
+
+class VisitsCommand(click.Command):
+    """A command whose option ``--with`` takes several files, as often as it is given.
+
+    The option's value is a pair, the group's number and one file: ``--with a b`` is parsed as
+    ``--with 1 a --with 1 b``.
+    """
+
+    def make_parser(self, ctx: click.Context) -> Any:
+        """Make the parser of the command line."""
+        parser = super().make_parser(ctx)
+        parse = parser.parse_args
+        parser.parse_args = lambda args: parse(numbered(args, strict=not ctx.resilient_parsing))  # type: ignore[method-assign]
+        return parser
+
+
+def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
+    """The words with every file after ``--with`` as an option of its own, with the number of its group.
+
+    Parameters
+    ----------
+    strict
+        Refuse a ``--with`` that no file follows; a shell that completes words leaves it out.
+
+    Raises
+    ------
+    UsageError
+        When no file follows a ``--with``, and `strict`.
+    """
+    found: list[str] = []
+    group, files = 0, -1  # files of the group so far; -1 outside one
+    for word in [*args, ""]:
+        if files >= 0 and word and not word.startswith("-"):
+            found += [WITH, str(group), word]
+            files += 1
+            continue
+        if files == 0 and strict:
+            raise UsageError(f"{WITH} names no map; give the maps of a later visit after it")
+        group, files = (group + 1, 0) if word == WITH else (group, -1)
+        found += [word] if word not in (WITH, "") else []
+    return found
+
+
+def groups_of(later: Sequence[tuple[int, Path]]) -> list[tuple[Path, ...]]:
+    """Files of each group, in the order of the groups."""
+    found: dict[int, list[Path]] = {}
+    for number, path in later:
+        found.setdefault(number, []).append(path)
+    return [tuple(found[number]) for number in sorted(found)]
+
+
+# --- `compare`: change of a mass's size between visits.
 
 _FILE = FilePath()
 _DEFAULTS = Settings()
@@ -126,11 +180,11 @@ def command(
 
     Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92
     """
-    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
+    from tactile_bayes.commands.options import repeatability_in, settings_of
     from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.files.documents import check_document, dump_json
     from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.report.compare_text import compare_summary, compare_text
+    from tactile_bayes.report.compare import compare_summary, compare_text
 
     comparing = Comparing(
         days=times_of(days or None, None if dates is None else dates.split(",")),
@@ -165,7 +219,7 @@ def command(
 
 def _check_maps(visits: list[tuple[Path, ...]], settings: Settings) -> None:
     """Refuse a map that is given twice, and a checkpoint."""
-    from tactile_bayes.files.file_names import given_twice
+    from tactile_bayes.files.atomic import given_twice
 
     if twice := given_twice(path for maps in visits for path in maps):
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
@@ -176,10 +230,10 @@ def _compare(
     visits: list[tuple[Path, ...]], settings: Settings, comparing: Comparing
 ) -> tuple[ComparedOutcome, Callable[[Path, bool], None]]:
     """Estimate every map and compare; also gives what draws the figure. An error with one map stops it."""
+    from tactile_bayes.api.comparing import compare_answers, drawn_maps
+    from tactile_bayes.api.estimating import answer_of, estimate_file
+    from tactile_bayes.api.pooled import elsewhere
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.pipeline.compared import compare_answers, drawn_maps
-    from tactile_bayes.pipeline.one_map import answer_of, estimate_file
-    from tactile_bayes.pipeline.one_mass import elsewhere
 
     total, outcomes = sum(len(maps) for maps in visits), []
     with progress_bar("maps") as progress:

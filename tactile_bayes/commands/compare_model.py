@@ -6,10 +6,7 @@ from pathlib import Path
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.options import FORCE, JSON, PRESSURE_WINDOW
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, PRESSURE_WINDOW, FigurePath, FilePath, head_option
 from tactile_bayes.presets import CELL_MM
 
 _FILE = FilePath()
@@ -67,16 +64,15 @@ def command(
     """
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.documents import dump_json
     from tactile_bayes.files.provenance import hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan
     from tactile_bayes.files.scene_toml import read_scene
-    from tactile_bayes.files.schema import dump_json
     from tactile_bayes.findings import finding_lines
-    from tactile_bayes.forward.plane.empirical import outside_range
-    from tactile_bayes.mapping.overlap import scan_findings
+    from tactile_bayes.forward.line import outside_range
+    from tactile_bayes.mapping.select import scan_findings
     from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.report.model_figure import comparison_figure
-    from tactile_bayes.report.model_text import comparison_document, comparison_text
+    from tactile_bayes.report.paper_head import comparison_document, comparison_figure, comparison_text
     from tactile_bayes.studies.model_comparison import compare_model, measured_frames
 
     if figure is not None:

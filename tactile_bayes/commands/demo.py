@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FilePath
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import METHODS, RESEARCH_USE
 
 if TYPE_CHECKING:
-    from tactile_bayes.files.size_posterior import StatedSize
+    from tactile_bayes.files.estimate_json import StatedSize
 
 EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.toml", "empty.toml")
 PROGRAM = "tactile-bayes"
@@ -186,7 +186,7 @@ def _truth(scan: Path) -> float:
 
 
 def _stated(posterior: Path) -> StatedSize:
-    from tactile_bayes.files.size_posterior import read_stated_size
+    from tactile_bayes.files.estimate_json import read_stated_size
 
     return read_stated_size(posterior)
 

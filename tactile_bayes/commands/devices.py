@@ -44,7 +44,7 @@ def command(*, url: str | None, pivot_url: str | None, tracker_protocol: str, du
     Example: tactile-bayes devices
     """
     if url:
-        from tactile_bayes.hardware.discovery import probe
+        from tactile_bayes.hardware.drivers import probe
 
         click.echo(f"{url}: {probe(url)}")
     elif pivot_url:
@@ -54,7 +54,7 @@ def command(*, url: str | None, pivot_url: str | None, tracker_protocol: str, du
 
 
 def _list() -> None:
-    from tactile_bayes.hardware.discovery import list_ports
+    from tactile_bayes.hardware.drivers import list_ports
 
     ports = list_ports()
     for port in ports:
@@ -66,9 +66,9 @@ def _list() -> None:
 def _pivot(url: str, protocol: str, duration_s: float) -> None:
     import numpy as np
 
+    from tactile_bayes.hardware.bladder import rotation_sense
     from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
     from tactile_bayes.hardware.readings import PoseReading
-    from tactile_bayes.hardware.rotation_sense import rotation_sense
 
     driver = TRACKERS[protocol]
     port = open_tracker(protocol, url)

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, JSON
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, FigurePath, FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
@@ -37,8 +35,8 @@ def command(
     """
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing
+    from tactile_bayes.files.documents import dump_json
     from tactile_bayes.files.posterior_nc import read_posterior
-    from tactile_bayes.files.schema import dump_json
     from tactile_bayes.findings import finding_lines
 
     for path in (trace, rank, corner):
@@ -77,7 +75,7 @@ def _draw(
 ) -> None:
     if not (trace or rank or corner):
         return
-    from tactile_bayes.report.figure_title import named_exam
+    from tactile_bayes.report.figure_file import named_exam
     from tactile_bayes.report.posterior_figures import corner_figure, rank_figure, trace_figure
 
     title = f"{named_exam(name, found.scans)}, method {found.method}"

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.options import SPEED, FiniteRange
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import SPEED, FilePath, FiniteRange
 from tactile_bayes.errors import BadDataError, UsageError
 
 if TYPE_CHECKING:
@@ -149,7 +148,7 @@ def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path,
     if kind == "head" and len(scan.frames):
         return EmulatedHead(scan)
     if kind == "tracker" and len(scan.poses) and protocol == "ndi":
-        from tactile_bayes.hardware.emulated_ndi import EmulatedNdi
+        from tactile_bayes.hardware.emulated import EmulatedNdi
 
         elapsed: Callable[[], float | None] | None = None if held is None else lambda: held.now()[1]
         return EmulatedNdi(scan.poses, hold=faults.hold, elapsed=elapsed)

@@ -11,17 +11,24 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, FiniteRange, scheduler_option, seed_option
-from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.api.estimating import Answer, answer_file, answer_of, estimate_file
+from tactile_bayes.api.settings import Settings, refuse_checkpoint
+from tactile_bayes.commands.options import (
+    FORCE,
+    METAVAR,
+    FigurePath,
+    FilePath,
+    FiniteRange,
+    also_read,
+    scheduler_option,
+    seed_option,
+)
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
-from tactile_bayes.pipeline.one_map import Answer, answer_file, answer_of, estimate_file
-from tactile_bayes.pipeline.settings import Settings, refuse_checkpoint
 from tactile_bayes.presets import METHODS, SCENES
 
 if TYPE_CHECKING:
+    from tactile_bayes.api.estimating import Outcome as MapOutcome
     from tactile_bayes.batch import Outcome
-    from tactile_bayes.pipeline.one_map import Outcome as MapOutcome
 
 _FILE = FilePath()
 _DEFAULTS = Settings()
@@ -159,7 +166,7 @@ def command(
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """
-    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
+    from tactile_bayes.commands.options import repeatability_in, settings_of
 
     settings = settings_of(
         settings_file,
@@ -214,8 +221,7 @@ def _named(calibration: str | None) -> Path | None:
 
 def _check_outputs(outputs: list[Path], maps: tuple[Path, ...], pool: bool, *, force: bool) -> None:
     """Raise an error, before any work is done, if an output cannot be written."""
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.file_names import given_twice
+    from tactile_bayes.files.atomic import given_twice, refuse_existing
 
     if twice := given_twice(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
@@ -248,7 +254,7 @@ def _write(
         outcome.write(output, document=answer.document, force=force)
     if any(figures):
         from tactile_bayes.report.estimate_figures import draw_figures
-        from tactile_bayes.report.figure_title import named_exam
+        from tactile_bayes.report.figure_file import named_exam
 
         name = named_exam(name, outcome.provenance.scans)
         draw_figures(tactile_map, estimate, *figures, name=name, probability=outcome.settings.interval, force=force)
@@ -257,9 +263,8 @@ def _write(
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> list[Answer]:
     from functools import partial
 
-    from tactile_bayes.batch import run_batch
+    from tactile_bayes.batch import cluster_executor, local_executor, run_batch
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.executors import cluster_executor, local_executor
 
     chosen = cluster_executor(scheduler) if scheduler else local_executor(min(workers, len(maps)))
     with chosen as executor, progress_bar("maps") as progress:
@@ -298,7 +303,7 @@ def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: b
 
 def _print(maps: Sequence[Path], answers: list[Answer], *, as_json: bool, verbose: bool, listed: bool) -> None:
     """Print errors on stderr and answers on stdout: in full with `verbose`, `listed` for several maps."""
-    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.files.documents import check_document, dump_json
 
     for answer in answers:
         if answer.document is None and answer.text:

@@ -11,9 +11,9 @@ import click
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 
 if TYPE_CHECKING:
-    from tactile_bayes.pipeline.one_map import Answer
-    from tactile_bayes.pipeline.pooled import PooledOutcome
-    from tactile_bayes.pipeline.settings import Settings
+    from tactile_bayes.api.estimating import Answer
+    from tactile_bayes.api.pooled import PooledOutcome
+    from tactile_bayes.api.settings import Settings
 
 
 def estimate_pool(
@@ -31,10 +31,9 @@ def estimate_pool(
 
     A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
     """
-    from tactile_bayes.files.schema import check_document, dump_json
-    from tactile_bayes.pipeline.one_map import answer_file
-    from tactile_bayes.pipeline.one_mass import of_one_mass
-    from tactile_bayes.pipeline.pooled import pool_answers
+    from tactile_bayes.api.estimating import answer_file
+    from tactile_bayes.api.pooled import of_one_mass, pool_answers
+    from tactile_bayes.files.documents import check_document, dump_json
     from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
     if settings.centre_mm is None:
@@ -76,7 +75,7 @@ def _write(
     if figure is not None:
         from tactile_bayes.findings import findings_in
         from tactile_bayes.report.estimate_figures import draw_size
-        from tactile_bayes.report.figure_title import named_exam
+        from tactile_bayes.report.figure_file import named_exam
 
         name = named_exam(f"{len(maps)} maps pooled", provenance.scans)
         findings = findings_in(found.document["findings"])

@@ -8,8 +8,7 @@ from typing import Any, Final
 
 import click
 
-from tactile_bayes.commands.options import FORCE
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
@@ -75,9 +74,8 @@ def command(
     Example: tactile-bayes export map.nc estimate.json --to dicom --study-date 2026-11-24T10:30 -o exam
     """
     from tactile_bayes.exports.exam import read_exam
-    from tactile_bayes.exports.run import export, refuse_untaken
-    from tactile_bayes.exports.worklist import identity_of
-    from tactile_bayes.exports.writing import Outputs
+    from tactile_bayes.exports.identity import identity_of
+    from tactile_bayes.exports.run import Outputs, export, refuse_untaken
 
     given = {name: value for name, value in identity.items() if value is not None}
     refuse_untaken(to, given)

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.options import FORCE, JSON, Decorator, FiniteRange
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, Decorator, FigurePath, FiniteRange, head_option
 
 if TYPE_CHECKING:
-    from tactile_bayes.forward.plane.head_design import HomogeneousTissue
+    from tactile_bayes.studies.head_design import HomogeneousTissue
 
 _ABOVE_0 = FiniteRange(min=0.0, min_open=True)
 _RANGE = "LOW HIGH"
@@ -94,9 +92,9 @@ def uniformity_command(
     Example: tactile-bayes head uniformity --head-radius-mm 35 --head shoulders-outside
     """
     from tactile_bayes.forward.contact import Head
-    from tactile_bayes.forward.plane.head_design import uniformity
     from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
-    from tactile_bayes.report.head_text import uniformity_document, uniformity_text
+    from tactile_bayes.report.paper_head import uniformity_document, uniformity_text
+    from tactile_bayes.studies.head_design import uniformity
 
     body, limit = _tissue(**tissue), limit_percent / 100
     section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or SHOULDERS_INSIDE)
@@ -127,10 +125,9 @@ def design_command(
     """
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.forward.plane.head_design import most_even, narrowest, search_heads
     from tactile_bayes.presets import HEADS, RESEARCH_USE
-    from tactile_bayes.report.head_figure import design_figure
-    from tactile_bayes.report.head_text import design_document, design_text, named
+    from tactile_bayes.report.paper_head import design_document, design_figure, design_text, named
+    from tactile_bayes.studies.head_design import most_even, narrowest, search_heads
 
     body, limit = _tissue(**tissue), limit_percent / 100
     if figure is not None:
@@ -159,7 +156,7 @@ def _tissue(
     thickness_mm: float,
     poisson: float,
 ) -> HomogeneousTissue:
-    from tactile_bayes.forward.plane.head_design import HomogeneousTissue
+    from tactile_bayes.studies.head_design import HomogeneousTissue
 
     return HomogeneousTissue(modulus_kpa, pressure_kpa, thickness_mm, poisson)
 

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SESSION
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, SESSION, FilePath
 from tactile_bayes.files.arrays_layout import layout_lines
 from tactile_bayes.presets import NORMALISE, RESEARCH_USE
 
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
-    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.mapping.map import TactileMap
     from tactile_bayes.scan import Scan
 
 _LONGEST_UNITS = 20
@@ -60,8 +59,7 @@ def command(
     as the file reads.
     """
     from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.file_names import check_suffix
+    from tactile_bayes.files.atomic import check_suffix, refuse_existing
 
     refuse_existing(output, force=force)
     kind = kind or _kind_of(source, output)
@@ -104,9 +102,9 @@ def _check_units(units: str | None, normalise: str | None) -> None:
 
 
 def _import_scan(source: Path, output: Path, session_file: Path | None, *, force: bool) -> list[str]:
+    from tactile_bayes.files.documents import with_session
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
-    from tactile_bayes.files.session_toml import with_session
 
     lost: tuple[str, ...] = ()
     truth = None
@@ -114,7 +112,7 @@ def _import_scan(source: Path, output: Path, session_file: Path | None, *, force
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, read_truth(source)
     else:
-        from tactile_bayes.files.arrays_npz import read_arrays
+        from tactile_bayes.files.imports import read_arrays
 
         scan = read_arrays(source)
     files = {"source": source} | ({"session": session_file} if session_file else {})
@@ -126,7 +124,7 @@ def _import_scan(source: Path, output: Path, session_file: Path | None, *, force
 def _import_map(
     source: Path, output: Path, *, spacing_mm: float | None, normalise: str, units: str, force: bool
 ) -> list[str]:
-    from tactile_bayes.files.grid_import import read_grid
+    from tactile_bayes.files.imports import read_grid
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import Provenance, hash_inputs
 

@@ -24,8 +24,8 @@ from tactile_bayes.declarations import replace
 if TYPE_CHECKING:
     from tactile_bayes.geometry import FloatArray
     from tactile_bayes.hardware.live import LiveMap, LiveState
-    from tactile_bayes.mapping.tactile_map import TactileMap
-    from tactile_bayes.posterior.lump.posterior import MapPosterior
+    from tactile_bayes.mapping.map import TactileMap
+    from tactile_bayes.posterior.draws import MapPosterior
     from tactile_bayes.scan import ElementCalibration, HeadGeometry
     from tactile_bayes.size.pooling import Calibration
 
@@ -45,8 +45,8 @@ def live_view(
     size_calibration: str,
 ) -> Iterator[Any]:
     """Start the view's process; returns an observer for the recorder."""
-    from tactile_bayes.files.scan_parts import calibration_document, head_document
-    from tactile_bayes.hardware.feed import Feed
+    from tactile_bayes.files.instrument_json import calibration_document, head_document
+    from tactile_bayes.hardware.live import Feed
     from tactile_bayes.hardware.serve import address_of
 
     if serve:
@@ -139,7 +139,7 @@ class Estimator:
 
 
 def _prepare() -> None:
-    from tactile_bayes.executors import prepare_worker
+    from tactile_bayes.batch import prepare_worker
 
     prepare_worker()
     import tactile_bayes.files.size_json
@@ -206,7 +206,7 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: T
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.findings import finding_summary
     from tactile_bayes.posterior.estimate import estimate_map
-    from tactile_bayes.posterior.lump.cells import candidate_centres
+    from tactile_bayes.posterior.fit_window import candidate_centres
     from tactile_bayes.posterior.options import EstimateOptions, FitOptions
     from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM, INTERVAL
 
@@ -261,9 +261,8 @@ def _interval(name: str, draws: FloatArray, probability: float) -> str:
 
 def run(pipe: int, setup: dict[str, Any]) -> None:
     """Follow a recording until it ends."""
-    from tactile_bayes.files.scan_parts import calibration_from_document, head_from_document
-    from tactile_bayes.hardware.feed import FeedReader
-    from tactile_bayes.hardware.live import LiveMap
+    from tactile_bayes.files.instrument_json import calibration_from_document, head_from_document
+    from tactile_bayes.hardware.live import FeedReader, LiveMap
     from tactile_bayes.hardware.serve import LiveServer, address_of
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -312,7 +311,7 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
 
     `keys` says whether the recording's keys can be pressed there.
     """
-    from tactile_bayes.report.live_text import colours_wanted, live_line, live_text
+    from tactile_bayes.report.live import colours_wanted, live_line, live_text
 
     out = sys.stderr
     if not out.isatty() or os.environ.get("TERM", "dumb") in ("dumb", ""):

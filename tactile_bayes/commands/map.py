@@ -8,9 +8,7 @@ from pathlib import Path
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, PRESSURE_WINDOW, NumberOr
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, METAVAR, PRESSURE_WINDOW, FigurePath, FilePath, NumberOr
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE
 
@@ -85,12 +83,12 @@ def command(
 
     Example: tactile-bayes map scan.mcap -o map.nc --figure map.png
     """
+    from tactile_bayes.api.maps import map_provenance
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.files.map_nc import write_map
     from tactile_bayes.files.provenance import repeated_scans
     from tactile_bayes.files.scan_mcap import read_scan
     from tactile_bayes.mapping import build_map
-    from tactile_bayes.pipeline.scans import map_provenance
     from tactile_bayes.report.map_text import map_text
 
     _check_paths(scans, output, figure, force=force)
@@ -127,7 +125,7 @@ def command(
     write_map(output, tactile_map, provenance=provenance, force=force)
     try:
         if figure:
-            from tactile_bayes.report.figure_title import named_exam
+            from tactile_bayes.report.figure_file import named_exam
             from tactile_bayes.report.map_figure import map_figure
 
             title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
@@ -139,8 +137,7 @@ def command(
 
 def _check_paths(scans: tuple[Path, ...], output: Path, figure: Path | None, *, force: bool) -> None:
     """Raise an error, before any work, for an output that cannot be written or a scan given twice."""
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.file_names import given_twice
+    from tactile_bayes.files.atomic import given_twice, refuse_existing
 
     if twice := given_twice(scans):
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, FilePath, FiniteRange, seed_option
 from tactile_bayes.errors import UsageError
 
 if TYPE_CHECKING:
@@ -103,7 +102,7 @@ def command(
     Example: tactile-bayes plan --patients 24 --patients 40 --maps 3 --maps 5 -o plan.json
     """
     from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.schema import check_document, dump_json
+    from tactile_bayes.files.documents import check_document, dump_json
     from tactile_bayes.trial.planning import designs
 
     if output:
@@ -147,12 +146,11 @@ def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, floa
     """Errors from the pilot, where no option gives them."""
     import numpy as np
 
-    from tactile_bayes.commands.paths import also_read
+    from tactile_bayes.api.trials import load_trial
+    from tactile_bayes.commands.options import also_read
     from tactile_bayes.errors import BadDataError
-    from tactile_bayes.pipeline.trial_inputs import load_trial
     from tactile_bayes.trial.planning import assumptions_from
-    from tactile_bayes.trial.plausibility import unit_doubts
-    from tactile_bayes.trial.readings import gather
+    from tactile_bayes.trial.readings import gather, unit_doubts
 
     inputs = load_trial(pilot, excision, None)
     also_read(*inputs.files.values())
@@ -176,10 +174,9 @@ def _from_pilot(pilot: Path, excision: Path, against: str, given: dict[str, floa
 
 
 def _simulate(cases: list[PlanCase], *, workers: int) -> list[dict[str, Any]]:
-    from tactile_bayes.batch import run_batch
+    from tactile_bayes.batch import open_executor, run_batch
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.errors import BadDataError
-    from tactile_bayes.executors import open_executor
     from tactile_bayes.trial.planning import run_case
 
     with open_executor(workers=workers) as executor, progress_bar("designs") as progress:
@@ -216,6 +213,6 @@ def _document(
 
 
 def _text(document: dict[str, Any]) -> str:
-    from tactile_bayes.report.plan_text import plan_text
+    from tactile_bayes.report.trial import plan_text
 
     return plan_text(document)

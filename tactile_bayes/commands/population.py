@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, MOST_ITEMS, WORKERS, scheduler_option, seed_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, MOST_ITEMS, WORKERS, FilePath, scheduler_option, seed_option
 from tactile_bayes.presets import DEFAULT_NORMALISE
 
 if TYPE_CHECKING:
-    from tactile_bayes.forward.population import BodyPrior, ExamPrior
     from tactile_bayes.forward.scene import Head
-    from tactile_bayes.studies.population import MassRow
+    from tactile_bayes.studies.population import BodyPrior, ExamPrior, MassRow
 
 _FILE = FilePath()
 
@@ -93,17 +91,16 @@ def command(
     from dataclasses import asdict
     from functools import partial
 
-    from tactile_bayes.batch import fault_lines, run_batch
+    from tactile_bayes.batch import fault_lines, open_executor, run_batch
     from tactile_bayes.batch_store import open_store
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.executors import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.bodies_toml import read_bodies
-    from tactile_bayes.files.head_json import read_simulated_head
-    from tactile_bayes.forward.population import BodyPrior, ExamPrior, as_settings
+    from tactile_bayes.files.documents import read_bodies
+    from tactile_bayes.files.instrument_json import read_simulated_head
     from tactile_bayes.forward.scene import Head
     from tactile_bayes.presets import RESEARCH_USE
+    from tactile_bayes.studies.population import BodyPrior, ExamPrior, as_settings
 
     refuse_existing(output, force=force)
     simulated = read_simulated_head(head) if head else Head()
@@ -183,10 +180,9 @@ def rows_of_mass(
     """
     import numpy as np
 
-    from tactile_bayes.forward.population import BodyPrior, draw_mass
-    from tactile_bayes.forward.population import centred as on_the_boundary
     from tactile_bayes.forward.simulate import simulate
-    from tactile_bayes.studies.population import measure_mass
+    from tactile_bayes.studies.population import BodyPrior, draw_mass, measure_mass
+    from tactile_bayes.studies.population import centred as on_the_boundary
 
     prior = bodies or BodyPrior()
     prior = on_the_boundary(prior) if index >= first_centred else prior

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from tactile_bayes.printing import raw_stream
 from tactile_bayes.progress import Progress, untold
+from tactile_bayes.shell import raw_stream
 
 # Work that ends sooner draws nothing.
 QUIET_S = 2.0

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from tactile_bayes.commands.options import FORCE
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
 

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SPEED, live_options
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, SPEED, FilePath, live_options
 from tactile_bayes.errors import DeviceError
 
 _FILE = FilePath()

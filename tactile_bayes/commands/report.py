@@ -8,8 +8,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from tactile_bayes.commands.options import FORCE, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.commands.options import FORCE, FilePath, FiniteRange, also_read, seed_option
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 
@@ -74,10 +73,10 @@ def command(
 
     Example: tactile-bayes report map.nc -o exam.html
     """
-    from tactile_bayes.commands.settings_file import repeatability_in, settings_of
+    from tactile_bayes.api.exam_report import ExamFiles, Given, read_exam
+    from tactile_bayes.commands.options import repeatability_in, settings_of
     from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.pipeline.exam_report import ExamFiles, Given, read_exam
-    from tactile_bayes.report.exam_files import PageFiles
+    from tactile_bayes.report.exam_page import PageFiles
     from tactile_bayes.report.exam_words import headline
 
     given, page = Given(title, name, day), PageFiles(output, pdf, force)

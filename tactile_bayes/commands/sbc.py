@@ -10,9 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, JSON, MOST_ITEMS, WORKERS, WholeOrAuto, scheduler_option, seed_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import (
+    FORCE,
+    JSON,
+    METAVAR,
+    MOST_ITEMS,
+    WORKERS,
+    FigurePath,
+    FilePath,
+    WholeOrAuto,
+    scheduler_option,
+    seed_option,
+)
 from tactile_bayes.presets import MOST_FIELD_COSINES, Method
 
 if TYPE_CHECKING:
@@ -80,8 +89,8 @@ def command(
     from tactile_bayes.batch import BatchInterrupted
     from tactile_bayes.errors import TactileBayesError
     from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.schema import dump_json
-    from tactile_bayes.report.sbc_text import sbc_document, sbc_figure, sbc_text, table_text
+    from tactile_bayes.files.documents import dump_json
+    from tactile_bayes.report.sbc import sbc_document, sbc_figure, sbc_text, table_text
 
     for path in (output, figure):
         if path is not None:
@@ -125,9 +134,8 @@ def _run(
     """Outcomes of all maps, and the number that this run made."""
     from functools import partial
 
-    from tactile_bayes.batch import run_batch
+    from tactile_bayes.batch import open_executor, run_batch
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.executors import open_executor
     from tactile_bayes.files.shipped import DEFAULT
     from tactile_bayes.studies.sbc import settings
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from tactile_bayes.commands.options import JSON
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import JSON, FilePath
 from tactile_bayes.presets import RESEARCH_USE
 
 
@@ -24,8 +23,8 @@ def command(file: Path, as_json: bool) -> None:
 
     Example: tactile-bayes show map.nc
     """
+    from tactile_bayes.files.documents import dump_json
     from tactile_bayes.files.identify import describe
-    from tactile_bayes.files.schema import dump_json
     from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
 
     shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None

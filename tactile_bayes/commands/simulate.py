@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.options import FORCE, SESSION
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, SESSION, FilePath, head_option
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -78,11 +76,11 @@ def _run(
 
     from tactile_bayes.commands.import_ import describe_scan
     from tactile_bayes.commands.progress import progress_bar
+    from tactile_bayes.files.documents import with_session
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import write_scan
     from tactile_bayes.files.scene_toml import read_scene
-    from tactile_bayes.files.session_toml import with_session
-    from tactile_bayes.forward.plane.empirical import outside_range
+    from tactile_bayes.forward.line import outside_range
     from tactile_bayes.forward.simulate import simulate
 
     scene = read_scene(scene_path)

@@ -1,4 +1,4 @@
-"""`study`: amplitude and width of the maps of simulated lumps."""
+"""The paper's forward study, with its figures."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.options import FORCE, WORKERS, FiniteRange, scheduler_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, WORKERS, FilePath, FiniteRange, head_option, scheduler_option
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -17,10 +15,97 @@ if TYPE_CHECKING:
 
     from tactile_bayes.batch import Outcome
     from tactile_bayes.batch_store import BatchStore
-    from tactile_bayes.forward.plane.line import TactileLine
-    from tactile_bayes.forward.plane.study import Geometry, LineFit, StudyRow, StudySettings
-    from tactile_bayes.forward.solid.study import SolidSettings
+    from tactile_bayes.forward.line import TactileLine
     from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.studies.paper import Fit, Geometry, LineFit, StudyRow, StudySettings
+    from tactile_bayes.studies.paper_solid import SolidSettings
+    from tactile_bayes.studies.paper_tables import MeasuredFrame
+
+
+# --- Figures of `study`: where they go, the frames that a user measured, and what is drawn from either model.
+
+_FRAMES_SCHEMA = "measured_frames.table.json"
+
+
+def read_frames(path: Path) -> list[MeasuredFrame]:
+    """The frames of a table, one for each place of the head, in the order in which they first appear."""
+    import numpy as np
+
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.studies.paper_tables import MeasuredFrame
+
+    columns = read_table(path, _FRAMES_SCHEMA).columns
+    place = np.array([0.0 if x is None else x for x in columns["x_c_mm"]])
+    s, pressure = np.array(columns["s_mm"]), np.array(columns["pressure_kpa"])
+    try:
+        return [MeasuredFrame(x, s[place == x], pressure[place == x]) for x in dict.fromkeys(place.tolist())]
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def figure_paths(folder: Path, *, model: str) -> list[Path]:
+    """Where figures 5 to 8 go, and in two dimensions the frames of four lumps."""
+    paths = [folder / f"figure_{number}.png" for number in (5, 6, 7, 8)]
+    return [*paths, folder / "four_lumps.png"] if model == "plane-strain" else paths
+
+
+def prepare_figures(folder: Path, *, model: str, force: bool) -> None:
+    """Make the directory, and stop before any work where a figure is in the way."""
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.files.atomic import refuse_existing
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be made a directory ({error.strerror}); choose another name") from None
+    for path in figure_paths(folder, model=model):
+        refuse_existing(path, force=force)
+
+
+def draw_figures(
+    rows: list[StudyRow],
+    settings: StudySettings | SolidSettings,
+    folder: Path,
+    *,
+    seat: float,
+    fit: Fit,
+    phantom: tuple[float, float] | None,
+    frames: list[MeasuredFrame],
+    force: bool,
+) -> list[str]:
+    """Draw figures 5 to 8 of the paper; say where they are and what was found for them.
+
+    Parameters
+    ----------
+    seat
+        Of the lumps that are drawn and not in the table.
+    fit
+        Of Eq 5 to a line, for the plane-strain model.
+    phantom, frames
+        Lump and measured frames of figure 6; None and none for the paper's phantom.
+    """
+    from tactile_bayes.studies.paper import StudySettings
+
+    if isinstance(settings, StudySettings):
+        from tactile_bayes.report.study import frames_text, lookalikes_text, study_figures
+        from tactile_bayes.studies.paper_tables import PHANTOMS, compare_frames
+
+        paths = figure_paths(folder, model="plane-strain")
+        d, h = phantom or PHANTOMS["phantom 12.5 mm"]
+        compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=seat, settings=settings) if frames else []
+        found = study_figures(rows, settings, paths, seat=seat, fit=fit, phantom=(d, h), measured=compared, force=force)
+        where = f"figures 5 to 8 and the frames of four lumps are in {folder}"
+        return [lookalikes_text(found), *frames_text(compared), where]
+    from tactile_bayes.report.solid_figures import solid_figures
+    from tactile_bayes.studies.paper_solid import fit_raster, raster_map
+
+    paths = figure_paths(folder, model="solid")
+    solid_figures(rows, settings, paths, seat=seat, fit=fit_raster, build=raster_map, force=force)
+    return [f"figures 5 to 8 are in {folder}"]
+
+
+# --- `study`: amplitude and width of the maps of simulated lumps.
 
 _FILE = FilePath()
 _ABOVE_0 = FiniteRange(min=0.0, min_open=True)
@@ -142,14 +227,13 @@ def command(
 
     Example: tactile-bayes study --model solid --seat resting -o study.csv
     """
-    from tactile_bayes.commands.study_figures import draw_figures, prepare_figures, read_frames
+    from tactile_bayes.batch import open_executor
     from tactile_bayes.errors import UsageError
-    from tactile_bayes.executors import open_executor
     from tactile_bayes.files.atomic import refuse_existing, write_text
     from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.forward.plane.study import paper_grid
     from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.report.study_text import study_text
+    from tactile_bayes.report.study import study_text
+    from tactile_bayes.studies.paper import paper_grid
 
     chosen = parse_seat(seat)
     settings = study_settings(model=model, **options)
@@ -203,8 +287,8 @@ def study_settings(
     """
     from tactile_bayes.errors import UsageError
     from tactile_bayes.forward.contact import Head
-    from tactile_bayes.forward.plane.study import StudySettings
     from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
+    from tactile_bayes.studies.paper import StudySettings
 
     default = SHOULDERS_INSIDE if model == "plane-strain" else SHOULDERS_OUTSIDE
     section = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or default)
@@ -214,7 +298,7 @@ def study_settings(
             raise UsageError(f"{asked} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
         return StudySettings(section, mean_kpa, poisson, fat_kpa, gland_ratio, thickness_mm, fineness=fineness)
     from tactile_bayes.forward.scene import Head as Array
-    from tactile_bayes.forward.solid.study import SolidSettings
+    from tactile_bayes.studies.paper_solid import SolidSettings
 
     array = Array(radius_mm=head_radius_mm, rim_mm=shoulder_mm).with_shoulders(section.shoulders)
     return SolidSettings(
@@ -235,7 +319,7 @@ def read_grid(path: Path, *, seat: float) -> list[Geometry]:
     from tactile_bayes.errors import BadDataError
     from tactile_bayes.files.tables import read_table
     from tactile_bayes.forward.body import parse_seat
-    from tactile_bayes.forward.plane.study import group_cases
+    from tactile_bayes.studies.paper import group_cases
 
     table = read_table(path, _GRID_SCHEMA)
     seats = [seat if text is None else parse_seat(text) for text in table.columns["seat"]]
@@ -279,12 +363,11 @@ def _rows_of(settings: StudySettings | SolidSettings) -> Callable[[Geometry], li
     """Function that computes a geometry's rows, importable by name in another process."""
     from functools import partial
 
-    from tactile_bayes.forward.plane.study import StudySettings, run_geometry
+    from tactile_bayes.studies.paper import StudySettings, run_geometry
 
     if isinstance(settings, StudySettings):
         return partial(run_geometry, settings=settings, fit=fit_line)
-    from tactile_bayes.forward.solid.study import run_solid_geometry
-    from tactile_bayes.studies.raster import fit_raster
+    from tactile_bayes.studies.paper_solid import fit_raster, run_solid_geometry
 
     return partial(run_solid_geometry, settings=settings, fit=fit_raster)
 
@@ -341,7 +424,7 @@ def _encode(rows: list[StudyRow]) -> list[dict[str, Any]]:
 
 
 def _decode(rows: list[dict[str, Any]]) -> list[StudyRow]:
-    from tactile_bayes.forward.plane.study import StudyRow
+    from tactile_bayes.studies.paper import StudyRow
 
     return [StudyRow(**row) for row in rows]
 
@@ -357,9 +440,9 @@ def fit_line(line: TactileLine, radius_mm: float) -> LineFit:
     import numpy as np
 
     from tactile_bayes.forward.gaussian import cell_mean_gaussian
-    from tactile_bayes.forward.plane.empirical import fit_shape
-    from tactile_bayes.forward.plane.study import LineFit
-    from tactile_bayes.posterior.white.fit import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
+    from tactile_bayes.forward.line import fit_shape
+    from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, WIDEST_IN_RADII
+    from tactile_bayes.studies.paper import LineFit
 
     inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
     x, excess = line.x_mm[inside], line.mean[inside] - 1.0

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.options import JSON, WORKERS, FiniteRange
+from tactile_bayes.commands.options import JSON, WORKERS, FiniteRange, head_option
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from tactile_bayes.forward.contact import Head
-    from tactile_bayes.forward.plane.tables import Agreement
+    from tactile_bayes.studies.paper_tables import Agreement
 
     ByHead = Mapping[Head, Sequence[Agreement]]
 
@@ -52,9 +51,9 @@ def command(
 
     from tactile_bayes.forward.body import parse_seat
     from tactile_bayes.forward.contact import Head
-    from tactile_bayes.forward.plane.tables import NEAREST_HEADS, TRIED_HEADS
     from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
     from tactile_bayes.report.tables_text import heads_text, tables_document, tables_text
+    from tactile_bayes.studies.paper_tables import NEAREST_HEADS, TRIED_HEADS
 
     at = parse_seat(seat)
     asked = Head(radius_mm=head_radius_mm, shoulder_mm=shoulder_mm, shoulders=head or SHOULDERS_INSIDE)
@@ -75,13 +74,12 @@ def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByH
     """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
     from functools import partial
 
-    from tactile_bayes.batch import run_batch
+    from tactile_bayes.batch import open_executor, run_batch
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.study import fit_line
     from tactile_bayes.errors import TactileBayesError
-    from tactile_bayes.executors import open_executor
-    from tactile_bayes.forward.plane.study import StudySettings
-    from tactile_bayes.forward.plane.tables import compare_heads, phantom_scenes, table_scenes
+    from tactile_bayes.studies.paper import StudySettings
+    from tactile_bayes.studies.paper_tables import compare_heads, phantom_scenes, table_scenes
 
     scenes = table_scenes(seat) + phantom_scenes(seat)
     work = partial(compare_heads, settings=StudySettings(), heads=heads, fit=fit_line)

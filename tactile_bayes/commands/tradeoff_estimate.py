@@ -6,9 +6,16 @@ from pathlib import Path
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, JSON, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.commands.options import (
+    FORCE,
+    JSON,
+    METAVAR,
+    FigurePath,
+    FilePath,
+    FiniteRange,
+    also_read,
+    seed_option,
+)
 from tactile_bayes.commands.tradeoff_options import CALIBRATION, RUNS, TOLERANCE
 
 _FILE = FilePath()
@@ -59,17 +66,15 @@ def command(
     import time
     from dataclasses import replace
 
-    from tactile_bayes.commands.fresh_process import fresh_cpu_s
+    from tactile_bayes.api.tradeoffs import pooled_rows, tradeoff_of_map
+    from tactile_bayes.commands.options import settings_of
     from tactile_bayes.commands.progress import progress_bar
-    from tactile_bayes.commands.settings_file import settings_of
-    from tactile_bayes.commands.tradeoff_options import forecast, show
+    from tactile_bayes.commands.tradeoff_options import forecast, fresh_cpu_s, show
     from tactile_bayes.errors import UsageError
-    from tactile_bayes.files.atomic import refuse_existing
-    from tactile_bayes.files.file_names import given_twice
+    from tactile_bayes.files.atomic import given_twice, refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.shipped import size_calibration_path
-    from tactile_bayes.pipeline.tradeoff import pooled_rows, tradeoff_of_map
-    from tactile_bayes.studies.cost_ladder import Work
+    from tactile_bayes.studies.estimate_tradeoff import Work
 
     if size_calibration is not None:
         also_read(size_calibration_path(size_calibration))

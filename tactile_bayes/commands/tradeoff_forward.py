@@ -8,15 +8,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.head_option import head_option
-from tactile_bayes.commands.options import FORCE, JSON, FiniteRange
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, FigurePath, FilePath, FiniteRange, head_option
 
 if TYPE_CHECKING:
-    from tactile_bayes.report.tradeoff_text import TradeoffReport
-    from tactile_bayes.studies.forward_tradeoff import LumpCase, Measured
-    from tactile_bayes.studies.size_rules import SizeRule
+    from tactile_bayes.report.forward_tradeoff import TradeoffReport
+    from tactile_bayes.studies.tradeoffs import LumpCase, Measured, SizeRule
 
 _FILE = FilePath()
 LEARNED = "learned"
@@ -77,11 +73,11 @@ def command(
     """
     import json
 
-    from tactile_bayes.commands.paths import also_read
+    from tactile_bayes.commands.options import also_read
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.presets import RESEARCH_USE
-    from tactile_bayes.report.tradeoff_text import tradeoff_document, tradeoff_text
+    from tactile_bayes.report.forward_tradeoff import tradeoff_document, tradeoff_text
 
     if figure is not None:
         refuse_existing(figure, force=force)
@@ -90,7 +86,7 @@ def command(
     report = run_tradeoff(_case(scene, head), size_calibration, tolerance=tolerance_percent / 100, runs=runs)
     try:
         if figure is not None:
-            from tactile_bayes.report.tradeoff_figures import draw_tradeoff
+            from tactile_bayes.report.forward_tradeoff import draw_tradeoff
 
             draw_tradeoff(report, figure, force=force)
     finally:  # what was measured is not lost with the figure
@@ -107,7 +103,7 @@ def _case(path: Path | None, head: str | None) -> LumpCase:
     from tactile_bayes.files.scene_toml import read_scene
     from tactile_bayes.forward.scene import Scene
     from tactile_bayes.forward.tissue import SceneBody, SolidLump
-    from tactile_bayes.studies.forward_tradeoff import case_of
+    from tactile_bayes.studies.tradeoffs import case_of
 
     if path is None:
         return case_of(Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)), head=head)
@@ -123,9 +119,11 @@ def run_tradeoff(case: LumpCase, calibration: str | None, *, tolerance: float, r
 
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.study import fit_line
-    from tactile_bayes.report.tradeoff_text import TradeoffReport
-    from tactile_bayes.studies.forward_tradeoff import PLANE, SOLID, measure, settings_of
-    from tactile_bayes.studies.raster import fit_raster
+    from tactile_bayes.report.forward_tradeoff import TradeoffReport
+    from tactile_bayes.studies.paper_solid import fit_raster
+    from tactile_bayes.studies.tradeoffs import PLANE, SOLID
+    from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
+    from tactile_bayes.studies.tradeoffs import measure_forward as measure
 
     # a raster's frames are divided by their means
     own = {PLANE: "plane-strain", SOLID: "solid-mean"}
@@ -149,9 +147,8 @@ def _rule(case: LumpCase, model: str, name: str) -> SizeRule:
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.shipped import size_calibration_path
     from tactile_bayes.files.size_json import read_size_calibration
-    from tactile_bayes.studies.forward_tradeoff import teach
-    from tactile_bayes.studies.raster import fit_raster
-    from tactile_bayes.studies.size_rules import calibrated_rule, learned_rule
+    from tactile_bayes.studies.paper_solid import fit_raster
+    from tactile_bayes.studies.tradeoffs import calibrated_rule, learned_rule, teach
 
     if name == LEARNED:
         with progress_bar(f"lumps for Eq 6, {model}") as progress:

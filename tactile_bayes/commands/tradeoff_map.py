@@ -6,9 +6,7 @@ from pathlib import Path
 
 import click
 
-from tactile_bayes.commands.figure_path import METAVAR, FigurePath
-from tactile_bayes.commands.options import FORCE, JSON, seed_option
-from tactile_bayes.commands.paths import FilePath
+from tactile_bayes.commands.options import FORCE, JSON, METAVAR, FigurePath, FilePath, seed_option
 from tactile_bayes.commands.tradeoff_options import RUNS, TOLERANCE
 
 _FILE = FilePath()
@@ -47,14 +45,14 @@ def command(
     import time
     from dataclasses import replace
 
+    from tactile_bayes.api.settings import Settings
+    from tactile_bayes.api.tradeoffs import tradeoff_of_scan
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.tradeoff_options import forecast, show
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan
-    from tactile_bayes.pipeline.settings import Settings
-    from tactile_bayes.pipeline.tradeoff import tradeoff_of_scan
-    from tactile_bayes.studies.cost_ladder import Work
+    from tactile_bayes.studies.estimate_tradeoff import Work
 
     if figure is not None:
         refuse_existing(figure, force=force)

@@ -1,8 +1,11 @@
-"""What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output."""
+"""Options of the trade-offs, and the CPU time of a command in a process of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +14,39 @@ import click
 from tactile_bayes.commands.options import FiniteRange
 
 if TYPE_CHECKING:
-    from tactile_bayes.studies.cost_ladder import Ladder
+    from tactile_bayes.studies.estimate_tradeoff import Ladder
+
+
+# --- CPU time of this program in a process of its own: what a user who types one command waits for.
+
+TIMES = 2
+
+
+def fresh_cpu_s(words: Sequence[str]) -> float | None:
+    """Least CPU seconds of a command in a fresh process; None where the system does not tell them.
+
+    Parameters
+    ----------
+    words
+        Of the command, without the program's name.
+    """
+    spent = []
+    for _ in range(TIMES):
+        before = os.times()
+        subprocess.run(
+            [sys.executable, "-m", "tactile_bayes", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            check=False,
+        )
+        after = os.times()
+        spent.append(after.children_user - before.children_user + after.children_system - before.children_system)
+    least = min(spent)
+    return least if least > 0 else None
+
+
+# --- What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output.
 
 TOLERANCE = click.option(
     "--tolerance-mm",
@@ -51,10 +86,8 @@ def show(
 ) -> int:
     """Draw and print; the exit code."""
     from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
-    from tactile_bayes.files.schema import check_document, dump_json
-    from tactile_bayes.report.ladder_document import SCHEMA_FILE, ladder_document
-    from tactile_bayes.report.ladder_figure import draw_ladder
-    from tactile_bayes.report.ladder_text import ladder_text
+    from tactile_bayes.files.documents import check_document, dump_json
+    from tactile_bayes.report.tradeoff import SCHEMA_FILE, draw_ladder, ladder_document, ladder_text
 
     try:
         if figure is not None:

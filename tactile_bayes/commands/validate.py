@@ -7,10 +7,9 @@ from typing import Any
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, FiniteRange, seed_option
-from tactile_bayes.commands.paths import FilePath, also_read
+from tactile_bayes.api.trial_report import TrialOutcome, TrialSettings, analyse
+from tactile_bayes.commands.options import FORCE, JSON, FilePath, FiniteRange, also_read, seed_option
 from tactile_bayes.errors import UsageError
-from tactile_bayes.pipeline.trial import TrialOutcome, TrialSettings, analyse
 
 _FILE = FilePath()
 _DEFAULTS = TrialSettings()
@@ -90,9 +89,9 @@ def command(
 
     Example: tactile-bayes validate trial.csv --excision excision.csv -o report.json
     """
+    from tactile_bayes.api.trials import load_trial
     from tactile_bayes.files.atomic import refuse_existing, write_text
-    from tactile_bayes.files.schema import check_document, dump_json
-    from tactile_bayes.pipeline.trial_inputs import load_trial
+    from tactile_bayes.files.documents import check_document, dump_json
 
     for target in (output, html):
         if target:
@@ -117,7 +116,7 @@ def command(
 
 def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, TrialSettings]:
     """Title and settings of the protocol, if there is one; refuses options that contradict it."""
-    from tactile_bayes.files.protocol import read_protocol
+    from tactile_bayes.files.documents import read_protocol
 
     if protocol is None:
         return None, TrialSettings(**given)
@@ -134,7 +133,7 @@ def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None,
 
 
 def _text(outcome: TrialOutcome, *, methods: bool) -> str:
-    from tactile_bayes.report.trial_text import trial_text
+    from tactile_bayes.report.trial import trial_text
 
     more = [] if outcome.next_mass is None else outcome.next_mass.lines()
     return trial_text(outcome.report, methods=methods, checks=outcome.checks, more=more)

@@ -1,14 +1,30 @@
-"""Coded concepts of the exports, with where each comes from.
-
-Codes of SNOMED CT and of DICOM are those that PS3.16 of the DICOM standard lists (the context groups are named beside
-them). What no list has is in a coding scheme of this program's own, which every file declares.
-"""
+"""Codes and identifiers of the standards."""
 
 from __future__ import annotations
 
+import uuid
 from typing import Final, NamedTuple
 
-from tactile_bayes.exports.uids import content_uid
+# --- Unique identifiers that follow from content: equal content, equal identifier, on every machine.
+
+_ROOT: Final = uuid.UUID("5d0f8a6c-54d1-5c0e-9a2b-3f5a3c1c9d47")
+"""Name space of this program's identifiers; it must never change."""
+
+
+def content_uuid(role: str, *parts: str) -> uuid.UUID:
+    """UUID of version 5 (RFC 9562) of a role and of what identifies the content in it, such as digests."""
+    return uuid.uuid5(_ROOT, "\x1f".join((role, *parts)))
+
+
+def content_uid(role: str, *parts: str) -> str:
+    """DICOM unique identifier ``2.25.`` and the number of `content_uuid` (PS3.5 B.2); at most 44 characters."""
+    return f"2.25.{content_uuid(role, *parts).int}"
+
+
+# --- Coded concepts of the exports, with where each comes from.
+#
+# Codes of SNOMED CT and of DICOM are those that PS3.16 of the DICOM standard lists (the context groups are named
+# beside them). What no list has is in a coding scheme of this program's own, which every file declares.
 
 
 class Code(NamedTuple):

@@ -1,19 +1,309 @@
-"""A map as a DICOM Parametric Map: float values, with their place in the patient where it is known."""
+"""A map as DICOM: a parametric map and a picture."""
 
 from __future__ import annotations
 
-from typing import Any, Final
+import io
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tactile_bayes.exports.codes import BREAST, PRESSURE, RELATIVE_PRESSURE
-from tactile_bayes.exports.dicom_file import Study, add_study, coded, declare_scheme, item, laterality
-from tactile_bayes.exports.exam import MapFile
-from tactile_bayes.exports.extras import required
-from tactile_bayes.exports.place import ImagePlane, image_plane, lps_from_plane
-from tactile_bayes.exports.uids import content_uid
+from tactile_bayes import __version__
+from tactile_bayes.errors import UsageError
+from tactile_bayes.exports.codes import (
+    BREAST,
+    OWN_SCHEME,
+    OWN_SCHEME_NAME,
+    OWN_SCHEME_UID,
+    PRESSURE,
+    RELATIVE_PRESSURE,
+    Code,
+    content_uid,
+)
+from tactile_bayes.exports.exam import EstimateFile, MapFile, required
+from tactile_bayes.exports.identity import Identity, Moment
+from tactile_bayes.exports.nrrd import ImagePlane, image_plane, lps_from_plane
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.report.map_figure import FitContour, Place
+
+
+# --- What the DICOM objects of one export share: patient, study, equipment, identifiers, and their bytes.
+
+MANUFACTURER: Final = "tactile_bayes (research software)"
+MODEL: Final = "tactile-bayes"
+UTF_8: Final = "ISO_IR 192"
+EXPLICIT_LITTLE_ENDIAN: Final = "1.2.840.10008.1.2.1"
+# What highdicom writes by the clock; all may be left out.
+_OF_THE_CLOCK: Final = (
+    "InstanceCreationDate",
+    "InstanceCreationTime",
+    "DateOfSecondaryCapture",
+    "TimeOfSecondaryCapture",
+    "ContributionDateTime",
+)
+# Written where the standard wants a serial number and nobody gave one.
+NO_SERIAL_NUMBER: Final = "unknown"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Study:
+    """Patient and study of one export.
+
+    Parameters
+    ----------
+    identity
+        As given; its `patient_id` may come from the scan.
+    moment, content
+        When the exam was and when the content was made, with the time of day.
+    study_uid
+        As given, or by the content of the maps.
+    key
+        What identifiers of the objects follow from, besides their own content.
+    """
+
+    identity: Identity
+    moment: Moment
+    content: Moment
+    study_uid: str
+    key: tuple[str, ...]
+
+    def uid(self, role: str, *parts: str) -> str:
+        """Identifier of an object, or of its series, by the study and the object's content."""
+        return content_uid(role, self.study_uid, *self.key, *parts)
+
+
+def study_of(identity: Identity, maps: Sequence[MapFile]) -> Study:
+    """The study that maps of one exam belong to.
+
+    Raises
+    ------
+    UsageError
+        When the date and time that DICOM wants are not given.
+    """
+    moment, content = identity.study, identity.content
+    if moment is None or content is None:
+        raise UsageError(
+            "DICOM needs to know when the exam was; give --study-date YYYY-MM-DDTHH:MM, or a --worklist with study_date"
+        )
+    for name, one in (("study-date", moment), ("content-date", content)):
+        if not one.time:
+            raise UsageError(f"DICOM needs the time of day; give --{name} {one.iso_date}THH:MM")
+    given = [f"{name}={value}" for name, value in sorted(identity.given.items())]
+    digests = sorted(one.digest for one in maps)
+    # equal for all exports of one exam, whatever else is exported with it
+    person = [line for line in given if line.startswith(("patient_id=", "issuer=", "accession=", "study_date="))]
+    study_uid = identity.study_uid or content_uid("study", *digests, *person)
+    return Study(identity, moment, content, study_uid, (__version__, *given))
+
+
+def add_study(dataset: Any, study: Study, facts: Mapping[str, str] | None = None) -> None:
+    """Write the modules of patient, study and equipment into a dataset; what nobody gave stays empty.
+
+    Parameters
+    ----------
+    facts
+        Of an image's exam, for the breast and its side; neither is written of a phantom.
+    """
+    identity = study.identity
+    dataset.SpecificCharacterSet = UTF_8
+    dataset.PatientName = identity.patient_name
+    dataset.PatientID = identity.patient_id
+    if identity.issuer:
+        dataset.IssuerOfPatientID = identity.issuer
+    dataset.PatientBirthDate = identity.birth_date.replace("-", "")
+    dataset.PatientSex = identity.sex
+    dataset.StudyInstanceUID = study.study_uid
+    dataset.StudyDate, dataset.StudyTime = study.moment.date, study.moment.time
+    dataset.ContentDate, dataset.ContentTime = study.content.date, study.content.time
+    if study.moment.zone:
+        dataset.TimezoneOffsetFromUTC = study.moment.zone
+    dataset.AccessionNumber = identity.accession
+    dataset.StudyID = identity.study_id
+    dataset.ReferringPhysicianName = identity.referring_physician
+    if identity.study_description:
+        dataset.StudyDescription = identity.study_description
+    dataset.Manufacturer = MANUFACTURER
+    dataset.ManufacturerModelName = MODEL
+    dataset.DeviceSerialNumber = NO_SERIAL_NUMBER
+    dataset.SoftwareVersions = __version__
+    if facts is not None:
+        dataset.Laterality = laterality(facts)
+        if dataset.Laterality:
+            dataset.BodyPartExamined = "BREAST"
+
+
+def coded(code: Code) -> Any:
+    """A concept as highdicom has it."""
+    return required("highdicom").sr.CodedConcept(code.value, code.scheme, code.meaning)
+
+
+def item(**attributes: Any) -> Any:
+    """A dataset of these attributes, for a sequence."""
+    dataset = required("pydicom").Dataset()
+    for name, value in attributes.items():
+        setattr(dataset, name, value)
+    return dataset
+
+
+def laterality(facts: Mapping[str, str]) -> str:
+    """``L`` or ``R`` by the scan's session; empty for a phantom or an unknown side."""
+    side = facts.get("side", "")
+    return side[0].upper() if side in ("left", "right") else ""
+
+
+def declare_scheme(dataset: Any) -> None:
+    """Declare this program's own coding scheme, as a file must that uses one."""
+    dataset.CodingSchemeIdentificationSequence = [
+        item(
+            CodingSchemeDesignator=OWN_SCHEME,
+            CodingSchemeUID=OWN_SCHEME_UID,
+            CodingSchemeName=OWN_SCHEME_NAME,
+            CodingSchemeResponsibleOrganization=MODEL,
+        )
+    ]
+
+
+def dicom_bytes(dataset: Any) -> bytes:
+    """The dataset as a file of DICOM's part 10; nothing in it depends on the clock."""
+    pydicom = required("pydicom")
+    for one in (dataset, *dataset.get("ContributingEquipmentSequence", ())):
+        for name in _OF_THE_CLOCK:
+            if name in one:
+                delattr(one, name)
+    meta = pydicom.dataset.FileMetaDataset()
+    meta.MediaStorageSOPClassUID = dataset.SOPClassUID
+    meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
+    meta.TransferSyntaxUID = EXPLICIT_LITTLE_ENDIAN
+    meta.ImplementationClassUID = content_uid("implementation", MODEL)
+    meta.ImplementationVersionName = "TACTILE_BAYES"
+    plain = pydicom.Dataset(dataset)
+    plain.file_meta = meta
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pydicom.dcmwrite(buffer, plain, enforce_file_format=True, implicit_vr=False, little_endian=True)
+    return buffer.getvalue()
+
+
+# --- The map's figure as pixels, drawn from what an estimate's file says.
+
+_MOST_NOTE: Final = 400
+"""Characters that have a place above the figure."""
+
+
+def map_picture(source: MapFile, estimate: EstimateFile | None) -> NDArray[np.uint8]:
+    """(rows, columns, 3) red, green and blue of the map's figure; of an estimate of this map alone with its ellipse.
+
+    No file name is in it, because those may hold patients' names.
+    """
+    from matplotlib import rc_context, rcdefaults
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from tactile_bayes.report.map_figure import map_figure
+
+    document = estimate.document if estimate is not None and estimate.kind == "estimate" else None
+    side = source.facts.get("side")
+    with rc_context():
+        rcdefaults()
+        figure = map_figure(
+            source.tactile_map,
+            None,
+            fit=None if document is None else _contour(document),
+            looked_at=() if document is None else _places(document),
+            title="Tactile map" + (f" of the {side} breast" if side in ("left", "right") else ""),
+            note="" if estimate is None else _note(estimate),
+            findings=None if estimate is None else estimate.findings,
+        )
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())
+    return np.ascontiguousarray(pixels[:, :, :3])
+
+
+def _note(estimate: EstimateFile) -> str:
+    from tactile_bayes.report.estimate_text import no_estimate_line
+
+    reasons = [one.reason for one in estimate.masses if one.largest is None]
+    return no_estimate_line(reasons[0][:_MOST_NOTE]) if reasons and not estimate.sized else ""
+
+
+def _places(document: Any) -> list[Place]:
+    from tactile_bayes.report.map_figure import Place
+
+    return [Place((one["x_mm"], one["y_mm"]), one["fault"]) for one in document["candidates"] if one["fault"]]
+
+
+def _contour(document: Any) -> FitContour | None:
+    """Ellipse and size at the medians."""
+    from tactile_bayes.report.map_figure import FitContour
+
+    names = ("sigma_x_mm", "sigma_y_mm", "background", "amplitude")
+    centre = document["centre_mm"] or {"x": None}
+    if centre["x"] is None or centre["y"] is None or any(document[name] is None for name in names):
+        return None
+    middle = {name: document[name]["median"] for name in names}
+    size = None
+    if document["d_x_mm"] is not None and document["d_y_mm"] is not None:
+        size = (document["d_x_mm"]["median"], document["d_y_mm"]["median"])
+    return FitContour(
+        (centre["x"]["median"], centre["y"]["median"]),
+        middle["sigma_x_mm"],
+        middle["sigma_y_mm"],
+        0.0 if document["angle_deg"] is None else document["angle_deg"]["median"],
+        size,
+        middle["background"],
+        middle["amplitude"],
+    )
+
+
+# --- The map's figure as a DICOM Secondary Capture, which every viewer shows.
+
+PICTURE_SERIES: Final = 2
+
+
+def secondary_capture(source: MapFile, estimate: EstimateFile | None, *, study: Study, number: int) -> Any:
+    """The figure as a Secondary Capture in red, green and blue.
+
+    Parameters
+    ----------
+    number
+        Of the instance in its series, from 1.
+    """
+    highdicom = required("highdicom")
+    digest = "" if estimate is None else estimate.digest
+    dataset = highdicom.sc.SCImage(
+        pixel_array=map_picture(source, estimate),
+        photometric_interpretation="RGB",
+        bits_allocated=8,
+        coordinate_system="PATIENT",
+        patient_orientation=("L", "F"),
+        study_instance_uid=study.study_uid,
+        series_instance_uid=study.uid("series of pictures"),
+        series_number=PICTURE_SERIES,
+        sop_instance_uid=study.uid("picture", source.digest, digest),
+        instance_number=number,
+        manufacturer=MANUFACTURER,
+        transfer_syntax_uid=EXPLICIT_LITTLE_ENDIAN,
+        series_description=f"Map figure. {RESEARCH_USE}",
+        content_date=study.content.date,
+        content_time=study.content.time,
+    )
+    add_study(dataset, study, source.facts)
+    if source.tactile_map.patient_from_plane is None:
+        dataset.PatientOrientation = ""
+    dataset.BurnedInAnnotation = "NO"  # nothing in it says who the patient is, nor when the exam was
+    dataset.RecognizableVisualFeatures = "NO"
+    dataset.ImageComments = f"{RESEARCH_USE} SHA-256 of the map: {source.digest}"
+    return dataset
+
+
+# --- A map as a DICOM Parametric Map: float values, with their place in the patient where it is known.
 
 PARAMETRIC_MAP: Final = "1.2.840.10008.5.1.4.1.1.30"
 SERIES: Final = 1

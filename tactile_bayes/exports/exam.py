@@ -1,32 +1,58 @@
-"""What an export is made from: a map's file, and what an estimate's file says of each mass."""
+"""What of an exam goes into an export."""
 
 from __future__ import annotations
 
 import codecs
 import hashlib
+import importlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tactile_bayes.abstention import NO_LUMP
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import NO_LUMP, BadDataError, UsageError
 from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json
 from tactile_bayes.files.estimate_json import SCHEMAS, check_estimate
-from tactile_bayes.files.kinds import HDF5_MAGIC
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
-from tactile_bayes.files.reading import open_input
+from tactile_bayes.files.reading import HDF5_MAGIC, open_input
 from tactile_bayes.findings import Finding, Verdict, finding_lines, findings_in, verdict
 from tactile_bayes.records import dataclass
+from tactile_bayes.report.estimate_text import exams_label
 from tactile_bayes.report.quantities import leading
-from tactile_bayes.report.size_text import exams_label
 
 if TYPE_CHECKING:
-    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.mapping.map import TactileMap
+
+
+# --- Packages that only exports need, each imported when its format is asked for.
+
+EXTRAS: Final = {"pydicom": "dicom", "highdicom": "dicom", "fhir.resources": "fhir", "nrrd": "slicer"}
+"""Package -> the extra of this program that installs it."""
+
+
+def required(module: str) -> Any:
+    """Import a module of an optional package, for example ``highdicom.sr``.
+
+    Raises
+    ------
+    UsageError
+        When its package is not installed, with the command that installs it.
+    """
+    package = next(name for name in EXTRAS if module == name or module.startswith(f"{name}."))
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        extra = EXTRAS[package]
+        raise UsageError(
+            f"this needs the package {package}; install it with pip install 'tactile-bayes[{extra}]'"
+        ) from None
+
+
+# --- What an export is made from: a map's file, and what an estimate's file says of each mass.
 
 _WAY_OUT: Final = "give a map (.nc), a posterior (.nc), or the JSON of `estimate --json`"
 _MOST_TEXT: Final = 2000
@@ -178,7 +204,7 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
             attributes = None if group is None else group.attributes()
         return _read_map(path) if attributes is None else [_read_posterior(path, attributes)]
     if not head.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"[")):
-        from tactile_bayes.files.kinds import kind_of
+        from tactile_bayes.files.reading import kind_of
 
         kind = kind_of(path) or ("none of these" if head else "empty")
         raise BadDataError(f"is {kind}", way_out=_WAY_OUT, path=str(path))
@@ -219,7 +245,7 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
     """
     schema = document.get("schema") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(schema, str) or schema not in SCHEMAS:
-        from tactile_bayes.files.kinds import schema_kind
+        from tactile_bayes.files.reading import schema_kind
 
         raise BadDataError(f"is {schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
     check_estimate(document, SCHEMAS[schema], path=path)

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_toml
-from tactile_bayes.files.schema import check_document
+from tactile_bayes.files.documents import check_document, load_toml
 from tactile_bayes.files.tables import RawTable, Table, parse_date, read_raw
 
 _EXCISION = ("patient", "mass", "ex_vivo_mm", "ex_vivo_second_mm", "sd_mm", "date")

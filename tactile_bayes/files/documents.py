@@ -1,4 +1,4 @@
-"""Safe reading of JSON and TOML: limited size and depth, finite numbers, no control characters or surrogates."""
+"""JSON and TOML from other hands: guarded parsing, schemas, settings, bodies, sessions."""
 
 from __future__ import annotations
 
@@ -6,15 +6,181 @@ import json
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from tactile_bayes.declarations import from_plain, schema_name
-from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.kinds import kind_of, schema_kind
-from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, read_text
+from tactile_bayes.errors import BadDataError, meant
+from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
+from tactile_bayes.studies.population import BodyPrior, ExamPrior
+
+if TYPE_CHECKING:
+    from tactile_bayes.scan import Scan
+
+
+# --- Refusal of keys that a file may not have, with the key that was probably meant.
+
+
+def refuse_unknown(table: Mapping[str, object], known: Collection[str], *, path: Path, where: str = "") -> None:
+    """Raise `BadDataError` for the first key of a table that is not known.
+
+    Parameters
+    ----------
+    where
+        Name of the table in the file; empty for the file itself.
+    """
+    for key in table:
+        if key in known:
+            continue
+        full = f"{where}.{key}" if where else key
+        raise BadDataError(f"{full} is not known", way_out=meant(key, known), path=str(path))
+
+
+# --- The schemas in data_schema/, from a wheel or a checkout, applied with one-line errors.
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+
+
+@cache
+def load_schema(name: str) -> dict[str, Any]:
+    """Load the schema ``data_schema/NAME`` (``size_calibration.schema.json``, ``trial.table.json``...)."""
+    for folder in (_PACKAGE / "data_schema", _PACKAGE.parent / "data_schema"):
+        if (folder / name).is_file():
+            document: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
+            return document
+    raise FileNotFoundError(f"schema {name} is not installed with this program")
+
+
+def check_document(document: object, schema_name: str, *, path: Path) -> None:
+    """Check a JSON document against its schema.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the field, its value and the rule it breaks.
+    """
+    import fastjsonschema
+
+    _check_kind(document, schema_name, path=path)
+    try:
+        _validator(schema_name)(document)
+    except fastjsonschema.JsonSchemaValueException as error:
+        what, way_out = _in_words(error)
+        raise BadDataError(what, way_out=f"{way_out} (see {schema_name})", path=str(path)) from None
+
+
+_CODE: Final = re.compile(r"\^\[A-Za-z0-9_-\]\{1,(\d+)\}\$")
+_KINDS: Final = {
+    "string": "a text",
+    "number": "a number",
+    "integer": "a whole number",
+    "object": "a table of keys",
+    "array": "a list",
+    "boolean": "true or false",
+    "null": "null",
+}
+
+
+def _in_words(error: Any) -> tuple[str, str]:
+    """What is wrong in a document, and what can be given instead, without the words of schemas."""
+    where = ".".join(map(str, error.path[1:])) or "the document"
+    what, wanted, definition = f"{where} is {_shown(error.value)}", error.rule_definition, error.definition
+    if error.rule == "required":
+        missing = next(name for name in wanted if name not in error.value)
+        return f"{where} has no {missing}", "add it"
+    if error.rule in ("additionalProperties", "propertyNames"):
+        return _unknown_key(error, "" if where == "the document" else f"{where}.")
+    if error.rule == "enum" and isinstance(error.value, str):
+        texts = [str(one) for one in wanted]
+        near = meant(error.value, texts)
+        return what, f"{near} Give one of {', '.join(texts)}" if near.startswith("did") else _allowed(definition)
+    if error.rule == "pattern" and not _CODE.fullmatch(wanted):
+        return what, str(definition.get("description", f"the pattern is {wanted}"))
+    if error.rule == "type" and wanted == "string":
+        return what, "give a text, in quotes"
+    if error.rule in ("type", "enum", "const", "pattern", "anyOf", "oneOf") or "imum" in error.rule:
+        return what, _allowed(definition)
+    if error.rule in ("minLength", "maxLength"):
+        return what, f"give a text of {definition.get('minLength', 0)} to {definition.get('maxLength', 2000)} letters"
+    rule = error.message.split(" ", 1)[1] if " " in error.message else error.message
+    return f"{where} {rule} (found {_shown(error.value)})", "give what it may hold"
+
+
+def _allowed(definition: Mapping[str, Any]) -> str:
+    """What a definition allows, such as "give a number above 0"."""
+    for several in ("anyOf", "oneOf"):
+        if several in definition:
+            return f"give {' or '.join(_allowed(one).removeprefix('give ') for one in definition[several])}"
+    if "const" in definition:
+        return f"give {definition['const']!r}"
+    if "enum" in definition:
+        return f"give one of {', '.join('null' if one is None else str(one) for one in definition['enum'])}"
+    if found := _CODE.fullmatch(definition.get("pattern", "")):
+        return f"give up to {found[1]} letters from A to Z and a to z, digits, _ and -"
+    kinds = definition.get("type", ())
+    return f"give {' or '.join(_kind(kind, definition) for kind in ([kinds] if isinstance(kinds, str) else kinds))}"
+
+
+def _kind(kind: str, definition: Mapping[str, Any]) -> str:
+    if kind not in ("number", "integer"):
+        return _KINDS[kind]
+    words = _KINDS[kind]
+    if "exclusiveMinimum" in definition:
+        words += f" above {definition['exclusiveMinimum']:g}"
+    if "minimum" in definition:
+        words += f" from {definition['minimum']:g}" + ("" if "maximum" in definition else " on")
+    if "maximum" in definition:
+        words += f" {'to' if 'minimum' in definition else 'up to'} {definition['maximum']:g}"
+    return words + (f" below {definition['exclusiveMaximum']:g}" if "exclusiveMaximum" in definition else "")
+
+
+def _unknown_key(error: Any, where: str) -> tuple[str, str]:
+    """The first key that a table may not have, with the one that was probably meant."""
+    known, rule = tuple(error.definition.get("properties", ())), error.rule_definition
+    if error.rule == "additionalProperties":
+        name = next(one for one in error.value if one not in known)
+        return f"{where}{name} is not known", meant(name, known) if known else "leave it out"
+    refused, pattern = rule.get("not", {}).get("enum", ()), rule.get("pattern", "")
+    name = next(one for one in error.value if one in refused or not re.search(pattern, one))
+    if name in refused:
+        return f"{where}{name} may not be given", "leave it out: nothing here may identify a person"
+    near = meant(name, known) if known else ""
+    return f"{where}{_shown(name)} is not known", near if near.startswith(
+        "did"
+    ) else "keys are of small letters, digits and _"
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _check_kind(document: object, schema_name: str, *, path: Path) -> None:
+    """Refuse a document of another kind by its name, before checking its fields against the wrong schema."""
+    wanted = schema_kind(load_schema(schema_name).get("properties", {}).get("schema", {}).get("const"))
+    found = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
+    if wanted and found and found != wanted:
+        raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
+
+
+@cache
+def _validator(schema_name: str) -> Any:
+    import fastjsonschema
+
+    # our ids are names, not addresses: with one in place the compiler would try to fetch what "$ref" points to
+    document = {key: value for key, value in load_schema(schema_name).items() if key != "$id"}
+    return fastjsonschema.compile(document)
+
+
+def dump_json(document: object) -> str:
+    """Format as JSON with a fixed layout; refuses NaN and infinities, which JSON does not have."""
+    return json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+# --- Safe reading of JSON and TOML: limited size and depth, finite numbers, no control characters or surrogates.
 
 MOST_LEVELS: Final = 64
 MOST_KEY_PARTS: Final = 16
@@ -168,3 +334,122 @@ def check_text(where: str, text: str, *, way_out: str) -> None:
     if not text.isprintable() and (found := _CONTROL.search(text)):
         code = f"U+{ord(found[0]):04X}"  # a terminal obeys some, a table's reader stumbles over all
         raise BadDataError(f"{where or 'a key'} holds the character {code}: {text[:40]!a}", way_out=way_out)
+
+
+# --- A pre-specified analysis in TOML: settings fixed before the data were seen, and other text.
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """The settings that a protocol fixes, and its title where it has one."""
+
+    analysis: dict[str, Any]
+    title: str | None = None
+
+
+def read_protocol(path: Path) -> Protocol:
+    """Read the title and the settings under ``[analysis]``; the rest counts only through the file's hash.
+
+    Raises
+    ------
+    BadDataError
+        When the file is not TOML or fixes something that is no setting.
+    """
+    document = load_toml(path, way_out="give the analysis as TOML")
+    check_document(document, "protocol.schema.json", path=path)
+    return Protocol(document.get("analysis", {}), document.get("title"))
+
+
+# --- Settings of `estimate` as TOML: priors and rarely used options; an unknown key is refused.
+
+SETTINGS_SCHEMA: Final = "settings.schema.json"
+PRIORS: Final = ("amplitude_sd", "width_median_mm", "log_width_sd", "log_ratio_sd", "tilt_sd")
+_NUMBERS: Final = ("fit_radius_mm", "between_map_sd", "accuracy_mm")
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Read settings by the names of `pipeline.settings.Settings`, the priors together under ``prior``.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the key, its value and what is allowed.
+    """
+    document = load_toml(path, way_out=f"see {SETTINGS_SCHEMA}")
+    known = load_schema(SETTINGS_SCHEMA)["properties"]
+    unknown = sorted(set(document) - set(known))
+    if unknown:
+        raise BadDataError(f"unknown key {unknown[0]}", way_out=meant(unknown[0], known), path=str(path))
+    check_document(dict(document), SETTINGS_SCHEMA, path=path)  # it fills in defaults
+    prior = {name: float(document.pop(name)) for name in PRIORS if name in document}
+    found: dict[str, Any] = {name: float(value) if name in _NUMBERS else value for name, value in document.items()}
+    if "checkpoint" in found:
+        found["checkpoint"] = path.parent / found["checkpoint"]
+    if found.get("field_cosines") == "auto":
+        found["field_cosines"] = None
+    return found | {"prior": prior or None, "settings_file": path}
+
+
+# --- Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other text.
+
+SESSION_SCHEMA: Final = "scan_session.schema.json"
+SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation", "array_calibration_days")
+"""Keys that the recording itself writes."""
+
+
+def with_session(scan: Scan, path: Path | None) -> Scan:
+    """The scan with the facts of a session file over its own; for the errors see `read_session`."""
+    return scan if path is None else replace(scan, session={**scan.session, **read_session(path)})
+
+
+def read_session(path: Path) -> dict[str, str]:
+    """Read the session facts.
+
+    Raises
+    ------
+    BadDataError
+        When the file is not TOML, a value is not text as `scan_session.schema.json` has it, or a key is one of
+        `SET_BY_RECORDING`.
+    """
+    document = load_toml(path, way_out=f"see {SESSION_SCHEMA}")
+    for key in SET_BY_RECORDING:
+        if key in document:
+            raise BadDataError(f"{key} is set by the recording itself", way_out=f"leave {key} out", path=str(path))
+    check_document(document, SESSION_SCHEMA, path=path)
+    return {key: str(value) for key, value in document.items()}
+
+
+# --- Bodies and exams of a simulated population as TOML: ranges, and an unknown key is refused.
+
+SCHEMA_FILE: Final = "bodies.schema.json"
+
+
+def read_bodies(path: Path) -> tuple[BodyPrior, ExamPrior]:
+    """Read the ranges of bodies and exams; missing keys keep the defaults.
+
+    Raises
+    ------
+    BadDataError
+        Naming the file, the key, its value and what is allowed.
+    """
+    document = load_toml(path, way_out=f"see {SCHEMA_FILE}")
+    tables = load_schema(SCHEMA_FILE)["properties"]
+    refuse_unknown(document, tables, path=path)
+    for name, table in document.items():
+        if isinstance(table, dict):
+            refuse_unknown(table, tables[name]["properties"], path=path, where=name)
+    check_document(document, SCHEMA_FILE, path=path)
+    bodies, exams = (_ranges(document.get(name, {}), name, path) for name in ("bodies", "exams"))
+    found = BodyPrior(**bodies), ExamPrior(**exams)
+    if found[1].drift_kpa[1] >= found[1].mean_kpa[0]:
+        what = f"exams.drift_kpa reaches {found[1].drift_kpa[1]:g}, and mean_kpa begins at {found[1].mean_kpa[0]:g}"
+        raise BadDataError(what, way_out="keep the drift below the mean pressure", path=str(path))
+    return found
+
+
+def _ranges(table: Mapping[str, Any], where: str, path: Path) -> dict[str, Any]:
+    for name, (low, high) in table.items():
+        if low > high:
+            what = f"{where}.{name} runs backwards, from {low:g} to {high:g}"
+            raise BadDataError(what, way_out="give the lower end first", path=str(path))
+    return {name: (low, high) for name, (low, high) in table.items()}

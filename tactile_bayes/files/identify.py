@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, parse_json
-from tactile_bayes.files.kinds import HDF5_MAGIC, MCAP_MAGIC
-from tactile_bayes.files.reading import open_input
+from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, open_input
 from tactile_bayes.findings import finding_lines, findings_in
 
 if TYPE_CHECKING:
     from tactile_bayes.files.netcdf import Group
-    from tactile_bayes.mapping.tactile_map import TactileMap
+    from tactile_bayes.mapping.map import TactileMap
     from tactile_bayes.size.pooling import Calibration
 
 _TABLES = (
@@ -52,7 +51,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _scan(path: Path) -> dict[str, Any]:
-    from tactile_bayes.files.scan_summary import summarise_scan
+    from tactile_bayes.files.scan_mcap import summarise_scan
 
     return summarise_scan(path)
 
@@ -228,9 +227,8 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
 
 def _table(path: Path, head: bytes) -> dict[str, Any]:
     """Describe a CSV table whose header fits one of the schemas."""
-    from tactile_bayes.files.csv_cells import separator_in
-    from tactile_bayes.files.schema import load_schema
-    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.files.documents import load_schema
+    from tactile_bayes.files.tables import read_table, separator_in
 
     try:
         text = head.decode("utf-8-sig")

@@ -14,9 +14,9 @@ from typing import Any, Final
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.campaign_names import exam_name, mass_name
+from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, read_bytes
 from tactile_bayes.files.remote import check_address, is_address
-from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.shipped import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, read_raw, read_table
 from tactile_bayes.records import dataclass

@@ -21,9 +21,9 @@ from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.findings import findings_in
 from tactile_bayes.geometry import FloatArray, check_rigid
-from tactile_bayes.head_shape import HeadShape
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.presets import NORMALISE
+from tactile_bayes.scan import HeadShape
 
 SCHEMA = "tactile-bayes/map/2"
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"

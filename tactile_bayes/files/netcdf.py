@@ -1,13 +1,10 @@
-"""Files of netCDF-4 by h5py alone: written in memory and stored atomically, read with every size checked first.
-
-A netCDF-4 file is an HDF5 file whose dimensions are dimension scales. A dimension without a variable of its name is an
-empty scale, which netCDF hides. Record 0080 says why neither netCDF4 nor h5netcdf is used here.
-"""
+"""Files of netCDF-4 through HDF5: limits, attributes, variables."""
 
 from __future__ import annotations
 
 import contextlib
 import io
+import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -17,10 +14,57 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import check_text
-from tactile_bayes.files.hdf5_heaps import check_heaps
-from tactile_bayes.files.kinds import HDF5_MAGIC, not_a
-from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, open_input, unpacked_limit
+from tactile_bayes.files.reading import (
+    HDF5_MAGIC,
+    NETCDF_BYTES,
+    check_limit,
+    decoding,
+    not_a,
+    open_input,
+    unpacked_limit,
+)
 from tactile_bayes.records import dataclass
+
+# --- Check of an HDF5 file's text heaps before the library opens it: a damaged size makes the library loop forever.
+
+_COLLECTION: Final = b"GCOL\x01\x00\x00\x00"
+_OBJECT: Final = struct.Struct("<HHIQ")  # index, references, reserved, size
+_ALIGNMENT: Final = 8
+
+
+def check_heaps(data: bytes, *, way_out: str) -> None:
+    """Refuse a file whose global heap has free space of size 0.
+
+    The HDF5 library (seen with 2.0) walks from object to object by their sizes and would stay at that one.
+
+    Raises
+    ------
+    BadDataError
+        When there is such a heap, or when heaps lie inside one another.
+
+    References
+    ----------
+    HDF5 File Format Specification 3.0, III.E, "Disk Format: Level 1E - Global Heap".
+    """
+    steps = len(data) // _OBJECT.size  # as many objects as the file can hold
+    start = data.find(_COLLECTION)
+    while start >= 0:
+        at = start + len(_COLLECTION)
+        end = min(len(data), start + int.from_bytes(data[at : at + 8], "little"))
+        at += 8
+        while at + _OBJECT.size <= end:
+            index, _, _, size = _OBJECT.unpack_from(data, at)
+            steps -= 1
+            if steps < 0 or (index == 0 and size == 0):
+                raise BadDataError("not a readable netCDF file (a damaged heap)", way_out=way_out)
+            at += size if index == 0 else _OBJECT.size + -(-size // _ALIGNMENT) * _ALIGNMENT
+        start = data.find(_COLLECTION, start + 1)
+
+
+# --- Files of netCDF-4 by h5py alone: written in memory and stored atomically, read with every size checked first.
+#
+# A netCDF-4 file is an HDF5 file whose dimensions are dimension scales. A dimension without a variable of its name
+# is an empty scale, which netCDF hides. Record 0080 says why neither netCDF4 nor h5netcdf is used here.
 
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable.{:10d}"
 _PACKING: Final = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "fletcher32": True}

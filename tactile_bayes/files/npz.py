@@ -1,7 +1,9 @@
-"""Arrays from an .npz file, without pickle; declared sizes are checked before memory is allocated."""
+"""NPZ files of our own: checked shapes, checkpoints, outlines."""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import math
 import os
 import zipfile
@@ -12,8 +14,12 @@ from typing import IO, Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.kinds import ZIP_MAGIC
-from tactile_bayes.files.reading import check_limit, decoding, open_input, unpacked_limit
+from tactile_bayes.files.atomic import write_bytes
+from tactile_bayes.files.reading import ZIP_MAGIC, check_limit, decoding, open_input, unpacked_limit
+from tactile_bayes.inference.ensemble import ChainState
+from tactile_bayes.size.draws import ShapeDraws
+
+# --- Arrays from an .npz file, without pickle; declared sizes are checked before memory is allocated.
 
 Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
@@ -89,3 +95,111 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.
         data = bytearray(stream.read())  # up to the end of the member, so that its checksum is looked at
         flat: np.ndarray[Any, np.dtype[Any]] = np.frombuffer(data, dtype=dtype)
         return flat.reshape(shape, order="F" if in_columns else "C")
+
+
+# --- Checkpoints of `estimate --method ensemble`: plain arrays in an .npz, bound by a hash to what they belong to.
+
+SCHEMA = "tactile-bayes/checkpoint/2"
+SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2}
+
+
+class CheckpointFile:
+    """A checkpoint file, rewritten after each block of steps.
+
+    Parameters
+    ----------
+    path
+        Made when it does not exist.
+    context
+        What else the chain depends on, for example the calibration's hash; another's checkpoint is refused.
+    """
+
+    def __init__(self, path: Path, *, context: str = "") -> None:
+        self.path, self.context = path, context
+
+    def load(self, key: str) -> ChainState | None:
+        """Read the state; None when there is no file.
+
+        Raises
+        ------
+        BadDataError
+            When the file is of another map, calibration or setting, or no checkpoint.
+        """
+        if not self.path.exists():
+            return None
+        try:
+            found = load_npz(self.path, required=["schema", "key", "sha256", *SHAPES], optional=())
+        except BadDataError as error:
+            raise BadDataError(
+                f"is no checkpoint: {error.what}", way_out="name another file", path=str(self.path)
+            ) from None
+        shaped = all(found[name].ndim == n for name, n in SHAPES.items())
+        if str(found["schema"]) != SCHEMA or not shaped:
+            raise BadDataError(f"is no checkpoint of schema {SCHEMA}", way_out="name another file", path=str(self.path))
+        if str(found["sha256"]) != _digest(found):
+            raise BadDataError("is damaged: its checksum does not match", way_out="remove it", path=str(self.path))
+        if str(found["key"]) != self._bound(key):
+            raise BadDataError(
+                "is a checkpoint of another map, calibration or setting",
+                way_out="give the same map and options (only max_steps may differ), or name another file",
+                path=str(self.path),
+            )
+        return ChainState(**{name: found[name] for name in SHAPES})
+
+    def save(self, key: str, state: ChainState) -> None:
+        """Write the state atomically."""
+        arrays = {"schema": np.array(SCHEMA), "key": np.array(self._bound(key)), **state.as_arrays()}
+        buffer = io.BytesIO()
+        np.savez(buffer, sha256=np.array(_digest(arrays)), **arrays)
+        write_bytes(self.path, buffer.getvalue(), force=True)
+
+    def _bound(self, key: str) -> str:
+        return f"{key}:{self.context}"
+
+
+def _digest(arrays: Mapping[str, np.ndarray[Any, Any]]) -> str:
+    """Checksum of the state and of what it belongs to, so that no changed number is read as valid."""
+    digest = hashlib.sha256()
+    for name in ("key", *SHAPES):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+# --- Draws that pooling needs of a map, as plain arrays in an .npz; equal draws give equal bytes.
+
+_DRAWS: Final = ("log_amplitude", "log_width", "q", "r")
+
+
+def write_shape(path: Path, shape: ShapeDraws, *, force: bool = False) -> None:
+    """Write the draws atomically; fields that are None are left out."""
+    values: dict[str, Any] = {name: getattr(shape, name) for name in shape.__struct_fields__}
+    out = io.BytesIO()
+    np.savez_compressed(out, **{name: value for name, value in values.items() if value is not None})
+    write_bytes(path, out.getvalue(), force=force)
+
+
+def read_shape(path: Path) -> ShapeDraws:
+    """Read what `write_shape` wrote.
+
+    Raises
+    ------
+    BadDataError
+        When the file is damaged, or its draws are not of one length.
+    """
+    try:
+        optional = [name for name in ShapeDraws.__struct_fields__ if name not in _DRAWS]
+        arrays = load_npz(path, required=_DRAWS, optional=optional)
+        if len({arrays[name].shape for name in _DRAWS}) > 1:
+            raise BadDataError("holds draws of several lengths", way_out="estimate the map again")
+        return ShapeDraws(**{name: _value(name, array) for name, array in arrays.items()})
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def _value(name: str, array: np.ndarray[Any, Any]) -> Any:
+    """An array of draws or labels as it is, a number as a float, a few numbers as a tuple."""
+    if name in (*_DRAWS, "labels"):
+        return array
+    return float(array) if array.ndim == 0 else tuple(array.tolist())

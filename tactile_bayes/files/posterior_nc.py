@@ -18,7 +18,7 @@ from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes,
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.findings import Finding, findings_in
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.posterior.inference_groups import DrawGroup
+from tactile_bayes.posterior.arviz_groups import DrawGroup
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.records import dataclass

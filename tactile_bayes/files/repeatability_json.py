@@ -8,9 +8,8 @@ from typing import Any, Final
 
 from tactile_bayes.declarations import to_plain
 from tactile_bayes.files.atomic import sha256, write_text
-from tactile_bayes.files.documents import load_json
+from tactile_bayes.files.documents import check_document, dump_json, load_json
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import check_document, dump_json
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.site import PROBABILITY, Repeatability
 

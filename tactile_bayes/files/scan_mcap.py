@@ -1,22 +1,4 @@
-"""Scan files: MCAP that Foxglove opens, readable after the recording program was killed.
-
-Layout (schema id ``tactile-bayes/scan/1``)
-    Metadata and attachments come first, so that even an unfinished file says what it is:
-    ``tactile-bayes`` (schema id, units), ``session`` (plain text facts), ``provenance``, and ``truth`` for a simulated
-    scan; attachments ``head.json`` and ``element_calibration.json``. Then messages, zstd, chunks of at most 64 KiB:
-
-    - ``/pressure``, foxglove.Grid: raw counts, one uint16 field; the grid's columns run along x of `scanhead` and its
-      rows along y, so that a viewer draws the head the right way round;
-    - ``/pose``, foxglove.PoseInFrame in `base`: the tracker's sensor;
-    - ``/landmark``, foxglove.PoseInFrame in `base`: one channel a landmark, its name in the channel's metadata.
-
-Units
-    Lengths are in mm, not in the metres that Foxglove assumes: mm / 1000 * 1000 is not always the number it was, and
-    a scan must come back as it went in. Viewers draw a head of 24 x 39 "metres"; each channel's metadata says ``mm``.
-
-Times
-    ``publish_time`` and the message's timestamp are the device's, ``log_time`` is the host's; all in ns.
-"""
+"""A scan as an MCAP file."""
 
 from __future__ import annotations
 
@@ -36,10 +18,8 @@ from numpy.typing import NDArray
 from tactile_bayes import __version__
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
-from tactile_bayes.files.documents import parse_json
-from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
-from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_parts import (
+from tactile_bayes.files.documents import check_document, parse_json
+from tactile_bayes.files.instrument_json import (
     ScanFile,
     calibration_document,
     calibration_from_document,
@@ -48,9 +28,11 @@ from tactile_bayes.files.scan_parts import (
     ns_from_s,
     s_from_ns,
 )
-from tactile_bayes.files.schema import check_document
-from tactile_bayes.findings import Finding, findings_in
+from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
+from tactile_bayes.files.provenance import Provenance
+from tactile_bayes.findings import Finding, finding_lines, findings_in
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.select import Span, with_times
 from tactile_bayes.scan import (
     CountArray,
     ElementCalibration,
@@ -60,6 +42,26 @@ from tactile_bayes.scan import (
     Scan,
     TrackerPoses,
 )
+
+# --- Scan files: MCAP that Foxglove opens, readable after the recording program was killed.
+#
+# Layout (schema id ``tactile-bayes/scan/1``)
+#     Metadata and attachments come first, so that even an unfinished file says what it is:
+#     ``tactile-bayes`` (schema id, units), ``session`` (plain text facts), ``provenance``, and ``truth`` for a
+#       simulated
+#     scan; attachments ``head.json`` and ``element_calibration.json``. Then messages, zstd, chunks of at most 64 KiB:
+#
+#     - ``/pressure``, foxglove.Grid: raw counts, one uint16 field; the grid's columns run along x of `scanhead` and its
+#       rows along y, so that a viewer draws the head the right way round;
+#     - ``/pose``, foxglove.PoseInFrame in `base`: the tracker's sensor;
+#     - ``/landmark``, foxglove.PoseInFrame in `base`: one channel a landmark, its name in the channel's metadata.
+#
+# Units
+#     Lengths are in mm, not in the metres that Foxglove assumes: mm / 1000 * 1000 is not always the number it was, and
+#     a scan must come back as it went in. Viewers draw a head of 24 x 39 "metres"; each channel's metadata says ``mm``.
+#
+# Times
+#     ``publish_time`` and the message's timestamp are the device's, ``log_time`` is the host's; all in ns.
 
 SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
 CHUNK_BYTES: Final = 64 * 1024
@@ -459,3 +461,61 @@ def _decode(kind: Any, body: bytes) -> Any:
         raise BadDataError(
             f"a message is not a {kind.DESCRIPTOR.full_name}", way_out="the file was written by another program"
         ) from None
+
+
+# --- Summary of a scan file, counted while reading it from front to back; no message is kept.
+
+
+def summarise_scan(path: Path) -> dict[str, Any]:
+    """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
+
+    Raises
+    ------
+    BadDataError
+        As `read_scan_report`, but for messages that hold what they must not: nothing looks into them.
+    """
+    records = scan_records(path, keep=())
+    try:
+        return _summary(records)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def _summary(records: McapRecords) -> dict[str, Any]:
+    head = head_from_document(json_attachment(records, "head.json"))
+    time_s = message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
+    pose_s = message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
+    account = records.metadata.get("recording", {})
+    span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    topics = records.topic_counts()
+    return {
+        "schema": SCAN_SCHEMA,
+        "kind": "scan",
+        "complete": records.finished and not records.lost,
+        "findings": finding_lines(with_times(file_findings(records), Span.of(time_s), Span.of(pose_s))),
+        "frames": len(time_s),
+        "taxels": list(head.shape),
+        "poses": len(pose_s),
+        "duration_s": span_s,
+        "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
+        **_recording(account, topics, time_s),
+        "landmarks": all(_touched(records, name) for name in LANDMARK_NAMES),
+        "nipple": _touched(records, NIPPLE),
+        "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
+        "session": dict(records.metadata.get("session", {})),
+        "provenance": json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance"),
+    }
+
+
+def _touched(records: McapRecords, name: str) -> bool:
+    return len(records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)) > 0
+
+
+def _recording(account: Mapping[str, str], topics: Mapping[str, int], time_s: FloatArray) -> dict[str, Any]:
+    """Losses: gaps between the frames' times, and the recorder's account if the file has one."""
+    steps = np.diff(time_s)
+    period = float(np.median(steps)) if len(steps) else 0.0
+    missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
+    names = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "overrun_bytes", "ended_by", "fault")
+    told = {name: account[name] for name in names if account.get(name)}
+    return {"frames_missing": missing, "notes": topics.get("/log", 0)} | ({"recording": told} if told else {})

@@ -9,20 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import parse_toml
+from tactile_bayes.files.documents import load_schema, parse_toml
 from tactile_bayes.files.reading import TOML_BYTES, read_text
-from tactile_bayes.files.schema import load_schema
-from tactile_bayes.forward.scene import (
-    Background,
-    Head,
-    Lump,
-    Noise,
-    Scene,
-    SceneLandmarks,
-    Strokes,
-    Taxels,
-    Tracker,
-)
+from tactile_bayes.forward.scene import Background, Head, Lump, Noise, Scene, SceneLandmarks, Strokes, Taxels, Tracker
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 
 _SCHEMA: Final = "scene.schema.json"

@@ -15,9 +15,8 @@ import numpy as np
 from tactile_bayes.declarations import Meta, Record, field, replace, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import load_json, parse_record
+from tactile_bayes.files.documents import dump_json, load_json, parse_record
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import dump_json
 from tactile_bayes.files.shipped import SHIPPED, is_shipped
 from tactile_bayes.geometry import Matrix, Vector
 from tactile_bayes.presets import RESEARCH_USE

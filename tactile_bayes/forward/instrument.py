@@ -9,13 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.forward.scene import Background, Scene, Strokes, Taxels, rotation_from_vector
-from tactile_bayes.geometry import (
-    FloatArray,
-    apply,
-    inverse,
-    patient_from_base,
-    quaternion_from_rotation,
-)
+from tactile_bayes.geometry import FloatArray, apply, inverse, patient_from_base, quaternion_from_rotation
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 from tactile_bayes.records import dataclass
 from tactile_bayes.scan import (

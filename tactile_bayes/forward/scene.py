@@ -1,20 +1,15 @@
-"""Input of a simulated scan: lumps, strokes, head, noise and tracker, each validated on creation.
-
-Frames: a scene has its own `plane` frame. Its origin is the centre of the strokes, x runs across the head (along the
-strokes), y along the head, z into the tissue. Lumps and landmarks are given in it; with landmarks, the `patient` frame
-follows from them as for a real scan. `data_schema/scene.schema.json` holds the same names, defaults and ranges.
-"""
+"""A scene: a body, a lump and an exam to simulate, and the truth of its scan."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import Final
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Final
 
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head as Section
-from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump, check_solid
+from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump, check_solid, fat_thickness
 from tactile_bayes.geometry import FloatArray, rigid, rotation_from_quaternion
 from tactile_bayes.presets import (
     HEAD_COLUMNS,
@@ -24,6 +19,13 @@ from tactile_bayes.presets import (
     SHOULDERS_INSIDE,
     SHOULDERS_OUTSIDE,
 )
+
+# --- Input of a simulated scan: lumps, strokes, head, noise and tracker, each validated on creation.
+#
+# Frames: a scene has its own `plane` frame. Its origin is the centre of the strokes, x runs across the head (along
+# the strokes), y along the head, z into the tissue. Lumps and landmarks are given in it; with landmarks, the
+# `patient` frame follows from them as for a real scan. `data_schema/scene.schema.json` holds the same names,
+# defaults and ranges.
 
 Point = tuple[float, float, float]
 Taxel = tuple[int, int]
@@ -353,3 +355,37 @@ def _rigid(rotation_deg: Point, offset_mm: Point) -> FloatArray:
 def _above_zero(name: str, value: float) -> None:
     if not value > 0:
         raise BadDataError(f"{name} is {value}", way_out="it must be above 0")
+
+
+# --- Truth of a simulated scan of tissue.
+
+
+def tissue_truth(scene: Scene) -> dict[str, Any]:
+    """The body and its lumps as plain data; the balls of a rib do not count as lumps."""
+    body = scene.body or SceneBody()
+    fat = fat_thickness(body, scene.solid_lumps)
+    return {
+        "lumps": [_lump_truth(lump, body, fat) for lump in scene.solid_lumps],
+        "ribs": [asdict(rib) | {"ball_x_mm": [ball.x_mm for ball in rib.balls()]} for rib in scene.ribs],
+        "body": asdict(body) | {"fat_mm": fat},
+        "background": asdict(scene.background),
+    }
+
+
+def refuse_bumps(scene: Scene, model: str) -> None:
+    """Raise BadDataError where a scene gives bumps to a `model` that needs tissue."""
+    if scene.lumps:
+        raise BadDataError(
+            "lump[0] gives no depth_ratio",
+            way_out=f"the {model} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
+        )
+
+
+def _lump_truth(lump: SolidLump, body: SceneBody, fat_mm: float) -> dict[str, Any]:
+    seat = (fat_mm - lump.depth_mm) / (lump.vertical_mm / 2)
+    return asdict(lump) | {
+        "height_mm": lump.vertical_mm,
+        "seat": seat,
+        "depth_mm": lump.depth_mm,
+        "lump_kpa": lump.stiffness_ratio * body.fat_kpa,
+    }

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.framing import PacketParser
+from tactile_bayes.hardware.head import PacketParser
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import HelloReading, PoseReading, plausible
 

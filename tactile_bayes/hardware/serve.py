@@ -26,7 +26,7 @@ import numpy as np
 
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
-from tactile_bayes.mapping.orientation import orientation_of
+from tactile_bayes.mapping.places import orientation_of
 
 _PAGE: Final = Path(__file__).with_name("live_page.html")
 # How long a page may take to ask, and to say goodbye: the view's process waits for all of them.

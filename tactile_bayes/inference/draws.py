@@ -1,14 +1,16 @@
-"""Draws of a model's parameters, the result of every method."""
+"""Draws of a posterior: their summary and a cache."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field
 
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.records import dataclass
+
+# --- Draws of a model's parameters, the result of every method.
 
 END_ERROR = 2.67
 """Monte-Carlo error of an end of a 95 % interval, in SDs, times the root of the independent draws (normal tails)."""
@@ -95,3 +97,186 @@ def picked_rows(have: Labels, wanted: Labels, rng: np.random.Generator) -> Label
         members = members if len(members) else np.arange(len(have))
         index[places] = rng.permutation(np.resize(rng.permutation(members), len(places)))
     return index
+
+
+# --- Summary of a posterior in seven numbers, with its interval's kind and probability.
+
+INTERVAL_KIND = "eti"
+
+
+def nine_digits(value: float) -> float:
+    """The value to nine significant digits, as JSON has them."""
+    return float(f"{value:.9g}")
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """Summary of one quantity's draws.
+
+    Parameters
+    ----------
+    low, high
+        Ends of the equal-tailed interval of `probability`.
+    mc_error
+        Monte-Carlo standard error of the wider of the two ends; digits beyond it mean nothing.
+    """
+
+    median: float
+    mean: float
+    sd: float
+    low: float
+    high: float
+    probability: float
+    mc_error: float
+    kind: str = INTERVAL_KIND
+
+    def as_dict(self) -> dict[str, float | str]:
+        """Plain data, rounded to nine significant digits."""
+        names = ("median", "mean", "sd", "low", "high", "mc_error")
+        numbers: dict[str, float | str] = {name: nine_digits(getattr(self, name)) for name in names}
+        return numbers | {"probability": self.probability, "kind": self.kind}
+
+
+def summarise(
+    draws: FloatArray,
+    *,
+    probability: float,
+    effective_draws: float | None = None,
+    replicates: Labels | None = None,
+) -> Quantity:
+    """Summarise draws, leaving NaN out.
+
+    Parameters
+    ----------
+    draws : (...) array
+    probability
+        Of the equal-tailed interval, in (0, 1).
+    effective_draws
+        How many independent draws they are worth for a tail. Default: all of them.
+    replicates : (n,) array
+        Label of the independent replicate of each draw, in the order of ``draws.ravel()``: the Monte-Carlo error then
+        comes from the spread between replicates, and `effective_draws` is not used.
+
+    Raises
+    ------
+    ValueError
+        When no draw is finite.
+    """
+    flat = draws.ravel()
+    finite = np.isfinite(flat)
+    values = flat[finite]
+    if not values.size:
+        raise ValueError("no finite draws")
+    tail = (1.0 - probability) / 2.0
+    ordered = np.sort(values)
+    low, median, high = quantiles_of(ordered, np.array([tail, 0.5, 1.0 - tail]))
+    if replicates is None:
+        step = float(np.sqrt(tail * (1.0 - tail) / max(effective_draws or values.size, 1.0)))
+    else:
+        step = _tail_error(values, replicates[finite], (low, high))
+    # an end's standard error is half the way between order statistics a standard error below and above (Maritz-Jarrett
+    # in spirit)
+    about = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
+    ends = quantiles_of(ordered, about)
+    return Quantity(
+        median=float(median),
+        mean=float(values.mean()),
+        sd=float(values.std()),
+        low=float(low),
+        high=float(high),
+        probability=probability,
+        mc_error=float(max(ends[1] - ends[0], ends[3] - ends[2]) / 2.0),
+    )
+
+
+def _tail_error(values: FloatArray, replicates: Labels, ends: tuple[float, float]) -> float:
+    """Standard error of the probability beyond an interval's end, from the replicates; one value for both ends.
+
+    Notes
+    -----
+    Of a ratio of sums over replicates (Cochran 1977, Sampling Techniques, ch. 6). Taking both ends together doubles the
+    few degrees of freedom. It is no less than what one draw moves.
+    """
+    count, n = np.bincount(replicates), len(values)
+    r = int(np.count_nonzero(count))
+    if r < 2:
+        return 0.5
+    squares = []
+    for beyond in (values < ends[0], values > ends[1]):
+        inside = np.bincount(replicates, weights=beyond)
+        squares.append(float(np.sum((inside - count * inside.sum() / n) ** 2)) * r / (r - 1))
+    return max(float(np.sqrt(np.mean(squares))), 1.0) / n
+
+
+def quantiles_of(ordered: FloatArray, probabilities: FloatArray) -> FloatArray:
+    """Quantiles of sorted values, linear between neighbours: ``np.quantile``, which does not use the fast sort."""
+    return np.interp(probabilities * (len(ordered) - 1), np.arange(len(ordered)), ordered)
+
+
+def weighted_quantiles_of(ordered: FloatArray, weights: FloatArray, probabilities: FloatArray) -> FloatArray:
+    """Weighted quantiles of sorted values, linear between the middles of their steps."""
+    edges = np.cumsum(weights)
+    return np.interp(probabilities, (edges - 0.5 * weights) / edges[-1], ordered)
+
+
+# --- Cache of conditional (linear) solutions by parameter vector, reused when those points become draws.
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+Solution = tuple[FloatArray, ...]
+"""Arrays with a row a parameter vector; see `CollapsedTarget.conditional`."""
+
+
+class Solved:
+    """Cache of solutions by parameter vector.
+
+    Importance sampling evaluates the density at points that its draws are then chosen from. Solving those a second
+    time for the amplitude, level and noise scale of the draws cost as much as the sampling.
+
+    Parameters
+    ----------
+    solve
+        (m, p) parameter vectors to arrays of m rows.
+    """
+
+    def __init__(self, solve: Callable[[FloatArray], Solution]) -> None:
+        self._solve = solve
+        self._theta: list[FloatArray] = []
+        self._solutions: list[Solution] = []
+        self._index: tuple[FloatArray, Solution] | None = None
+
+    def add(self, theta: FloatArray, solution: Solution) -> None:
+        """Keep the solution at (m, p) parameter vectors."""
+        self._theta.append(theta)
+        self._solutions.append(solution)
+        self._index = None
+
+    def __call__(self, theta: FloatArray) -> Solution:
+        """Solutions at (m, p) parameter vectors: cached where all are known, else computed."""
+        if not self._theta:
+            return self._solve(theta)
+        points, kept = self._sorted()
+        row = np.minimum(np.searchsorted(points[:, 0], theta[:, 0]), len(points) - 1)
+        if not np.array_equal(points[row], theta):
+            return self._solve(theta)
+        return tuple(one[row] for one in kept)
+
+    def _sorted(self) -> tuple[FloatArray, Solution]:
+        """All points in order of their first coordinate, which random points never share, and their solutions."""
+        if self._index is None:
+            theta = np.concatenate(self._theta)
+            order = np.argsort(theta[:, 0], kind="stable")
+            together = (np.concatenate(parts) for parts in zip(*self._solutions, strict=True))
+            self._index = theta[order], tuple(one[order] for one in together)
+        return self._index
+
+
+def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Distinct rows in order, and the index of each row among them: ``np.unique``, quicker for random points.
+
+    No two of those agree in their first coordinate; where some do, rows are compared as a whole.
+    """
+    _, first, back = np.unique(rows[:, 0], return_index=True, return_inverse=True)
+    if np.array_equal(rows[first[back]], rows):
+        return rows[first], back
+    distinct, back = np.unique(rows, axis=0, return_inverse=True)
+    return distinct, back.reshape(-1)

@@ -1,4 +1,4 @@
-"""Importance sampling by randomised quasi-Monte Carlo about the mode, doubled until interval ends are accurate."""
+"""Importance sampling from adapted Student-t proposals, with Pareto-smoothed weights."""
 
 from __future__ import annotations
 
@@ -6,14 +6,286 @@ import numpy as np
 
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.adaptation import fitted_gaussians
-from tactile_bayes.inference.draws import REPLICATES, ParameterDraws
-from tactile_bayes.inference.laplace import LogDensity
-from tactile_bayes.inference.pareto import TRUSTED_SHAPE, smooth_weights
-from tactile_bayes.inference.proposal import Gaussians, Proposal
-from tactile_bayes.inference.sobol import BITS, shifted_sobol
-from tactile_bayes.inference.summary import weighted_quantiles_of
+from tactile_bayes.inference.draws import REPLICATES, ParameterDraws, weighted_quantiles_of
+from tactile_bayes.inference.modes import LogDensity
+from tactile_bayes.inference.points import BITS, normal_quantile, shifted_sobol
 from tactile_bayes.records import dataclass
+
+# --- Pareto-smoothed importance sampling (PSIS): smoothed weights, and the shape that shows if they can be trusted.
+
+TRUSTED_SHAPE = 0.7
+"""Above this shape of the weights' tail, their mean converges too slowly to be of use (Vehtari et al. 2024)."""
+
+
+def smooth_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
+    """Smooth weights (PSIS): replace the upper tail by quantiles of a fitted Pareto tail, and normalise.
+
+    Parameters
+    ----------
+    log_weights : (n,) array
+        Unnormalised; -inf for draws without density.
+
+    Returns
+    -------
+    weights : (n,) array
+        Non-negative, sum 1.
+    shape
+        The tail's shape k; NaN when the tail is too short to fit, -inf when all its weights are equal.
+
+    References
+    ----------
+    Vehtari, Simpson, Gelman, Yao & Gabry (2024), Journal of Machine Learning Research 25(72).
+    """
+    n = len(log_weights)
+    weights = np.exp(log_weights - log_weights.max())
+    tail = int(min(0.2 * n, 3.0 * np.sqrt(n)))
+    if tail < 5 or not np.isfinite(log_weights.max()):
+        return weights / weights.sum(), float("nan")
+    order = np.argsort(weights, kind="stable")
+    top = order[-tail:]
+    cut = weights[order[-tail - 1]]
+    excess = weights[top] - cut
+    if not excess[-1] > 1e-12:
+        return weights / weights.sum(), float("-inf")
+    shape, scale = fit_generalised_pareto(excess)
+    if np.isfinite(shape):
+        probability = (np.arange(tail) + 0.5) / tail
+        weights[top] = np.minimum(cut + _pareto_quantile(probability, shape, scale), 1.0)
+    return weights / weights.sum(), shape
+
+
+def fit_generalised_pareto(excess: FloatArray) -> tuple[float, float]:
+    """Fit shape and scale of a generalised Pareto distribution to ascending positive excesses.
+
+    Notes
+    -----
+    The posterior mean under a weak prior of Zhang & Stephens (2009), Technometrics 51:316, with the shape drawn towards
+    0.5 by the weight of ten observations as in Vehtari et al. (2024), appendix C.
+    """
+    n = len(excess)
+    positive = np.maximum(excess, 1e-300)
+    grid = 30 + int(np.sqrt(n))
+    quarter = positive[max(int(n / 4 + 0.5) - 1, 0)]
+    index = np.arange(1, grid + 1)
+    theta = 1.0 / positive[-1] + (1.0 - np.sqrt(grid / (index - 0.5))) / (3.0 * quarter)
+    shapes = np.mean(np.log1p(-theta[:, None] * positive), axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        profile = n * (np.log(-theta / shapes) - shapes - 1.0)
+    profile = np.where(np.isfinite(profile), profile, -np.inf)
+    if not np.isfinite(profile.max()):
+        return float("nan"), float("nan")
+    weight = np.exp(profile - profile.max())
+    best = float(weight @ theta / weight.sum())
+    shape = float(np.mean(np.log1p(-best * positive)))
+    scale = -shape / best
+    return (n * shape + 10 * 0.5) / (n + 10), scale
+
+
+def _pareto_quantile(probability: FloatArray, shape: float, scale: float) -> FloatArray:
+    if abs(shape) < 1e-10:
+        return np.asarray(-scale * np.log1p(-probability))
+    return np.asarray(scale * np.expm1(-shape * np.log1p(-probability)) / shape)
+
+
+# --- The density that importance sampling draws from: one Gaussian or a mixture of several, their tails bent outwards.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaussians:
+    """A mixture of Gaussians.
+
+    Parameters
+    ----------
+    weight : (h,) array
+        Sum 1.
+    mean, covariance : (h, p), (h, p, p) arrays
+    """
+
+    weight: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def one(cls, mean: FloatArray, covariance: FloatArray) -> Gaussians:
+        """A single Gaussian."""
+        return cls(np.ones(1), mean[None], covariance[None])
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """(m,) log density at (m, p) points, normalised."""
+        parts = []
+        for weight, mean, covariance in zip(self.weight, self.mean, self.covariance, strict=True):
+            z = np.linalg.solve(np.linalg.cholesky(covariance), (theta - mean).T)
+            volume = float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+            parts.append(np.log(weight) - 0.5 * np.sum(z**2, axis=0) - 0.5 * volume)
+        return np.asarray(np.logaddexp.reduce(parts, axis=0))
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """(p,) mean and (p, p) covariance of the whole."""
+        mean = self.weight @ self.mean
+        off = self.mean - mean
+        return mean, np.asarray(
+            np.einsum("h,hpq->pq", self.weight, self.covariance) + (self.weight[:, None] * off).T @ off
+        )
+
+    def given(self, last: FloatArray) -> Gaussians:
+        """The mixture of the first parameters, the last ones known: (j,) values."""
+        k = self.mean.shape[1] - len(last)
+        across = np.linalg.solve(self.covariance[:, k:, k:], self.covariance[:, k:, :k])
+        mean = self.mean[:, :k] + np.einsum("hj,hjk->hk", last - self.mean[:, k:], across)
+        covariance = self.covariance[:, :k, :k] - self.covariance[:, :k, k:] @ across
+        at_last = [
+            Gaussians.one(mean[k:], covariance[k:, k:]).log_density(last[None])[0]
+            for mean, covariance in zip(self.mean, self.covariance, strict=True)
+        ]
+        log_weight = np.log(self.weight) + at_last
+        return Gaussians(np.exp(log_weight - np.logaddexp.reduce(log_weight)), mean, covariance)
+
+    def widest(self, covariance: FloatArray) -> float:
+        """Largest variance of any of them in any direction, over that of `covariance` in the same direction."""
+        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+        return float(np.linalg.eigvalsh(whiten @ self.covariance @ whiten.T).max())
+
+
+class Proposal:
+    """Bent Gaussians: normal coordinates z become sinh(b z) / b, normal in the middle and log-normal outside.
+
+    Parameters
+    ----------
+    gaussians
+        What is bent.
+    stretch
+        The bend b.
+    """
+
+    def __init__(self, gaussians: Gaussians, stretch: float) -> None:
+        self._gaussians, self._stretch = gaussians, stretch
+        self._roots = np.linalg.cholesky(gaussians.covariance)
+        self._log_det = np.log(np.diagonal(self._roots, axis1=1, axis2=2)).sum(axis=1)
+
+    @property
+    def dimension(self) -> int:
+        """Uniform coordinates that a point takes: one for each parameter, and the last one to choose a Gaussian."""
+        return int(self._gaussians.mean.shape[1]) + (len(self._gaussians) > 1)
+
+    def points(self, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (..., p) and their log densities (...) for (..., dimension) uniform coordinates."""
+        mean, b = self._gaussians.mean, self._stretch
+        p = mean.shape[1]
+        z = normal_quantile(uniform[..., :p])
+        bent = np.sinh(b * z) / b
+        if len(mean) == 1:
+            return mean[0] + bent @ self._roots[0].T, self._log_bent(z) - self._log_det[0]
+        chosen = np.searchsorted(np.cumsum(self._gaussians.weight)[:-1], uniform[..., p])
+        theta = np.empty_like(bent)
+        for h, root in enumerate(self._roots):
+            theta[chosen == h] = mean[h] + bent[chosen == h] @ root.T
+        return theta, self.log_density(theta)
+
+    def log_density(self, theta: FloatArray) -> FloatArray:
+        """(...) log density at (..., p) points."""
+        total = np.full(theta.shape[:-1], -np.inf)
+        for h, root in enumerate(self._roots):
+            bent = (theta - self._gaussians.mean[h]) @ np.linalg.inv(root).T
+            z = np.arcsinh(self._stretch * bent) / self._stretch
+            total = np.logaddexp(total, np.log(self._gaussians.weight[h]) + self._log_bent(z) - self._log_det[h])
+        return total
+
+    def _log_bent(self, z: FloatArray) -> FloatArray:
+        parts = -0.5 * z**2 - np.log(np.cosh(self._stretch * z)) - 0.5 * np.log(2 * np.pi)
+        return np.asarray(parts.sum(axis=-1))
+
+
+# --- A mixture of Gaussians fitted to weighted points: the second round of importance sampling where one was not
+# enough.
+#
+# Incremental mixture importance sampling: a Gaussian goes where the largest weight is, as wide as the points about
+# it, and its points join the others. It finds a second mode, a curved ridge or a skewed flank, where one Gaussian
+# has too little.
+#
+# References
+# ----------
+# Raftery & Bao (2010), Biometrics 66:1162, section 3; Hesterberg (1995), Technometrics 37:185 (defensive mixtures).
+
+ADDED = 256
+"""Points of each Gaussian added, and points that its width is taken from."""
+MOST_ADDED = 32
+ENOUGH = 0.75
+"""Share of effective points at which no more Gaussians are added, if the weights' tail is light as well."""
+LIGHT_TAIL = 0.3
+"""Pareto shape of weights that more points will hardly show to be heavier."""
+LEAST_VARIANCE = 1e-6
+"""Of a Gaussian in any direction, over that of all the points: points may lie in a plane."""
+
+
+def fitted_gaussians(
+    log_density: LogDensity,
+    first: Proposal,
+    theta: FloatArray,
+    log_target: FloatArray,
+    *,
+    rng: np.random.Generator,
+) -> tuple[Gaussians, int]:
+    """Gaussians whose mixture resembles a density, from points of another proposal.
+
+    Parameters
+    ----------
+    log_density
+        Vectorised: (m, p) to (m,).
+    first
+        The proposal that the points come from.
+    theta, log_target : (n, p), (n,) arrays
+        The points, and the log density there.
+
+    Returns
+    -------
+    gaussians
+        The first of them is a defensive one: mean and covariance of all the weighted points.
+    evaluations
+        Densities asked for.
+    """
+    # a point's share: over all the proposals, their number of points times their density there
+    n, log_share = len(theta), first.log_density(theta) + np.log(len(theta))
+    weight, _ = smooth_weights(log_target - log_share)
+    mean = weight @ theta
+    whole = _covariance(theta, weight, mean)
+    found = Gaussians.one(mean, whole)
+    means, covariances = [mean], [whole]
+    for number in range(MOST_ADDED):
+        weight, shape = smooth_weights(log_target - log_share)
+        if 1.0 / np.sum(weight**2) > ENOUGH * len(theta) and shape <= LIGHT_TAIL:
+            break
+        centre = theta[np.argmax(log_target - log_share)]
+        added = Gaussians.one(centre, _covariance_about(theta, weight, centre, whole))
+        points = centre + rng.standard_normal((ADDED, len(centre))) @ np.linalg.cholesky(added.covariance[0]).T
+        log_share = np.logaddexp(log_share, np.log(ADDED) + added.log_density(theta))
+        means.append(centre)
+        covariances.append(added.covariance[0])
+        earlier = Gaussians(np.full(number + 1, 1.0 / (number + 1)), np.array(means[1:]), np.array(covariances[1:]))
+        there = np.log(ADDED * (number + 1)) + earlier.log_density(points)
+        log_share = np.concatenate([log_share, np.logaddexp(np.log(n) + first.log_density(points), there)])
+        theta, log_target = np.concatenate([theta, points]), np.concatenate([log_target, log_density(points)])
+        size = np.array([n, *[ADDED] * (number + 1)], dtype=np.float64)
+        found = Gaussians(size / size.sum(), np.array(means), np.array(covariances))
+    return found, ADDED * (len(found) - 1)
+
+
+def _covariance(theta: FloatArray, weight: FloatArray, centre: FloatArray) -> FloatArray:
+    off = theta - centre
+    return np.asarray((weight[:, None] * off).T @ off)
+
+
+def _covariance_about(theta: FloatArray, weight: FloatArray, centre: FloatArray, whole: FloatArray) -> FloatArray:
+    """Covariance of the nearest points about one, weighted half by their weights and half alike."""
+    z = np.linalg.solve(np.linalg.cholesky(whole), (theta - centre).T)
+    near = np.argsort(np.sum(z**2, axis=0), kind="stable")[:ADDED]
+    mixed = weight[near] + 1.0 / len(theta)
+    return _covariance(theta[near], mixed / mixed.sum(), centre) + LEAST_VARIANCE * whole
+
+
+# --- Importance sampling by randomised quasi-Monte Carlo about the mode, doubled until interval ends are accurate.
 
 STRETCH, WIDE_STRETCH = 0.45, 0.8
 """Bend of the proposal's tails, see `Proposal`. The wide one is for densities with tails like a t: from a few thousand

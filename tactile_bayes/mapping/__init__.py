@@ -6,18 +6,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
     from tactile_bayes.mapping.build import build_map
-    from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+    from tactile_bayes.mapping.growing import Instrument, MapAccumulator, MapGrid
+    from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
 __all__ = ["Instrument", "MapAccumulator", "MapGrid", "MapRecipe", "TactileMap", "build_map"]
 
 _HOME = {
-    "Instrument": "accumulator",
-    "MapAccumulator": "accumulator",
-    "MapGrid": "accumulator",
-    "MapRecipe": "tactile_map",
-    "TactileMap": "tactile_map",
+    "Instrument": "growing",
+    "MapAccumulator": "growing",
+    "MapGrid": "growing",
+    "MapRecipe": "map",
+    "TactileMap": "map",
     "build_map": "build",
 }
 

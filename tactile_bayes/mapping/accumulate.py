@@ -1,15 +1,269 @@
-"""Normalise the frames and average them in cells (paper steps ii and iii)."""
+"""Frames added up in cells: gains, a flat field, the source of frames."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import CellSums
+from tactile_bayes.mapping.cells import CellSums, Projection, Projector, Readout
 from tactile_bayes.mapping.scatter import add_frames, chunk_frames
-from tactile_bayes.mapping.source import Progress, Source, no_progress
+from tactile_bayes.mapping.select import BoolArray, SelectedFrames, chunks
+from tactile_bayes.scan import CountArray, Scan
+
+# --- Used frames of a scan on the map's lattice, which can be read any number of times.
+
+Progress = Callable[[int, int], None]
+
+
+def no_progress(done: int, total: int) -> None:
+    """Report no progress."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """Used frames of one scan, which can be read chunk by chunk any number of times.
+
+    Parameters
+    ----------
+    selection, readout
+        The scan with its used frames, and the taxels that are read.
+    projection
+        Of the used frames only, in their order.
+    """
+
+    selection: SelectedFrames
+    readout: Readout
+    projection: Projection
+
+    @classmethod
+    def of(cls, selection: SelectedFrames, *, plane_from_base: FloatArray, cell_mm: float) -> Source:
+        """Project the used frames of a scan."""
+        good = selection.good_taxels
+        projector = Projector(selection.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
+        projection = projector.at(selection.poses.part(selection.used))
+        return cls(selection, Readout.of(selection.scan.element_calibration, good), projection)
+
+    @property
+    def frames(self) -> NDArray[np.intp]:
+        """Indices of the used frames in the scan."""
+        return np.flatnonzero(self.selection.used)
+
+    def parts(self, size: int) -> Iterator[tuple[slice, CountArray]]:
+        """Iterate over stretches of at most `size` used frames and their (f, k) counts."""
+        frames, counts = self.frames, self.selection.scan.frames.counts
+        for part in chunks(len(frames), size):
+            chosen = frames[part]
+            whole = chosen[-1] - chosen[0] == len(chosen) - 1  # a stretch without gaps need not be copied
+            yield part, self.readout.counts(counts[chosen[0] : chosen[-1] + 1] if whole else counts[chosen])
+
+
+def sources_of(selections: list[SelectedFrames], *, plane_from_base: FloatArray, cell_mm: float) -> list[Source]:
+    """Put the scans on one lattice."""
+    return [Source.of(part, plane_from_base=plane_from_base, cell_mm=cell_mm) for part in selections]
+
+
+# --- Gains per frame, solved jointly with the map: dividing by the mean would lower the lump.
+
+MAX_GAIN_PASSES = 50
+# Cells of this many readings are kept between passes (4 bytes each); beyond, they are found anew in every pass.
+KEPT_READINGS = 2**26
+_CHUNK = 128
+
+# Of pressures (f, k), which are valid, and the frames they are of: what is added up.
+_Weight = Callable[[FloatArray, "NDArray[np.bool_] | None", slice], "NDArray[np.generic]"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedGains:
+    """Gains of the used frames, one array per scan, and the course of the solution."""
+
+    gains: list[FloatArray]
+    passes: int
+    last_change: float
+
+
+def solve_gains(
+    sources: list[Source], levels: list[FloatArray], *, tolerance: float, progress: Progress = no_progress
+) -> SolvedGains:
+    """Alternate between the map, given the gains, and each frame's least-squares gain, given the map.
+
+    The model is pressure = gain of the frame x map at the cell. Only the product is determined: the level is set in
+    the end so that the median of the map's cells is 1, since most cells lie beside the lump.
+
+    Notes
+    -----
+    Frames far apart are tied only through those between them, so plain alternation creeps. Every third step goes
+    further along the direction of the last two (SQUAREM, Varadhan & Roland 2008, Scand. J. Statist. 35, scheme S3),
+    on the logarithms of the gains.
+    """
+    system = _System(sources, progress)
+    ends = np.cumsum([len(level) for level in levels])[:-1]
+    path = [np.log(np.concatenate(levels))]
+    passes, change = 0, np.inf
+    while change > tolerance and passes < MAX_GAIN_PASSES:
+        path.append(np.log(system.improved(np.exp(path[-1]))))
+        change = float(np.abs(path[-1] - path[-2]).max(initial=0.0))
+        passes += 1
+        if len(path) == 3 and change > tolerance:
+            path = [_extrapolated(*path)]
+    return SolvedGains(np.split(np.exp(path[-1]), ends), passes, change)
+
+
+def _extrapolated(start: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Limit of the steps from `start` over `first` to `second`, by extrapolation."""
+    step = first - start
+    bend = second - first - step
+    size = float(np.linalg.norm(bend))
+    if not size > 0:
+        return second
+    length = max(1.0, float(np.linalg.norm(step)) / size)
+    return start + 2 * length * step + length**2 * bend
+
+
+class _System:
+    """All used frames of all scans on one block of cells."""
+
+    def __init__(self, sources: list[Source], progress: Progress) -> None:
+        self._sources, self._progress = sources, progress
+        blocks = [source.projection.block() for source in sources if len(source.projection)]
+        self._first = (min(first[0] for first, _ in blocks), min(first[1] for first, _ in blocks))
+        self._shape = (
+            max(first[0] + shape[0] for first, shape in blocks) - self._first[0],
+            max(first[1] + shape[1] for first, shape in blocks) - self._first[1],
+        )
+        readings = sum(len(source.projection) * len(source.readout.taxels) for source in sources)
+        self._kept: dict[tuple[int, int], NDArray[np.int32]] | None = {} if readings <= KEPT_READINGS else None
+        self._count = self._sum(lambda pressure, valid, _: np.ones_like(pressure) if valid is None else valid)
+
+    def improved(self, gains: FloatArray) -> FloatArray:
+        """Least-squares gain of each frame against the map of all frames with `gains`: sum(p m) / sum(m^2)."""
+        total = self._sum(lambda pressure, _, frames: pressure / gains[frames, None])
+        mean = np.divide(total, self._count, out=np.zeros_like(total), where=self._count > 0)
+        better = np.empty(len(gains))
+        for frames, flat, pressure, valid in self._parts():
+            expected = mean[flat]
+            if valid is not None:
+                expected *= valid
+            products = np.einsum("fk,fk->f", pressure, expected)
+            better[frames] = products / np.einsum("fk,fk->f", expected, expected)
+        return better
+
+    def _sum(self, weight: _Weight) -> FloatArray:
+        """Sum of a weight over all readings of each cell."""
+        cells = self._shape[0] * self._shape[1]
+        total = np.zeros(cells)
+        for frames, flat, pressure, valid in self._parts():
+            total += np.bincount(flat.ravel(), weight(pressure, valid, frames).ravel(), cells)
+        return total
+
+    def _parts(self) -> Iterator[tuple[slice, NDArray[np.integer], FloatArray, NDArray[np.bool_] | None]]:
+        """Chunks: frames' indices, their cells, pressures (0 where not valid) and which are valid."""
+        start, total = 0, sum(len(source.projection) for source in self._sources)
+        for number, source in enumerate(self._sources):
+            for part, counts in source.parts(_CHUNK):
+                pressure, valid = source.readout.pressure_kpa(counts)
+                if valid is not None:
+                    pressure *= valid
+                yield slice(start, start + len(counts)), self._flat(number, part), pressure, valid
+                start += len(counts)
+                self._progress(start, total)
+
+    def _flat(self, number: int, part: slice) -> NDArray[np.integer]:
+        if self._kept is not None and (number, part.start) in self._kept:
+            return self._kept[number, part.start]
+        flat = self._sources[number].projection.part(part).flat(self._first, self._shape)
+        if self._kept is not None:
+            self._kept[number, part.start] = flat.astype(np.int32)
+        return flat
+
+
+# --- Response of each taxel to an even pressure, from frames without a lump.
+
+# Frames that are looked at, spread evenly over the scan.
+MOST_FRAMES = 4096
+# A frame is called lump-free when its departure from the head's usual profile is within this factor of the calmest
+# tenth's, and there must be this many of them.
+CALM_FACTOR = 1.1
+LEAST_FRAMES = 50
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlatField:
+    """Response of each taxel relative to the array's mean.
+
+    Parameters
+    ----------
+    response : (rows, columns) array
+        1 where the taxel reads as much as its frame's mean; 1 for taxels left out.
+    frames
+        Lump-free frames it was taken from.
+    """
+
+    response: FloatArray
+    frames: int
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the response."""
+        return float(self.response.std())
+
+    def applied(self, scan: Scan) -> Scan:
+        """Copy of the scan with its calibration divided by the response."""
+        calibration = scan.element_calibration
+        flat = replace(
+            calibration,
+            gain_kpa_per_count=calibration.gain_kpa_per_count / self.response,
+            offset_kpa=calibration.offset_kpa / self.response,
+        )
+        return replace(scan, element_calibration=flat)
+
+
+def flat_field(selection: SelectedFrames) -> FlatField:
+    """Estimate the taxels' response over the lump-free frames of a scan.
+
+    Raises
+    ------
+    BadDataError
+        When too few frames look alike to be called lump-free.
+
+    Notes
+    -----
+    The usual profile of the head is each taxel's median over frames, which a lump under a minority of them does not
+    move. Frames that depart from it no more than the calmest ones are lump-free; their mean is the response. A lump
+    under most frames would be taken for the head's own profile and be flattened away.
+    """
+    scan, good = selection.scan, selection.good_taxels
+    frames = np.flatnonzero(selection.used)
+    frames = frames[:: max(1, len(frames) // MOST_FRAMES)][:MOST_FRAMES]
+    readout = Readout.of(scan.element_calibration, good)
+    pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[frames]))
+    ratio = pressure / selection.level_kpa[frames, None]
+    calm = _calm(ratio if valid is None else np.where(valid, ratio, 1.0))
+    if valid is not None:
+        calm &= valid.all(axis=1)
+    if np.count_nonzero(calm) < LEAST_FRAMES:
+        raise BadDataError(
+            f"only {np.count_nonzero(calm)} of {len(frames)} frames look free of a lump",
+            way_out=f"scan beside the lump too ({LEAST_FRAMES} frames are needed), or leave out the flat field",
+        )
+    response = np.ones(good.shape)
+    response[good] = np.clip(ratio[calm].mean(axis=0), 0.05, None)
+    return FlatField(response, int(np.count_nonzero(calm)))
+
+
+def _calm(ratio: FloatArray) -> BoolArray:
+    """(f,) True where the departure from the median profile is at most `CALM_FACTOR` times its quantile 0.1."""
+    departure = np.sqrt(np.square(ratio - np.median(ratio, axis=0)).mean(axis=1))
+    calm: BoolArray = departure <= CALM_FACTOR * float(np.quantile(departure, 0.1))
+    return calm
+
+
+# --- Normalise the frames and average them in cells (paper steps ii and iii).
 
 GAIN_TOLERANCE = 1e-4
 
@@ -67,8 +321,6 @@ def accumulate(
         levels = [np.ones(len(level)) for level in levels]
     if normalise != "gain":
         return Accumulated(add_all(sources, levels, cell_mm=cell_mm, progress=progress), levels)
-    from tactile_bayes.mapping.gains import solve_gains
-
     solved = solve_gains(sources, levels, tolerance=GAIN_TOLERANCE, progress=progress)
     sums = add_all(sources, solved.gains, cell_mm=cell_mm, progress=progress)
     return Accumulated(sums, solved.gains, float(np.nanmedian(sums.mean())), solved.passes, solved.last_change)

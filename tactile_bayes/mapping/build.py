@@ -1,4 +1,4 @@
-"""Building of a tactile map from scans."""
+"""From a scan to a map (paper steps i to iii): the passes in order, and the map's quality."""
 
 from __future__ import annotations
 
@@ -9,32 +9,189 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError, UsageError, check_choice, check_number
 from tactile_bayes.findings import Finding, by_weight
-from tactile_bayes.geometry import FloatArray, Plane, apply, patient_from_plane
-from tactile_bayes.head_shape import HeadShape
-from tactile_bayes.mapping.accumulate import Accumulated, accumulate
-from tactile_bayes.mapping.assumptions import broken_assumptions, handling_findings
+from tactile_bayes.geometry import FloatArray, Plane, apply, inverse, patient_from_plane
+from tactile_bayes.mapping.accumulate import Accumulated, Progress, accumulate, add_all, no_progress, sources_of
+from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
+from tactile_bayes.mapping.cells import CellSums, yaw_deg
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
-from tactile_bayes.mapping.evenness import evenness_figures
-from tactile_bayes.mapping.flat_field import flat_field as find_flat_field
-from tactile_bayes.mapping.frames import SelectedFrames, refuse_without_frames, select_frames
-from tactile_bayes.mapping.head_profile import head_profile_figures
+from tactile_bayes.mapping.errors import pose_noise_figures, shared_frame_figures
 from tactile_bayes.mapping.latency import estimate_latency
-from tactile_bayes.mapping.neighbourhood import local_plane
-from tactile_bayes.mapping.overlap import scan_findings
-from tactile_bayes.mapping.plane import HeadMoments, head_moments
-from tactile_bayes.mapping.pose_noise import pose_noise_figures
-from tactile_bayes.mapping.poses import MAX_POSE_GAP_MS
-from tactile_bayes.mapping.quality import cell_figures, frame_figures, plane_figures, stroke_figures
-from tactile_bayes.mapping.shared_frames import shared_frame_figures
-from tactile_bayes.mapping.source import Progress, no_progress, sources_of
-from tactile_bayes.mapping.stroke_lag import stroke_lag_figures
+from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
+from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, HeadMoments, head_moments
+from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures
+from tactile_bayes.mapping.select import (
+    SelectedFrames,
+    every_nth,
+    refuse_without_frames,
+    scan_findings,
+    select_frames,
+    timing_figures,
+)
+from tactile_bayes.mapping.strokes import StrokeShift, mobility, stroke_count, stroke_lag_figures
 from tactile_bayes.mapping.strokes import register_strokes as find_shifts
-from tactile_bayes.mapping.strokes import stroke_count
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-from tactile_bayes.mapping.thinning import every_nth
-from tactile_bayes.mapping.timing import timing_figures
 from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, PRESSURE_WINDOW_KPA
-from tactile_bayes.scan import Scan
+from tactile_bayes.scan import HeadShape, Scan
+
+# --- Frames near the mass, to which the paper fits its plane.
+
+# The mass is looked for in cells of this side: its place matters to a few mm.
+_CELL_MM = 2.0
+_WIDER = 1.5
+
+
+def find_mass(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
+    """(2,) place of the highest point of the smoothed map on `plane`, mm."""
+    sources = sources_of(list(selections), plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
+    levels = [source.selection.level_kpa[source.selection.used] for source in sources]
+    sums = add_all(sources, levels, cell_mm=_CELL_MM).trimmed()
+    count, total = smooth(sums.count), smooth(sums.total)
+    mean = np.divide(total, count, out=np.full_like(total, -np.inf), where=count >= FEW_READINGS)
+    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
+    return np.array([sums.x_mm()[column], sums.y_mm()[row]])
+
+
+def local_plane(
+    selections: Sequence[SelectedFrames], plane: Plane, *, radius_mm: float | None
+) -> tuple[Plane, dict[str, float]]:
+    """Best-fit plane of the frames near the mass.
+
+    Parameters
+    ----------
+    radius_mm
+        Frames whose array is centred within it of the mass are used; None takes half the diagonal of the array, within
+        which an array reaches the mass, and widens it while those frames span no plane.
+
+    Returns
+    -------
+    plane, figures
+        ``plane_radius_mm`` and ``plane_frames``.
+
+    Raises
+    ------
+    BadDataError
+        When no frame lies within a given radius, or they span no plane.
+    """
+    mass = find_mass(selections, plane)
+    radius = radius_mm or max(_half_diagonal(part) for part in selections)
+    while True:
+        try:
+            return _plane_within(selections, plane, mass, radius)
+        except BadDataError:
+            if radius_mm is not None or radius > 500.0:
+                raise
+            radius *= _WIDER
+
+
+def _half_diagonal(part: SelectedFrames) -> float:
+    extent = np.ptp(part.scan.head.surface_mm[..., :2].reshape(-1, 2), axis=0)
+    return float(np.hypot(*extent)) / 2
+
+
+def _plane_within(
+    selections: Sequence[SelectedFrames], plane: Plane, mass: FloatArray, radius: float
+) -> tuple[Plane, dict[str, float]]:
+    moments = HeadMoments.none()
+    for part in selections:
+        lever = inverse(part.scan.head.scanhead_from_tracker)
+        middle = apply(lever, part.scan.head.surface_mm.reshape(-1, 3).mean(axis=0))
+        centre = part.poses.position_mm + (part.poses.rotation * middle).sum(axis=2)
+        distance = np.linalg.norm(apply(plane.plane_from_base, centre)[:, :2] - mass, axis=1)
+        near = FramePoses(part.poses.position_mm, part.poses.rotation, part.used & (distance <= radius))
+        moments = moments + head_moments(part.scan.head, near)
+    if not moments.count:
+        raise BadDataError(f"no frame lies within {radius:g} mm of the mass", way_out="give a larger --plane-radius-mm")
+    return moments.plane(), {"plane_radius_mm": float(radius), "plane_frames": float(moments.count)}
+
+
+# --- Figures of a map's report: frames used and left out, motion of the head, coverage of the cells.
+
+
+def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
+    """Frames used and left out, summed over the scans."""
+    figures = {
+        "scans": len(selections),
+        "frames_total": sum(len(part.used) for part in selections),
+        "frames_used": sum(int(part.used.sum()) for part in selections),
+        "dropped_no_pose": sum(part.dropped_no_pose for part in selections),
+        "dropped_elements": sum(part.dropped_elements for part in selections),
+        "dropped_low": sum(int(part.low.sum()) for part in selections),
+        "dropped_high": sum(int(part.high.sum()) for part in selections),
+        "masked_taxels": sum(len(part.faults) for part in selections),
+        "saturated_readings": sum(_saturated(part) for part in selections),
+    }
+    levels = np.concatenate([part.level_kpa[part.used] for part in selections])
+    felt = np.concatenate([part.level_kpa[part.used | part.low | part.high] for part in selections])
+    low, high = np.quantile(felt, [0.05, 0.95])
+    return {
+        **{name: float(value) for name, value in figures.items()},
+        "mean_pressure_kpa": float(levels.mean()),
+        "level_p05_kpa": float(low),
+        "level_p95_kpa": float(high),
+    }
+
+
+def _saturated(part: SelectedFrames) -> int:
+    """Number of full-scale readings of good taxels in used frames."""
+    good = int(part.good_taxels.sum())
+    return int(np.rint((good - part.valid_share[part.used] * part.good_taxels.size).sum()))
+
+
+def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[str, float]:
+    """Motion of the head on the plane (tilt, yaw, reach of the strokes), and how well the plane is determined.
+
+    ``plane_condition`` is the longest over the second spread of the taxel centres: large for strokes along a line.
+    """
+    transform = plane.plane_from_base
+    normals, yaws, centres = [], [], []
+    for part in selections:
+        rotation, tracker_from_head = part.poses.rotation[part.used], inverse(part.scan.head.scanhead_from_tracker)
+        normals.append((rotation * tracker_from_head[:3, 2]).sum(axis=2).sum(axis=0))
+        yaws.append(yaw_deg(part.scan.head, rotation, plane_from_base=transform))
+        apex = part.poses.position_mm[part.used] + (rotation * tracker_from_head[:3, 3]).sum(axis=2)
+        centres.append(apply(transform, apex))
+    normal = np.sum(normals, axis=0)
+    tilt = np.arctan2(np.linalg.norm(np.cross(transform[2, :3], normal)), transform[2, :3] @ normal)
+    span = np.ptp(np.concatenate(centres), axis=0)
+    return {
+        "plane_rms_mm": plane.rms_mm,
+        "plane_condition": float(plane.spread_mm[0] / plane.spread_mm[1]),
+        "tilt_deg": float(np.degrees(tilt)),
+        "yaw_sd_deg": float(np.concatenate(yaws).std()),
+        "span_x_mm": float(span[0]),
+        "span_y_mm": float(span[1]),
+    }
+
+
+def cell_figures(sums: CellSums) -> dict[str, float]:
+    """Coverage of the cells, and unusual readings in them."""
+    hit = sums.count > 0
+    return {
+        "coverage": float((sums.count >= FEW_READINGS).mean()),
+        "median_count": float(np.median(sums.count[hit])),
+        "few_cells": float(np.count_nonzero(hit & (sums.count < FEW_READINGS))),
+        "clipped_values": float(sums.clipped),
+        "negative_readings": float(sums.negative),
+    }
+
+
+def stroke_figures(strokes: Sequence[StrokeShift]) -> dict[str, float]:
+    """Shift of each stroke, and the mobility that they add up to."""
+    if not strokes:
+        return {}
+    moved, sd = mobility(strokes)
+    figures = {
+        "strokes": float(len(strokes)),
+        "strokes_known": float(sum(one.known for one in strokes)),
+        "mobility_mm": moved,
+        "mobility_sd_mm": sd,
+    }
+    for number, one in enumerate(strokes, start=1):
+        if one.known:
+            figures |= {f"stroke_{number}_shift_x_mm": one.shift_mm, f"stroke_{number}_sd_x_mm": one.sd_mm}
+    return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+# --- Building of a tactile map from scans.
 
 # Landmarks of one examination further apart than this (mm) mean that the patient or the tracker was moved.
 MAX_LANDMARK_SHIFT_MM = 20.0

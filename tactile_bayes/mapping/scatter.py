@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.cells import LIMIT_STEPS, READINGS_PER_CALL, VALUE_STEP, CellSums
-from tactile_bayes.mapping.project import Projection
-from tactile_bayes.mapping.readout import BoolArray, Readout
+from tactile_bayes.mapping.cells import (
+    LIMIT_STEPS,
+    READINGS_PER_CALL,
+    VALUE_STEP,
+    BoolArray,
+    CellSums,
+    Projection,
+    Readout,
+)
 from tactile_bayes.presets import PRESSURE_RANGE_KPA
 
 

@@ -6,22 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tactile_bayes.abstention import Abstention
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import Abstention, UsageError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.orientation import orientation_of
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.lump.cells import covered_share, map_ends, on_map, trusted, window_cells
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.places import orientation_of
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.fit_window import covered_share, map_ends, on_map, trusted, window_cells
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed
 from tactile_bayes.posterior.options import DETECTED
-from tactile_bayes.posterior.white.fit import (
-    AT_RIM,
-    LEAST_COVERED_SHARE,
-    LEAST_WIDTH_IN_CELLS,
-    MOST_AXIS_RATIO,
-    Candidate,
-)
+from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
 
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 FEEL_AGAIN = "if a lump is felt, go over the place again, more slowly or with more lines, and map all scans together"

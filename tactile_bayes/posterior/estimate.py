@@ -6,12 +6,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from tactile_bayes.abstention import NO_LUMP, Abstention
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import BadDataError, NotConvergedError
+from tactile_bayes.errors import NO_LUMP, Abstention, BadDataError, NotConvergedError
 from tactile_bayes.findings import Finding, by_weight
-from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.abstention import (
     FEEL_AGAIN,
     FEEL_AGAIN_ON_PAPER,
@@ -21,18 +19,15 @@ from tactile_bayes.posterior.abstention import (
     searched,
     undetected,
 )
-from tactile_bayes.posterior.assessment import Assessment, MapDraws, bump_of
-from tactile_bayes.posterior.drawn import Drawn, draw_sized
-from tactile_bayes.posterior.lump.diagnostics import Diagnostics, NoiseFigures
-from tactile_bayes.posterior.lump.posterior import MapPosterior
+from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.draws import Diagnostics, MapPosterior, NoiseFigures
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.options import DETECTED, ROTATION_ODDS, EstimateOptions, FitOptions, check_options
-from tactile_bayes.posterior.result import Estimate, ModalBump
-from tactile_bayes.posterior.search import best_chance, search
-from tactile_bayes.posterior.sensitivity import Sensitivity, prior_sensitivity
-from tactile_bayes.posterior.white.detection import Detection
-from tactile_bayes.posterior.white.fit import Candidate, check_background
+from tactile_bayes.posterior.result import Estimate, ModalBump, Sensitivity, prior_sensitivity
+from tactile_bayes.posterior.search import Assessment, Drawn, MapDraws, best_chance, bump_of, draw_sized, search
+from tactile_bayes.posterior.white import Candidate, check_background
 from tactile_bayes.presets import CELL_PER_SIGMA
+from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size.draws import SizePosterior
 from tactile_bayes.size.fat import head_profile
 from tactile_bayes.size.pooling import Calibration

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.inference.draws import INDEPENDENT_DRAWS
-from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.presets import METHODS, Background, Method, Noise, Rotation, SceneAsked
 from tactile_bayes.records import dataclass
 from tactile_bayes.size.pooling import SizePriors
 
 if TYPE_CHECKING:
-    from tactile_bayes.inference.chain_state import ChainStore
+    from tactile_bayes.inference.ensemble import ChainStore
 
 DETECTED = 0.95
 """Evidence for a bump against smooth errors, as a probability at even odds, below which there is no estimate."""

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.records import dataclass
-from tactile_bayes.report.growth import Growth, growth_section
+from tactile_bayes.report.compare import Growth, growth_section
 
 FAILED, UNSIZED, SIZED = "failed", "without a size", "sized"
 _STYLE = """

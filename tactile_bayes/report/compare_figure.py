@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.orientation import PATIENT_WORDS, PLANE_WORDS, Orientation
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.places import PATIENT_WORDS, PLANE_WORDS, Orientation
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare_text import compare_summary
-from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.report.figure_title import named_exam
+from tactile_bayes.report.compare import compare_summary
+from tactile_bayes.report.figure_file import figure_file, named_exam
 from tactile_bayes.report.map_figure import draw_edges
 
 if TYPE_CHECKING:

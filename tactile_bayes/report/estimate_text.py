@@ -1,39 +1,185 @@
-"""An estimate as a short table a clinician can read."""
+"""An estimate in words."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
-from tactile_bayes.findings import finding_lines
-from tactile_bayes.inference.draws import ParameterDraws
-from tactile_bayes.inference.summary import Quantity
-from tactile_bayes.mapping.clock_face import ClockPosition
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.findings import finding_lines, finding_summary
+from tactile_bayes.inference.draws import ParameterDraws, Quantity
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.places import ClockPosition
 from tactile_bayes.posterior.abstention import chance_text
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.lump.diagnostics import Diagnostics
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.draws import Diagnostics
 from tactile_bayes.posterior.lump_probability import SHARE_WITH_LUMP
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.lump_place import place_line
-from tactile_bayes.report.masses_document import MassDocument, mass_lines, masses_document, numbered, others
-from tactile_bayes.report.narrowing import width_lines
-from tactile_bayes.report.quantities import ANOTHER_EXAM, estimate_quantities, leading_size
-from tactile_bayes.report.scene_text import prior_line, scene_lines, sensitivity_line
-from tactile_bayes.report.size_text import (
-    SIZE_DECIMALS,
-    decimals,
-    ends_text,
-    exams_label,
-    shape_text,
-    site_interval_text,
-    table_head,
-    table_row,
-    two_intervals_text,
+from tactile_bayes.report.estimate_document import (
+    MassDocument,
+    mass_lines,
+    masses_document,
+    numbered,
+    others,
+    prior_line,
+    scene_line,
+    scene_lines,
+    sensitivity_line,
+    supposed_document,
+    supposed_line,
+    supposed_lines,
 )
-from tactile_bayes.report.smallest_text import smallest_text
-from tactile_bayes.report.supposed_text import supposed_document, supposed_lines
+from tactile_bayes.report.quantities import (
+    ANOTHER_EXAM,
+    estimate_quantities,
+    from_xiphoid,
+    leading_size,
+    place_line,
+    xiphoid_mm,
+)
 from tactile_bayes.size.draws import EXTREMES, SIZES
+
+# --- The smallest lump that a map without one would have shown, in a sentence.
+
+
+def smallest_text(smallest: Mapping[str, Any]) -> str:
+    """What would have shown, by depth, where the map is best and where it is worst; without a full stop.
+
+    Parameters
+    ----------
+    smallest
+        As `SmallestLumps.as_dict` has it.
+    """
+    ends = zip(smallest["depths_mm"], smallest["best_mm"], smallest["worst_mm"], strict=True)
+    told = [f"{_smallest_range(best, worst)} at a depth of {depth:g} mm" for depth, best, worst in ends]
+    share = f"{100 * smallest['probability']:g} %"
+    return f"A ball would have shown with {share} from a diameter on of {'; '.join(told)} (of its middle), by its place"
+
+
+def _smallest_range(best: float | None, worst: float | None) -> str:
+    """Diameters at the best place and at the worst."""
+    if best is None:
+        return "more than 30 mm"
+    if worst is None:
+        return f"{best:.3g} to more than 30 mm"
+    return f"{best:.3g} mm" if best == worst else f"{best:.3g} to {worst:.3g} mm"
+
+
+# --- Sentences about a size, shared by the reports of one map and of several.
+
+SIZE_DECIMALS = 1
+"""At most, whatever the Monte-Carlo error: sizes are compared with excisions, which are measured in mm."""
+SOURCES = {
+    "map": "the map",
+    "between_maps": "spread between maps of one mass",
+    "calibration": "the calibration's coefficients",
+    "residual": "the scatter about Eq 6",
+    "body": "properties of the body that no map shows",
+    "site": "the correction by the site's phantoms",
+    "shape": "whether the lump is round or oval",
+}
+
+
+def exams_label(spread: float | None) -> str:
+    """What an interval supposes: how far exams of one mass are apart, as a share of its size; None for not at all."""
+    return f"if exams differ by {100 * spread:.0f} %" if spread is not None else "if exams do not differ"
+
+
+def two_intervals_text(this: float | None, another: float) -> str:
+    """What the intervals of a size suppose, the leading one first; `this` is None for no spread between exams."""
+    alike = "no spread" if this is None else f"{100 * this:.0f} %"
+    return (
+        f"The intervals of the sizes suppose that exams of one mass differ by {100 * another:.0f} %, as those of "
+        f"patients did in the paper; the narrower one supposes {alike}, as those of simulated bodies do: what exams "
+        "that repeat so well can buy. `calibrate repeatability` learns a site's own spread; then there is one interval."
+    )
+
+
+def site_interval_text(repeatability: str) -> str:
+    """What the interval of a size supposes where the site's repeatability is known, from `Repeatability.words`."""
+    return f"The interval is for any exam of the mass: {repeatability}."
+
+
+def decimals(mc_error: float, *, most: int = 3) -> int:
+    """Decimal places that the Monte-Carlo error of an interval's end supports."""
+    if not mc_error > 0:
+        return most
+    return min(most, max(0, -math.floor(math.log10(2.0 * mc_error))))
+
+
+def table_head(probability: float) -> str:
+    """The first line of a table of medians and intervals."""
+    return f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"
+
+
+def table_row(label: str, median: float, ends: tuple[float, float], *, unit: str, places: int) -> str:
+    """Row of that table: label, median and interval with a number of decimal places."""
+    interval = f"{ends[0]:.{places}f} to {ends[1]:.{places}f} {unit}".rstrip()
+    return f"{label:28}{median:>9.{places}f}   {interval}"
+
+
+def ends_text(name: str, mc_error: float, sd: float) -> str:
+    """Monte-Carlo error of the ends of intervals, in SDs and mm."""
+    return f"{name} {mc_error / sd:.3f} SD ({mc_error:.2g} mm)" if sd > 0 else f"{name} {mc_error:.2g} mm"
+
+
+def shape_text(figures: Mapping[str, float]) -> str:
+    """Whether the lump is sized as round or oval, and the difference that makes to the largest size."""
+    lead = "Irregular outline. " if figures.get("irregular_outline") else ""
+    probability = figures["oval_probability"]
+    longer = 100 * math.expm1(figures["oval_half_log_ratio"])
+    if probability < 0.005:
+        text = "Sized as round; an oval lump is improbable (below 0.005)."
+    elif probability < 0.5:
+        text = f"Sized as round; an oval lump (probability {probability:.2f}) would be {longer:.0f} % longer."
+    else:
+        text = f"Oval (probability {probability:.2f}): {longer:.0f} % longer than a round lump of the same mean size."
+    return lead + text
+
+
+# --- Sources of a size interval's width, remedies, and the pieces of short reports.
+
+MOST_LINES = 12
+"""Of a short report."""
+MORE = "More (all quantities, places looked at, odds, priors, omissions): estimate -v."
+"""The end of a short report's last line but one."""
+NARROWED_BY = {
+    "map": "a slower scan with more strokes over the lump",
+    "between_maps": "more exams of this mass, pooled (estimate --pool); the site's spread (calibrate repeatability)",
+    "calibration": "a size calibration learned from more lumps",
+    "residual": "a size calibration learned with this head and bodies like this one",
+    "site": "more phantoms of known size, depth, seat and stiffness (calibrate size --correct)",
+    "body": "knowing the lump's depth, seat or stiffness (estimate --known)",
+}
+WORTH_NARROWING = 10.0
+"""Percent of the variance from which a source is worth a way to narrow it."""
+
+
+def width_lines(variance_share: Mapping[str, float]) -> list[str]:
+    """Sources of a size's variance, largest first, and ways to narrow the interval.
+
+    Parameters
+    ----------
+    variance_share
+        Percent of the variance of the largest size, by source.
+    """
+    ranked = sorted(variance_share.items(), key=lambda pair: -pair[1])
+    parts = [f"{share:.0f} % {SOURCES.get(name, name)}" for name, share in ranked if share >= 0.5]
+    ways = [NARROWED_BY[name] for name, share in ranked if share >= WORTH_NARROWING and name in NARROWED_BY]
+    lines = [f"What makes the interval wide: {', '.join(parts)}."] if parts else []
+    return [*lines, f"What would narrow it: {'; '.join(ways)}."] if ways else lines
+
+
+def joined(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
+    """Join the first texts in one line after `lead`, and count the others; empty for no text."""
+    if not texts:
+        return []
+    more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
+    return [f"{lead}{'; '.join(texts[:most])}{more}."]
+
+
+# --- An estimate as a short table a clinician can read.
 
 ANOTHER_LARGEST = f"{ANOTHER_EXAM}.max_size_mm"
 ANOTHER_SMALLEST = f"{ANOTHER_EXAM}.min_size_mm"
@@ -241,3 +387,127 @@ def passed_over(estimate: Estimate) -> list[str]:
 
 def _left_out(estimate: Estimate) -> list[str]:
     return [f"Left out: {'; '.join(estimate.left_out)}."] if estimate.left_out else []
+
+
+# --- An estimate in at most 12 lines: the size, what makes its interval wide, what would narrow it, its quality.
+
+WIDTHS = ("sigma_x_mm", "sigma_y_mm")
+MOST_CAUTIONS = 3
+MOST_CHECKS = 2
+MOST_MASSES = 3
+"""Masses besides the reported one that have a line."""
+
+
+def estimate_summary(
+    estimate: Estimate,
+    quantities: Mapping[str, Quantity],
+    *,
+    probability: float,
+    masses: Sequence[MassDocument] = (),
+    place: ClockPosition | None = None,
+) -> str:
+    """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest.
+
+    Parameters
+    ----------
+    quantities
+        As `estimate_quantities` gives them; empty without an estimate.
+    probability
+        Of the intervals.
+    masses
+        As `masses_document` gives them.
+    place
+        Of the lump about the nipple, where it is known.
+    """
+    if estimate.status == "no_estimate":
+        body = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
+        body += [no_estimate_line(estimate.reason), *smallest_lines(estimate), *advice_lines(estimate)]
+        body += [*_masses(masses, room=MOST_MASSES), *finding_summary(estimate.findings, "check", most=MOST_CHECKS)]
+    else:
+        body = _something(estimate, quantities, probability, masses, place)
+    return "\n".join([*body, f"{_model(estimate)}{MORE}", RESEARCH_USE]) + "\n"
+
+
+def _something(
+    estimate: Estimate,
+    quantities: Mapping[str, Quantity],
+    probability: float,
+    masses: Sequence[MassDocument],
+    place: ClockPosition | None,
+) -> list[str]:
+    """The body of a report with an estimate; what makes the interval wide gives way to masses."""
+    lines = finding_summary(estimate.findings, "caution", most=MOST_CAUTIONS)
+    shown = [name for name in EXTREMES if name in quantities] or [name for name in WIDTHS if name in quantities]
+    table = shown if ANOTHER_LARGEST not in quantities else [*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST]
+    lines += size_table({name: quantities[name] for name in table}, probability, alike=alike_spread(estimate))
+    lines += _lump(estimate, quantities, numbered(masses), place)
+    after = [f"No size: {estimate.reason}.", *advice_lines(estimate)] if estimate.reason else []
+    last = [*_quality(estimate, {name: quantities[name] for name in shown})]
+    last += finding_summary(estimate.findings, "check", most=MOST_CHECKS)
+    room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
+    beside = _masses(masses, room=min(MOST_MASSES, room))
+    widths = [] if estimate.size is None else width_lines(leading_size(estimate.size).variance_share)
+    lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
+    return [*lines, *_supposed(estimate, quantities)] if len(lines) < MOST_LINES - 2 else lines
+
+
+def _supposed(estimate: Estimate, quantities: Mapping[str, Quantity]) -> list[str]:
+    """How large a soft lump and a hard one would be, where that matters."""
+    largest = quantities.get("max_size_mm")
+    if largest is None:
+        return []
+    supposed = supposed_document(estimate.size, largest)
+    return supposed_line(supposed, largest.median, places=size_decimals([largest]))
+
+
+def _lump(
+    estimate: Estimate, quantities: Mapping[str, Quantity], number: str, place: ClockPosition | None
+) -> list[str]:
+    """Probability of a lump, and its place; `number` says which of several masses it is."""
+    parts = [] if estimate.probability is None else [f"Probability of a lump {chance_text(estimate.probability)}"]
+    if "amplitude" in quantities:
+        parts.append(f"amplitude {quantities['amplitude'].median:.2g}")
+    if place is not None:
+        parts.append(place.text())
+    elif (centre := xiphoid_mm(quantities)) is not None:
+        parts.append(from_xiphoid(*centre))
+    if "centre_mm.x" in quantities:
+        parts.append("at ({:.1f}, {:.1f}) mm on the map".format(*(quantities[f"centre_mm.{a}"].median for a in "xy")))
+    text = ", ".join(parts)
+    return [f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."] if parts else []
+
+
+def _masses(masses: Sequence[MassDocument], *, room: int) -> list[str]:
+    """At most `room` lines on the masses besides the reported one, at least one; the last counts those left out."""
+    lines = mass_lines(masses)
+    shown = lines[: max(room, 1)]
+    if left := len(lines) - len(shown):
+        shown[-1] = f"{shown[-1].rstrip('.')}; and {left} more {'mass' if left == 1 else 'masses'}."
+    return shown
+
+
+def _model(estimate: Estimate) -> str:
+    """Model and omissions, as the beginning of a line."""
+    if estimate.scene is not None:
+        return f"{scene_line(estimate.scene)} "
+    return "".join(f"{line} " for line in joined(estimate.left_out, most=2, lead="Left out: "))
+
+
+def _quality(estimate: Estimate, shown: Mapping[str, Quantity]) -> list[str]:
+    """Monte-Carlo error of the interval ends, convergence measure, tracker's share, draws without a size."""
+    if estimate.draws is None or not shown:
+        return []
+    worst = max(shown.values(), key=lambda one: one.mc_error / one.sd if one.sd > 0 else 0.0)
+    ends = f"interval ends to {worst.mc_error / worst.sd:.3f} SD" if worst.sd > 0 else "interval ends exact"
+    parts = [f"method {estimate.draws.method}, {ends}"]
+    if estimate.diagnostics is not None and estimate.diagnostics.calibration:
+        parts.insert(0, f"sizes by the {estimate.diagnostics.calibration}")
+    if estimate.diagnostics is not None and estimate.diagnostics.repeatability:
+        parts.append(estimate.diagnostics.repeatability)
+    if measure := convergence_text(estimate.draws):
+        parts.append(measure)
+    if share := tracker_share(estimate):
+        parts.append(share)
+    if estimate.size is not None and estimate.size.invalid:
+        parts.append(f"{estimate.size.invalid} draws gave no size and were left out")
+    return [f"Quality: {'; '.join(parts)}."]

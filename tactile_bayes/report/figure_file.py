@@ -1,9 +1,10 @@
-"""Figure files: PNG, PDF or SVG by suffix; with the same libraries, equal input gives equal bytes."""
+"""Figures as files, with a title and a date that do not vary."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import wrap
@@ -15,6 +16,37 @@ from tactile_bayes.findings import Finding, finding_lines
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+# --- Names for the titles of figures: a map's, with the subject's code and the scan's digest.
+
+_CODE: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
+_DIGEST_LETTERS: Final = 8
+_MOST: Final = 3
+
+
+def named_exam(name: str, scans: Sequence[Mapping[str, str]]) -> str:
+    """Such as ``"exam (P07, scan 3dbf3ce1)"``; what is no code is left out, and `$` starts no formula.
+
+    Parameters
+    ----------
+    name
+        Of the map; may be empty.
+    scans
+        As `Provenance.scans` has them.
+    """
+    subjects = dict.fromkeys(scan.get("subject", "") for scan in scans)
+    codes = [code for code in subjects if _CODE.fullmatch(code)]
+    digests = [one for one in (scan.get("sha256", "")[:_DIGEST_LETTERS] for scan in scans) if _CODE.fullmatch(one)]
+    more = f" and {len(digests) - _MOST} more" if len(digests) > _MOST else ""
+    codes += [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests[:_MOST])}{more}"] if digests else []
+    plain = name.replace("$", r"\$")
+    if not codes:
+        return plain
+    return f"{plain} ({', '.join(codes)})" if plain else ", ".join(codes)
+
+
+# --- Figure files: PNG, PDF or SVG by suffix; with the same libraries, equal input gives equal bytes.
 
 DPI: Final = 150
 # Suffix -> what would be written about the program and the time, each None: left out.

@@ -12,8 +12,8 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
-from tactile_bayes.mapping.orientation import Orientation, orientation_of
-from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
+from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
+from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file
 

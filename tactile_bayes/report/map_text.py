@@ -7,11 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from tactile_bayes.findings import finding_lines
-from tactile_bayes.mapping.advice import advise_cell
-from tactile_bayes.mapping.assumptions import skewed
-from tactile_bayes.mapping.evenness import SPAN_MM
-from tactile_bayes.mapping.shared_frames import LEAST_SHARE
-from tactile_bayes.mapping.tactile_map import FEW_READINGS, TactileMap
+from tactile_bayes.mapping.errors import LEAST_SHARE
+from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, advise_cell, skewed
+from tactile_bayes.mapping.profile import SPAN_MM
 from tactile_bayes.presets import CELL_PER_SIGMA, POSE_NOISE, RESEARCH_USE
 
 _LISTED_TAXELS = 8

@@ -6,21 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
-from tactile_bayes.findings import (
-    Finding,
-    by_weight,
-    finding_lines,
-    finding_summary,
-    findings_in,
-    verdict,
-)
-from tactile_bayes.inference.summary import nine_digits
+from tactile_bayes.findings import Finding, by_weight, finding_lines, finding_summary, findings_in, verdict
+from tactile_bayes.inference.draws import nine_digits
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.narrowing import MORE, MOST_LINES, width_lines
-from tactile_bayes.report.population_text import fat_text, unknowns_text
-from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, leading
-from tactile_bayes.report.site_text import site_words
-from tactile_bayes.report.size_text import (
+from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
+from tactile_bayes.report.estimate_document import supposed_document, supposed_line, supposed_lines
+from tactile_bayes.report.estimate_text import (
+    MORE,
+    MOST_LINES,
     SIZE_DECIMALS,
     decimals,
     ends_text,
@@ -29,8 +22,9 @@ from tactile_bayes.report.size_text import (
     site_interval_text,
     table_head,
     table_row,
+    width_lines,
 )
-from tactile_bayes.report.supposed_text import supposed_document, supposed_line, supposed_lines
+from tactile_bayes.report.quantities import ANOTHER_EXAM, another_exam, leading
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import EXTREMES, SizePosterior
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate

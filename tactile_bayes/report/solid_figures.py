@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_bayes.forward.body import THICKNESS_MM, Layers
-from tactile_bayes.forward.plane.study import (
+from tactile_bayes.forward.layers import LayeredBody
+from tactile_bayes.forward.solid import solid_head
+from tactile_bayes.forward.solid_scan import face_of
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.report.study import COLOURS, FAT_MM, MARKS, PHANTOM, RATIOS, SIZE_IN, finish
+from tactile_bayes.studies.paper import (
     DETECTABLE,
     HARD_RATIO,
     StudyRow,
@@ -23,16 +31,8 @@ from tactile_bayes.forward.plane.study import (
     width_changes,
     widths,
 )
-from tactile_bayes.forward.plane.tables import PHANTOMS
-from tactile_bayes.forward.solid.frames import solid_head
-from tactile_bayes.forward.solid.layers import LayeredBody
-from tactile_bayes.forward.solid.scan import face_of
-from tactile_bayes.forward.solid.study import RasterFitter, RasterFrames, SolidSettings, raster_frames
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.report.study_figures import COLOURS, FAT_MM, MARKS, PHANTOM, RATIOS, SIZE_IN, finish
+from tactile_bayes.studies.paper_solid import RasterFitter, RasterFrames, SolidSettings, raster_frames
+from tactile_bayes.studies.paper_tables import PHANTOMS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

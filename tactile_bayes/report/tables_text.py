@@ -7,8 +7,9 @@ from dataclasses import asdict
 from textwrap import wrap
 
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.plane.empirical import RANGE, outside_range
-from tactile_bayes.forward.plane.tables import (
+from tactile_bayes.forward.line import RANGE, outside_range
+from tactile_bayes.report.paper_head import named
+from tactile_bayes.studies.paper_tables import (
     DEFINITION,
     OTHER_DEFINITIONS,
     PRINTED_FRAMES,
@@ -17,7 +18,6 @@ from tactile_bayes.forward.plane.tables import (
     Agreement,
     table_distance,
 )
-from tactile_bayes.report.head_text import named
 
 ByHead = Mapping[Head, Sequence[Agreement]]
 

@@ -9,10 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.growth import Growth, growth_section
+from tactile_bayes.report.compare import Growth, growth_section
+from tactile_bayes.report.trial import growing_line, limit_rows, ratio_line, shown
 from tactile_bayes.report.trial_figures import calibration_figure, differences_figure, sizes_figure
-from tactile_bayes.report.trial_methods_text import growing_line, limit_rows, shown
-from tactile_bayes.report.trial_text import ratio_line
 from tactile_bayes.trial.figures import Figure
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 

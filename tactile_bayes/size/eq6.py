@@ -25,8 +25,7 @@ from tactile_bayes.declarations import Meta, Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray, Matrix, Vector
 from tactile_bayes.inference.draws import Labels, even_replicates
-from tactile_bayes.inference.normal import normal_quantile
-from tactile_bayes.inference.paired import paired_points
+from tactile_bayes.inference.points import normal_quantile, paired_points
 from tactile_bayes.size.draws import SizePosterior, shares
 from tactile_bayes.size.spread import BetweenMaps
 from tactile_bayes.size.terms import (

@@ -17,8 +17,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels
-from tactile_bayes.inference.normal import normal_quantile
-from tactile_bayes.inference.paired import evened, paired_points
+from tactile_bayes.inference.points import evened, normal_quantile, paired_points
 from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
 from tactile_bayes.size.draws import (
     OVAL_SD,

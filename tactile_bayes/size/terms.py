@@ -11,13 +11,12 @@ from typing import Annotated, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.abstention import Abstention
 from tactile_bayes.declarations import Meta, Record, field
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import Abstention, BadDataError
 from tactile_bayes.geometry import FloatArray, Matrix, Vector
-from tactile_bayes.head_shape import HeadShape
-from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import INTERVAL, Background, Noise
+from tactile_bayes.scan import HeadShape
 
 LEARN_ANEW: Final = "learn the calibration anew"
 _NEEDED: Final = {"required": ["amplitude", "sigma_mm", "d_mm"]}

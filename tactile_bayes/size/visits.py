@@ -26,10 +26,8 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels
-from tactile_bayes.inference.normal import normal_cdf, normal_quantile
-from tactile_bayes.inference.paired import evened, paired_points
-from tactile_bayes.inference.summary import Quantity, summarise
+from tactile_bayes.inference.draws import Labels, Quantity, summarise
+from tactile_bayes.inference.points import evened, normal_cdf, normal_quantile, paired_points
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, matched_draws

@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.plane.empirical import fit_shape, lump_pressure
-from tactile_bayes.forward.plane.tables import mean_squared_difference
+from tactile_bayes.forward.line import fit_shape, lump_pressure
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import felt_at_poses
 from tactile_bayes.geometry import FloatArray, inverse
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.frames import SelectedFrames, select_frames
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.posterior.options import FitOptions
-from tactile_bayes.posterior.white.fit import BumpFit, fit_bump, fitted_candidates
+from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.presets import CELL_MM, FIT_RADIUS_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.records import dataclass
 from tactile_bayes.scan import CountArray, ElementCalibration, PressureFrames, Scan
+from tactile_bayes.studies.paper_tables import mean_squared_difference
 
 Progress = Callable[[int, int], None]
 NEAR_MM = 40.0

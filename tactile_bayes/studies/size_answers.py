@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tactile_bayes.inference.summary import Quantity, summarise
+from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.posterior.result import Estimate
 
 SIZE = "max_size_mm"

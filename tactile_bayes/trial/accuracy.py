@@ -1,19 +1,134 @@
-"""Accuracy against excision: percent and mm errors, and bias."""
+"""Accuracy of a modality against excision, and two modalities against each other."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 
 import numpy as np
+import numpy.typing as npt
 
-from tactile_bayes.trial.figures import Figure, figure
-from tactile_bayes.trial.jackknife import UndefinedError
-from tactile_bayes.trial.misses import alike, by_size, figure_with_misses
+from tactile_bayes.trial.figures import (
+    Figure,
+    Sample,
+    Scale,
+    SumStatistic,
+    UndefinedError,
+    columns,
+    effective_number,
+    figure,
+    method_of,
+    ratio,
+    resampled,
+)
+from tactile_bayes.trial.lines import all_equal
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
-from tactile_bayes.trial.sums import SumStatistic, columns, ratio
+
+# --- Cautions about a modality's intervals, where the data meet a caution's condition.
+
+# Up to so many misses, each moves the mean error by more than an uncorrected interval allows for.
+FEW_MISSES = 3
 
 
-def figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+def cautions(sizes: ModalitySizes, *, confidence: float) -> tuple[str, ...]:
+    """Cautions about this modality's intervals; docs/coverage.md has the measured shares."""
+    missed = len(sizes.size_mm) - int(sizes.detected.sum())
+    if not 0 < missed <= FEW_MISSES or method_of(confidence) == "corrected":
+        return ()
+    return (
+        f"only {missed} of {len(sizes.size_mm)} masses missed: intervals of MAPE hold less often than they say; "
+        "--intervals corrected allows for it",
+    )
+
+
+# --- Figures that count a missed mass as size 0, with intervals that allow for misses not yet observed.
+#
+# Where one mass in 25 is missed, a trial of 25 has none, one or two misses, and each moves the mean error by some 3
+# points. Leaving out or redrawing patients sees only the misses that occurred: without any, the interval allows for
+# none.
+
+Ends = tuple[float, float]
+
+
+def figure_with_misses(
+    statistic: SumStatistic,
+    sizes: ModalitySizes,
+    *,
+    scale: Scale,
+    confidence: float,
+    weight: Callable[[ModalitySizes], FloatArray],
+    missed: Callable[[ModalitySizes], float],
+) -> Figure:
+    r"""Weighted mean over masses, found and missed, with an interval over patients.
+
+    Parameters
+    ----------
+    statistic
+        The mean.
+    weight
+        (n,) weights of the mean.
+    missed
+        What the mean would be if every mass were missed.
+
+    Notes
+    -----
+    The mean is :math:`(1 - p) a + p b` with the missed share p of the weights, a over masses found and b if all were
+    missed. The corrected interval recovers the variances of a and p from their own intervals (Zou & Donner 2008, Stat.
+    Med. 27, 1693): a's is the jackknife's, p's that of Jeffreys' prior for the effective number of patients. Other
+    methods treat a miss as one more size.
+    """
+    plain = figure(statistic, sizes, scale=scale, confidence=confidence, leverage=weight)
+    if method_of(confidence) != "corrected" or plain.value is None:
+        return plain
+    found = figure(statistic, sizes.only_detected(), scale=scale, confidence=confidence, leverage=weight)
+    if found.value is None or found.interval is None:
+        return plain
+    weights = weight(sizes)
+    share = float(weights[~sizes.detected].sum() / weights.sum())
+    low, high = share_interval(share, effective_number(weights, sizes.patient), confidence=float(confidence))
+    step = missed(sizes) - found.value
+    by_share = sorted((step * (low - share), step * (high - share)))
+    by_found = ((1 - share) * (end - found.value) for end in found.interval)
+    below, above = (math.hypot(one, other) for one, other in zip(by_found, by_share, strict=True))
+    return replace(plain, interval=(plain.value - below, plain.value + above), interval_reason="")
+
+
+def share_interval(share: float, number: float, *, confidence: float) -> Ends:
+    """Equal-tailed interval of a proportion with Jeffreys' prior; it contains the observed share (Brown et al. 2001).
+
+    Parameters
+    ----------
+    share, number
+        Share observed, and of how many trials, which need not be a whole number.
+    """
+    from scipy.special import betaincinv
+
+    tail, a, b = 0.5 * (1 - confidence), share * number + 0.5, (1 - share) * number + 0.5
+    return min(share, float(betaincinv(a, b, tail))), max(share, float(betaincinv(a, b, 1 - tail)))
+
+
+def alike(sizes: ModalitySizes) -> FloatArray:
+    """Equal weights of 1."""
+    return np.ones_like(sizes.ex_vivo_mm)
+
+
+def by_size(sizes: ModalitySizes) -> FloatArray:
+    """Weights by ex-vivo size, over the largest."""
+    return np.asarray(sizes.ex_vivo_mm / sizes.ex_vivo_mm.max())
+
+
+def by_square(sizes: ModalitySizes) -> FloatArray:
+    """Weights by squared ex-vivo size, over the largest."""
+    return by_size(sizes) ** 2
+
+
+# --- Accuracy against excision: percent and mm errors, and bias.
+
+
+def accuracy_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
     """Accuracy of one modality: `mape_percent`, `mae_mm` (a mass not found counts as size 0), the same over detected
     masses only, weighted and median percent errors, and `bias_percent` (detected only: 0 has no logarithm)."""
     found = sizes.only_detected()
@@ -79,3 +194,312 @@ def some(values: FloatArray) -> FloatArray:
     if len(values) == 0:
         raise UndefinedError("no mass to average over")
     return values
+
+
+# --- The paper's line through zero, with three figures that are all called r squared.
+#
+# The paper names no convention for r squared; its printed 0.14 can only be the centred or Pearson's (shared reading
+# of Fig. 10), so the centred one leads. The regression is of sizes y on ex-vivo sizes e.
+
+
+def origin_line_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+    """Slope and r squared with missed masses at size 0 (the paper's convention), then over detected masses only."""
+    result: dict[str, Figure] = {}
+    for suffix, subset in (("", sizes), ("_detected", sizes.only_detected())):
+        result[f"slope_through_origin{suffix}"] = figure_with_misses(
+            slope, subset, scale="linear", confidence=confidence, weight=by_square, missed=lambda _: 0.0
+        )
+        result[f"r2_centred{suffix}"] = figure(r2_centred, subset)
+        result[f"r2_uncentred{suffix}"] = figure(r2_uncentred, subset)
+        result[f"r2_pearson{suffix}"] = figure(r2_pearson, subset)
+        result[f"pearson_r{suffix}"] = figure(pearson_r, subset)
+    return result
+
+
+def _terms(sizes: ModalitySizes) -> FloatArray:
+    """Products of sizes, then of sizes about their means: e e, e y, y y, 1, e', y', e'e', e'y', y'y'."""
+    e, y = _scaled(sizes)
+    de, dy = e - e.mean(), y - y.mean()
+    return columns(e * e, e * y, y * y, 1.0, de, dy, de * de, de * dy, dy * dy)
+
+
+def _terms_of_varied_sizes(sizes: ModalitySizes) -> FloatArray:
+    _need_spread(sizes.size_mm, f"all {len(sizes.size_mm)} sizes are equal")
+    return _terms(sizes)
+
+
+def _terms_of_varied_pairs(sizes: ModalitySizes) -> FloatArray:
+    terms = _terms_of_varied_sizes(sizes)
+    _need_spread(sizes.ex_vivo_mm, f"all {len(sizes.ex_vivo_mm)} ex-vivo sizes are equal")
+    return terms
+
+
+def _slope(sums: FloatArray) -> FloatArray:
+    return ratio(sums[..., 1], sums[..., 0])
+
+
+def _sse(sums: FloatArray) -> FloatArray:
+    """Sum of squares about the line through zero."""
+    return np.maximum(sums[..., 2] - _slope(sums) * sums[..., 1], 0.0)
+
+
+def _sst(sums: FloatArray) -> FloatArray:
+    return sums[..., 8] - sums[..., 5] ** 2 / sums[..., 3]
+
+
+def _pearson(sums: FloatArray) -> FloatArray:
+    n = sums[..., 3]
+    product = sums[..., 7] - sums[..., 4] * sums[..., 5] / n
+    return np.clip(ratio(product, np.sqrt((sums[..., 6] - sums[..., 4] ** 2 / n) * _sst(sums))), -1.0, 1.0)
+
+
+# Least-squares slope of sizes on ex-vivo sizes without an intercept: sum e y / sum e^2.
+slope = SumStatistic(_terms, _slope)
+
+# Share of the variance about the mean that the line through zero explains, 1 - SSE0 / SST; below 0 when the mean of
+# the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it.
+r2_centred = SumStatistic(_terms_of_varied_sizes, lambda sums: 1 - ratio(_sse(sums), _sst(sums)))
+
+# Share of the sum of squares about zero that the line explains, 1 - SSE0 / sum y^2: what R prints for
+# lm(y ~ 0 + x). It flatters: any line through a cloud far from zero explains most of it.
+r2_uncentred = SumStatistic(_terms, lambda sums: 1 - ratio(_sse(sums), sums[..., 2]), "no mass was detected")
+
+# Correlation coefficient; its sign says what the squares hide.
+pearson_r = SumStatistic(_terms_of_varied_pairs, _pearson)
+
+# Squared correlation coefficient; blind to scale and offset.
+r2_pearson = SumStatistic(_terms_of_varied_pairs, lambda sums: _pearson(sums) ** 2)
+
+
+def _scaled(sizes: ModalitySizes) -> tuple[FloatArray, FloatArray]:
+    """Sizes over the largest ex-vivo size, so that squares neither overflow nor vanish."""
+    unit = some(sizes.ex_vivo_mm).max()
+    return sizes.ex_vivo_mm / unit, sizes.size_mm / unit
+
+
+def _need_spread(values: FloatArray, reason: str) -> None:
+    some(values)
+    if all_equal(values):
+        raise UndefinedError("one mass has no spread" if len(values) == 1 else reason)
+
+
+# --- Ratio of one modality's error to another's.
+
+REFERENCE = "tactile"
+
+
+@dataclass(frozen=True, slots=True)
+class ModalityRatio:
+    """Percent error of one modality over the tactile one's on common masses.
+
+    Attributes
+    ----------
+    ratio
+        On the `masses` that both looked for, a mass not found counting 100 %.
+    ratio_detected
+        On the `masses_detected` that both found.
+    """
+
+    masses: int
+    ratio: Figure
+    masses_detected: int
+    ratio_detected: Figure
+
+
+def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dict[str, ModalityRatio]:
+    """Ratio of every other modality to the tactile one; empty without a tactile one."""
+    reference = sizes.get(REFERENCE)
+    if reference is None:
+        return {}
+    return {
+        name: _modality_ratio(one, reference, confidence=confidence) for name, one in sizes.items() if name != REFERENCE
+    }
+
+
+def _modality_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> ModalityRatio:
+    looked_for = on_common_masses(sizes, reference)
+    found = on_common_masses(sizes.only_detected(), reference.only_detected())
+    return ModalityRatio(
+        masses=len(looked_for[0].size_mm),
+        ratio=mape_ratio(*looked_for, confidence=confidence),
+        masses_detected=len(found[0].size_mm),
+        ratio_detected=mape_ratio(*found, confidence=confidence),
+    )
+
+
+def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:
+    """Both modalities, limited to their common masses, in the same order."""
+    _, of_one, of_other = np.intersect1d(one.mass, other.mass, return_indices=True)
+    return one.take(of_one), other.take(of_other)
+
+
+def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> Figure:
+    """Quotient of two percent errors.
+
+    The interval leaves each patient out of both at once, so that patients hard for both do not widen it.
+    """
+    return resampled(Pair(sizes, reference, _quotient), scale="log", confidence=confidence)
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A statistic of two modalities' percent errors, which can be resampled by patients."""
+
+    sizes: ModalitySizes
+    reference: ModalitySizes
+    combine: Callable[[FloatArray, FloatArray], FloatArray]
+
+    @property
+    def patients(self) -> npt.NDArray[np.int64]:
+        """Patients with a mass in either modality."""
+        return np.union1d(self.sizes.patients, self.reference.patients)
+
+    def _samples(self) -> tuple[Sample, Sample]:
+        among = self.patients
+        return Sample(mape_percent, self.sizes, among), Sample(mape_percent, self.reference, among)
+
+    def value(self) -> float:
+        """The statistic from all patients."""
+        one, other = (sample.value() for sample in self._samples())
+        return self._combined(np.array(one), np.array(other)).item()
+
+    def left_out(self) -> FloatArray:
+        """(g,) statistic without each patient."""
+        one, other = (sample.left_out() for sample in self._samples())
+        return self._combined(one, other)
+
+    def redrawn(self, draws: FloatArray) -> FloatArray:
+        """(b,) statistic from patients drawn anew."""
+        one, other = (sample.redrawn(draws) for sample in self._samples())
+        return self.combine(one, other)
+
+    def _combined(self, one: FloatArray, other: FloatArray) -> FloatArray:
+        values = self.combine(one, other)
+        if np.any(np.isnan(values)):
+            raise UndefinedError(f"the error of {self.reference.name} is 0")
+        return values
+
+
+def _quotient(one: FloatArray, other: FloatArray) -> FloatArray:
+    return ratio(one, other)
+
+
+# --- Paired comparison of two modalities: difference and ratio of errors, and a permutation test.
+
+# Up to so many patients every pattern of signs is tried; beyond, this many random ones.
+MOST_EXACT = 14
+FLIPS = 9_999
+_AT_ONCE = 111
+
+
+@dataclass(frozen=True, slots=True)
+class PairedComparison:
+    """Percent errors of `first` against `second` on their common masses; a mass not found counts as size 0.
+
+    Attributes
+    ----------
+    difference_percent, ratio
+        Mean error of the first less, or over, that of the second.
+    p_value
+        Two-sided, of the sign-flip test by patient; None where no patient differs.
+    p_holm
+        The same, corrected for all pairs of this trial.
+    """
+
+    first: str
+    second: str
+    masses: int
+    patients: int
+    first_percent: float | None
+    second_percent: float | None
+    difference_percent: Figure
+    ratio: Figure
+    p_value: float | None
+    p_holm: float | None = None
+
+
+def paired_comparisons(
+    sizes: Mapping[str, ModalitySizes], *, confidence: float, seed: int = 0
+) -> list[PairedComparison]:
+    """Compare every pair of modalities on their common masses, with Holm's correction of p values."""
+    pairs = [
+        _compare(sizes[one], sizes[other], confidence=confidence, seed=seed) for one, other in combinations(sizes, 2)
+    ]
+    corrected = holm([pair.p_value for pair in pairs])
+    return [replace(pair, p_holm=p) for pair, p in zip(pairs, corrected, strict=True)]
+
+
+def least_p(patients: int) -> float:
+    """Smallest two-sided p value that a sign-flip test of so many patients can give: 2 of 2^n patterns."""
+    return min(1.0, 2.0 ** (1 - patients))
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Correct p values for their number, leaving None out: Holm (1979), Scand. J. Statist. 6, 65."""
+    known = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
+    corrected: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for rank, (p, index) in enumerate(known):
+        largest = max(largest, min(1.0, (len(known) - rank) * p))
+        corrected[index] = largest
+    return corrected
+
+
+def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float | None:
+    """Two-sided p value of a sum of patients' differences, by a permutation test that flips their signs.
+
+    Parameters
+    ----------
+    by_patient : (g,) array
+        Sum over each patient's masses of the difference of absolute errors.
+    seed
+        Of the random patterns, when there are too many to try all.
+    flips
+        How many random patterns.
+
+    Notes
+    -----
+    Exact when all patterns are tried; with random ones the observed pattern is counted in (Phipson & Smyth 2010, Stat.
+    Appl. Genet. Mol. Biol. 9, 39). Valid when, under the null hypothesis, exchanging the two modalities of a patient
+    changes no probability.
+    """
+    differences = by_patient[by_patient != 0]
+    if len(differences) == 0:
+        return None
+    # the same sum in another order differs in rounding; a hair's breadth is equal
+    observed = abs(float(differences.sum())) * (1 - 1e-9)
+    if len(differences) <= MOST_EXACT:
+        patterns = (np.arange(2 ** len(differences))[:, None] >> np.arange(len(differences))) & 1
+        return float(np.mean(np.abs((1 - 2 * patterns) @ differences) >= observed))
+    rng = np.random.default_rng([seed, len(differences)])
+    beyond = 1
+    for start in range(0, flips, _AT_ONCE):
+        signs = 1 - 2 * rng.integers(0, 2, (min(_AT_ONCE, flips - start), len(differences)), dtype=np.int8)
+        beyond += int(np.sum(np.abs(signs @ differences) >= observed))
+    return beyond / (flips + 1)
+
+
+def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, seed: int) -> PairedComparison:
+    first, second = on_common_masses(one, other)
+    difference = resampled(Pair(first, second, _difference), scale="linear", confidence=confidence)
+    quotient = resampled(Pair(first, second, ratio), scale="log", confidence=confidence)
+    patients = first.patients
+    with np.errstate(all="ignore"):
+        off = np.abs(first.size_mm / first.ex_vivo_mm - 1) - np.abs(second.size_mm / second.ex_vivo_mm - 1)
+    sums = np.zeros(len(patients))
+    np.add.at(sums, np.searchsorted(patients, first.patient), off)
+    return PairedComparison(
+        first=one.name,
+        second=other.name,
+        masses=len(first.size_mm),
+        patients=len(patients),
+        first_percent=figure(mape_percent, first).value,
+        second_percent=figure(mape_percent, second).value,
+        difference_percent=difference,
+        ratio=quotient,
+        p_value=sign_flip(sums, seed=seed) if len(patients) and np.all(np.isfinite(sums)) else None,
+    )
+
+
+def _difference(one: FloatArray, other: FloatArray) -> FloatArray:
+    return np.asarray(one - other)

@@ -1,27 +1,310 @@
-"""A figure of a trial: a number, its interval, and the reason where one of them is missing."""
+"""Figures with intervals over patients: bootstrap, jackknife, exact sums."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Protocol, assert_never
+from functools import lru_cache, partial
+from typing import Literal, Protocol, TypeVar, assert_never
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.trial.bootstrap import Intervals, bca_interval, draw_patients, method_of
-from tactile_bayes.trial.jackknife import (
-    Scale,
-    UndefinedError,
-    effective_number,
-    interval_from_values,
-    need_patients,
-)
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
-from tactile_bayes.trial.sums import SumStatistic
+
+# --- Jackknife intervals over patients, keeping a patient's masses together.
+
+Scale = Literal["log", "linear", "fisher", "slope"]
+Values = TypeVar("Values", float, npt.NDArray[np.float64])
+
+# Below this the spread of so few leave-one-out values says little; a Student t with 6 degrees of freedom would hide it.
+MIN_PATIENTS = 8
+# An interval on the logarithm whose upper end is more than this many times the lower one says nothing.
+WIDEST = 1000.0
+
+
+class UndefinedError(Exception):
+    """The data leave a figure or its interval undefined; the message is the reason."""
+
+
+def need_patients(groups: int) -> None:
+    """Raise `UndefinedError` with fewer than `MIN_PATIENTS`."""
+    if groups < MIN_PATIENTS:
+        raise UndefinedError(f"an interval needs at least {MIN_PATIENTS} patients (found {groups})")
+
+
+def interval_from_values(
+    value: float,
+    values: Sequence[float] | npt.NDArray[np.float64],
+    *,
+    scale: Scale,
+    confidence: float,
+    freedom: float | None = None,
+) -> tuple[float, float]:
+    r"""Two-sided jackknife interval of a statistic from its values with one patient left out.
+
+    Parameters
+    ----------
+    value
+        The statistic on all patients.
+    values : (G,) array
+        The statistic without each patient.
+    scale
+        ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear`` on the figure,
+        ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1), ``slope`` as ``log`` where the
+        figure is above 0 with every patient left out, else as ``linear``.
+    confidence
+        Probability of the interval.
+    freedom
+        Degrees of freedom of Student's t where they are fewer than G - 1.
+
+    Raises
+    ------
+    UndefinedError
+        With fewer than `MIN_PATIENTS` patients, or where the leave-one-out values do not exist or do not differ.
+
+    Notes
+    -----
+    .. math:: \hat\theta \pm t_{G-1}\sqrt{\tfrac{G-1}{G}\sum_g (\hat\theta_{(g)} - \bar\theta_{(\cdot)})^2}
+
+    for G patients: Tukey (1958), Ann. Math. Statist. 29, 614; Efron & Tibshirani (1993), ch. 11.
+    """
+    from scipy.special import stdtrit
+
+    groups = len(values)
+    need_patients(groups)
+    left_out = np.asarray(values, dtype=np.float64)
+    if scale == "slope":
+        scale = "log" if value > 0 and np.all(left_out > 0) else "linear"
+    everything, others = on_scale(value, scale), on_scale(left_out, scale)
+    variance = (groups - 1) / groups * float(np.sum((others - others.mean()) ** 2))
+    if variance <= (1e-12 * max(1.0, abs(everything))) ** 2:
+        raise UndefinedError("the figure is the same whichever patient is left out, so its error cannot be estimated")
+    degrees = groups - 1 if freedom is None else min(max(freedom, 1.0), groups - 1)
+    reach = float(stdtrit(degrees, 0.5 + 0.5 * confidence)) * math.sqrt(variance)
+    low, high = everything - reach, everything + reach
+    if scale == "linear":
+        return low, high
+    if scale == "fisher":
+        return math.tanh(low), math.tanh(high)
+    if high - low > math.log(WIDEST):
+        raise UndefinedError(f"it would span more than a factor of {WIDEST:g}: the figure rests on one or two patients")
+    return math.exp(low), math.exp(high)
+
+
+def effective_number(weights: npt.NDArray[np.float64], patient: npt.NDArray[np.int64]) -> float:
+    r"""Effective number of patients, :math:`(\sum_g W_g)^2 / \sum_g W_g^2` (Satterthwaite 1946).
+
+    Parameters
+    ----------
+    weights : (n,) array
+        Of each mass, not below 0; 0 is returned where all are 0.
+    patient : (n,) array
+        Patient of each mass.
+    """
+    _, group = np.unique(patient, return_inverse=True)
+    by_patient = np.bincount(group, weights=weights / max(float(weights.max(initial=0.0)), 1e-300))
+    squares = float(np.sum(by_patient**2))
+    return float(by_patient.sum()) ** 2 / squares if squares > 0 else 0.0
+
+
+def kurtosis_freedom(values: npt.NDArray[np.float64]) -> float:
+    r"""Degrees of freedom of a jackknife variance from the fourth moment of its leave-one-out values.
+
+    With normal contributions of unequal variance the expected squares and fourth powers give Satterthwaite's
+    :math:`(\sum\sigma_g^2)^2 / \sum\sigma_g^4 = 3 (\sum d_g^2)^2 / \sum d_g^4`.
+    """
+    off = np.abs(values - values.mean())
+    if not off.any():
+        return 1.0
+    squares = (off / off.max()) ** 2
+    return 3 * float(squares.sum()) ** 2 / float(np.sum(squares**2))
+
+
+def on_scale(values: Values, scale: Scale) -> Values:
+    """Transform values to a scale: unchanged, logarithms, or Fisher's z; `UndefinedError` where one has none."""
+    if scale == "linear":
+        return values
+    if scale == "fisher":
+        if np.any(np.abs(np.asarray(values)) >= 1):
+            raise UndefinedError("the coefficient is 1 or -1, or becomes so without one patient")
+        stretched: Values = np.arctanh(values)
+        return stretched
+    if np.any(np.asarray(values) <= 0):
+        raise UndefinedError("the figure is 0, or becomes 0 without one patient, and has no logarithm")
+    logarithms: Values = np.log(values)
+    return logarithms
+
+
+# --- Statistics that depend on masses only through sums, so that resampling patients is cheap.
+
+
+@dataclass(frozen=True, slots=True)
+class SumStatistic:
+    """A figure computed from the sums of a few terms over the masses.
+
+    Parameters
+    ----------
+    terms
+        (n, k) array of what each mass adds; raises `UndefinedError` where the masses leave the figure undefined.
+    finish
+        The figure from the (..., k) sums, for all leading axes at once; NaN where it does not exist.
+    undefined
+        The reason when `finish` gives NaN.
+    """
+
+    terms: Callable[[ModalitySizes], FloatArray]
+    finish: Callable[[FloatArray], FloatArray]
+    undefined: str = "the masses do not determine it"
+
+    def __call__(self, sizes: ModalitySizes) -> float:
+        """Compute the statistic of these masses."""
+        value = float(self.finish(self.terms(sizes).sum(axis=0)))
+        if np.isnan(value):
+            raise UndefinedError(self.undefined)
+        return value
+
+    def left_out(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
+        """(g,) statistic without each patient in turn; a patient without a mass changes nothing."""
+        terms = self.terms(sizes)
+        return self.finish(terms.sum(axis=0) - self.by_patient(terms, sizes, patients))
+
+    def redrawn(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
+        """(b,) statistic for each row of (b, g) `draws`: how often each patient was drawn."""
+        return self.finish(draws @ self.by_patient(self.terms(sizes), sizes, patients))
+
+    @staticmethod
+    def by_patient(terms: FloatArray, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
+        """(g, k) sums of the terms within each patient."""
+        sums = np.zeros((len(patients), terms.shape[1]))
+        np.add.at(sums, np.searchsorted(patients, sizes.patient), terms)
+        return sums
+
+
+def columns(*values: FloatArray | float) -> FloatArray:
+    """(n, k) array of k columns, each of length n or one number for all rows."""
+    return np.stack(np.broadcast_arrays(*values), axis=-1).astype(np.float64)
+
+
+def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
+    """`above` over `below`, NaN where `below` is 0."""
+    with np.errstate(all="ignore"):
+        quotient: FloatArray = np.where(below == 0, np.nan, above / np.where(below == 0, 1.0, below))
+    return quotient
+
+
+# --- Exact intervals of a proportion k of n.
+
+
+def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, float]:
+    r"""Exact two-sided interval of a binomial proportion.
+
+    Parameters
+    ----------
+    k, n
+        Successes of trials, 0 <= k <= n, n > 0. Fractions are allowed, for effective numbers of trials.
+    confidence
+        Probability that the interval covers the proportion, at least.
+
+    Returns
+    -------
+    Low and high end, in [0, 1].
+
+    Notes
+    -----
+    The ends are quantiles of Beta(k, n-k+1) and Beta(k+1, n-k). Clopper & Pearson (1934), Biometrika 26, 404.
+    """
+    from scipy.special import betaincinv
+
+    if not 0 <= k <= n or n <= 0:
+        raise ValueError(f"need 0 <= k <= n and n > 0 (found k = {k}, n = {n})")
+    tail = 0.5 * (1 - confidence)
+    low = 0.0 if k <= 0 else float(betaincinv(k, n - k + 1, tail))
+    high = 1.0 if k >= n else float(betaincinv(k + 1, n - k, 1 - tail))
+    return low, high
+
+
+# --- Bootstrap intervals over patients (BCa), keeping a patient's masses together.
+
+Method = Literal["corrected", "jackknife", "bca"]
+RESAMPLES = 2000
+SEED = 1999
+# Of the redrawn trials, at least this share must have the figure at all.
+_LEAST_DEFINED = 0.99
+
+
+class Intervals(float):
+    """Probability of intervals together with their method; a plain number means the jackknife.
+
+    Parameters
+    ----------
+    confidence
+        Probability, two-sided.
+    method, resamples, seed
+        ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients
+        `resamples` times from this seed.
+    """
+
+    method: Method
+    resamples: int
+    seed: int
+
+    def __new__(
+        cls, confidence: float, *, method: Method = "jackknife", resamples: int = RESAMPLES, seed: int = SEED
+    ) -> Intervals:
+        """A float with three more attributes."""
+        made = super().__new__(cls, confidence)
+        made.method, made.resamples, made.seed = method, resamples, seed
+        return made
+
+
+def method_of(confidence: float) -> Method:
+    """Method of the intervals of a probability."""
+    return confidence.method if isinstance(confidence, Intervals) else "jackknife"
+
+
+@lru_cache(maxsize=8)
+def draw_patients(patients: int, *, resamples: int, seed: int) -> FloatArray:
+    """(resamples, patients) how often each patient is drawn, with replacement; equal for every figure."""
+    rng = np.random.default_rng([seed, patients])
+    draws = rng.multinomial(patients, np.full(patients, 1 / patients), size=resamples).astype(np.float64)
+    draws.flags.writeable = False
+    return draws
+
+
+def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confidence: float) -> tuple[float, float]:
+    r"""BCa interval: quantiles corrected for bias and acceleration.
+
+    Notes
+    -----
+    Efron (1987), J. Am. Stat. Assoc. 82, 171: bias from the share of draws below the figure (ties by half),
+    acceleration from the skewness of the values with one patient left out.
+    """
+    from scipy.special import ndtr, ndtri
+
+    drawn = _defined(drawn)
+    share = (np.sum(drawn < value) + 0.5 * np.sum(drawn == value)) / len(drawn)
+    bias = float(ndtri(np.clip(share, 0.5 / len(drawn), 1 - 0.5 / len(drawn))))
+    off = left_out.mean() - left_out
+    squares = float(np.sum(off**2))
+    if squares == 0:
+        raise UndefinedError("the figure is the same whichever patient is left out, so its error cannot be estimated")
+    acceleration = float(np.sum(off**3)) / (6 * squares**1.5)
+    z = bias + np.array([-1, 1]) * float(ndtri(0.5 + 0.5 * confidence))
+    low, high = np.quantile(drawn, ndtr(bias + z / (1 - acceleration * z)))
+    return float(low), float(high)
+
+
+def _defined(drawn: FloatArray) -> FloatArray:
+    defined = drawn[np.isfinite(drawn)]
+    if len(defined) < _LEAST_DEFINED * len(drawn):
+        raise UndefinedError(f"of {len(drawn)} redrawn trials {len(drawn) - len(defined)} leave the figure undefined")
+    return defined
+
+
+# --- A figure of a trial: a number, its interval, and the reason where one of them is missing.
 
 # Room above for percent and squares; NaN fails the comparison too.
 LARGEST = 1e150

@@ -1,19 +1,269 @@
-"""Straight lines between two methods: least squares, Deming and weighted Deming regression.
-
-x is the reference and y the method under test. The Deming lines take `error_ratio`, the variance of the error of x over
-that of y, as Linnet (1990) does; 1 is orthogonal regression, and 0 and infinity are the two least-squares lines.
-"""
+"""Lines between two methods: Deming, Passing-Bablok, concordance."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from tactile_bayes.trial.jackknife import UndefinedError
+from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.readings import FloatArray
+
+# --- Ordered angles of the lines through all pairs of points: listed, or counted when there are many.
+
+# Up to so many points the pairs are listed (2 million of them); beyond, ranks are found by counting inversions.
+MOST_LISTED = 2000
+# Beyond MOST_LISTED an ordered angle is found to this many radians.
+RESOLUTION = 1e-9
+# Differences below this share of the mean of the two numbers are rounding, as in laboratories' programs.
+_EQUAL = 1e-12
+
+
+class PairAngles:
+    """Ordered angles in (-pi/2, pi/2] of all pairs of points that do not coincide.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+    vertical
+        The angle of a pair of equal x: pi/2 or -pi/2.
+    """
+
+    def __init__(self, x: FloatArray, y: FloatArray, *, vertical: float) -> None:
+        self._counted = len(x) > MOST_LISTED
+        self._vertical = vertical
+        if self._counted:
+            order = np.lexsort((y, x))
+            self._x, self._y = x[order], y[order]
+            self._coincident = _pairs_of_equals(np.stack([self._x, self._y], axis=1))
+            self._upright = _pairs_of_equals(self._x[:, None]) - self._coincident
+            self.number = len(x) * (len(x) - 1) // 2 - self._coincident
+        else:
+            self._angles = _listed(x, y, vertical)
+            self.number = len(self._angles)
+
+    def below(self, angle: float, *, inclusive: bool) -> int:
+        """Number of angles below `angle` (in (-pi/2, pi/2)), or not above it when inclusive."""
+        if not self._counted:
+            return int(np.searchsorted(self._angles, angle, side="right" if inclusive else "left"))
+        slope = math.copysign(1.0, angle) if abs(angle) == math.pi / 4 else math.tan(angle)
+        z = self._y - slope * self._x
+        grain = _EQUAL * (np.abs(self._y).max() + abs(slope) * np.abs(self._x).max())
+        z = np.rint(z / grain) if grain > 0 else z
+        upright = self._upright if self._vertical < 0 else 0
+        return _inversions(self._x, z, ties=inclusive) + upright - (self._coincident if inclusive else 0)
+
+    def ranked(self, rank: int) -> float:
+        """The angle of a rank, from 1."""
+        if not self._counted:
+            return float(self._angles[rank - 1])
+        low, high = -math.pi / 2, math.pi / 2
+        count_low, count_high = 0, self.number
+        widths = [high - low]
+        while high - low > RESOLUTION:
+            share = _next_share(rank, count_low, count_high, widths)
+            middle = low + share * (high - low)
+            count = self.below(middle, inclusive=True)
+            if count >= rank:
+                high, count_high = middle, count
+            else:
+                low, count_low = middle, count
+            widths.append(high - low)
+        return high
+
+    def shift(self, *, rising: bool) -> int:
+        """Twice the shift of the median's rank: one for each angle beyond 45 degrees against the line, half at it."""
+        if rising:
+            return self.below(-math.pi / 4, inclusive=True) + self.below(-math.pi / 4, inclusive=False)
+        on_or_above = self.number - self.below(math.pi / 4, inclusive=False)
+        return -(on_or_above + self.number - self.below(math.pi / 4, inclusive=True))
+
+    def exactly_on_the_shift(self, *, rising: bool) -> int:
+        """Number of angles exactly 45 degrees against the line."""
+        at = -math.pi / 4 if rising else math.pi / 4
+        return self.below(at, inclusive=True) - self.below(at, inclusive=False)
+
+
+def kendall_sign(x: FloatArray, y: FloatArray) -> int:
+    """Sign of Kendall's tau: concordant less discordant pairs."""
+    if len(x) <= MOST_LISTED:
+        first, second = np.triu_indices(len(x), 1)
+        return int(np.sign(np.sum(np.sign(x[second] - x[first]) * np.sign(y[second] - y[first]))))
+    order = np.lexsort((y, x))
+    discordant = _inversions(x[order], y[order], ties=False)
+    tied = _pairs_of_equals(x[order][:, None]) + _pairs_of_equals(np.sort(y)[:, None])
+    both = _pairs_of_equals(np.stack([x[order], y[order]], axis=1))
+    concordant = len(x) * (len(x) - 1) // 2 - tied + both - discordant
+    return (concordant > discordant) - (concordant < discordant)
+
+
+def _listed(x: FloatArray, y: FloatArray, vertical: float) -> FloatArray:
+    first, second = np.triu_indices(len(x), 1)
+    dx, dy = _difference(x[second], x[first]), _difference(y[second], y[first])
+    apart = (dx != 0) | (dy != 0)
+    dx, dy = dx[apart], dy[apart]
+    upright = dx == 0
+    return np.sort(np.where(upright, vertical, np.arctan(dy / np.where(upright, 1.0, dx))))
+
+
+def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
+    difference = a - b
+    return np.where(np.abs(difference) < _EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
+
+
+def _next_share(rank: int, count_low: int, count_high: int, widths: Sequence[float]) -> float:
+    """Where to count next in the bracket: by interpolation, offset to alternate sides so that both ends close in.
+
+    Where that does not shrink the bracket eightfold in three steps, its middle.
+    """
+    step = len(widths)
+    if count_high == count_low or (step > 3 and widths[-1] > widths[-4] / 8):
+        return 0.5
+    share = (rank - 0.5 - count_low) / (count_high - count_low)
+    beside = 0.98 * share if step % 2 else 1 - 0.98 * (1 - share)
+    return min(0.999, max(0.001, beside))
+
+
+def _pairs_of_equals(rows: FloatArray) -> int:
+    """Number of pairs of equal rows in (n, k) sorted rows."""
+    new = np.any(rows[1:] != rows[:-1], axis=1)
+    lengths = np.diff(np.concatenate([[-1], np.flatnonzero(new), [len(rows) - 1]]))
+    return int(np.sum(lengths * (lengths - 1) // 2))
+
+
+def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
+    """Number of pairs of ascending x whose z descends; with `ties`, also pairs of equal z, or of equal x and z."""
+    order = np.lexsort((z, x))
+    ordered = z[order]
+    index = np.arange(len(z))
+    by_value = np.lexsort((-index if ties else index, ordered))
+    rank = np.empty(len(z), dtype=np.int64)
+    rank[by_value] = index
+    return _inversions_of_permutation(rank)
+
+
+def _inversions_of_permutation(rank: npt.NDArray[np.int64]) -> int:
+    """Number of inversions, counted bit by bit: within equal higher bits, every 1 before a 0."""
+    total = 0
+    for bit in reversed(range(max(1, int(len(rank) - 1).bit_length()))):
+        group, one = rank >> (bit + 1), (rank >> bit) & 1
+        ones_before = np.concatenate([[0], np.cumsum(one)])[:-1]
+        start = np.concatenate([[True], group[1:] != group[:-1]])
+        base = np.maximum.accumulate(np.where(start, ones_before, 0))
+        total += int(np.sum((ones_before - base)[one == 0]))
+        rank = rank[np.argsort(rank >> bit, kind="stable")]
+    return total
+
+
+# --- Passing and Bablok's line: the shifted median of the slopes of all pairs of masses.
+#
+# Conventions, those that laboratories' programs share: the slope of a vertical pair is +90 degrees when Kendall's
+# tau is 0 or more and -90 degrees otherwise; coincident pairs are left out; a slope of exactly -1 (+1 for a falling
+# line) counts half in the shift; means of two middle slopes are taken between angles (``radian``) or between slopes
+# (``tangent``).
+
+Measure = Literal["radian", "tangent"]
+
+
+@dataclass(frozen=True, slots=True)
+class PassingBablok:
+    """A Passing-Bablok line with its intervals; ends may be infinite for few masses."""
+
+    intercept: float
+    slope: float
+    intercept_interval: tuple[float, float]
+    slope_interval: tuple[float, float]
+    n: int
+
+
+def passing_bablok(
+    x: FloatArray, y: FloatArray, *, confidence: float = 0.95, measure: Measure = "radian"
+) -> PassingBablok:
+    """Fit y on x without assuming a distribution or knowing which method errs more.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+    measure
+        How two middle slopes are averaged.
+
+    Notes
+    -----
+    Passing & Bablok (1983), J. Clin. Chem. Clin. Biochem. 21, 709, for a line that rises; the mirror image for one that
+    falls. The intercept is the median of y - slope x. Slope ends are order statistics at the shifted median -+
+    :math:`z\\sqrt{n(n-1)(2n+5)/18}/2`, intercept ends the medians for the two slope ends. When either slope end lies
+    beyond the ordered slopes, both ends of both intervals are infinite.
+
+    Raises
+    ------
+    UndefinedError
+        With fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond 45
+        degrees against the line that the shifted median lies beyond the last.
+    """
+    if len(x) < 2:
+        raise UndefinedError(f"a line needs at least 2 masses (found {len(x)})")
+    rising = kendall_sign(x, y) >= 0
+    angles = PairAngles(x, y, vertical=math.pi / 2 if rising else -math.pi / 2)
+    if angles.number == 0:
+        raise UndefinedError("all points coincide, so no line is determined")
+    shift = angles.shift(rising=rising)
+    if (angles.number + shift) // 2 + 1 > angles.number or angles.number + shift < 1:
+        raise UndefinedError("the shifted median lies beyond the slopes: the points neither rise nor fall")
+    slope = _at(angles, angles.number + shift, measure)
+    if not abs(slope) < 1e15:
+        raise UndefinedError("the middle slope is vertical")
+    ends = _slope_ends(angles, shift, rising=rising, confidence=confidence, measure=measure, n=len(x))
+    return PassingBablok(
+        intercept=float(np.median(y - slope * x)),
+        slope=slope,
+        intercept_interval=_intercept_ends(x, y, ends),
+        slope_interval=ends,
+        n=len(x),
+    )
+
+
+def _slope_ends(
+    angles: PairAngles, shift: int, *, rising: bool, confidence: float, measure: Measure, n: int
+) -> tuple[float, float]:
+    from scipy.special import ndtri
+
+    sd = math.sqrt(n * (n - 1) * (2 * n + 5) / 18)
+    reach = math.floor(float(ndtri(0.5 + 0.5 * confidence)) * sd + 0.5)
+    low, high = angles.number - reach + shift, angles.number + reach + shift
+    # ranks below the slopes of -1 (+1 for a falling line) say nothing of the line
+    least = 2 * angles.exactly_on_the_shift(rising=rising) + 1
+    if (low + 1) // 2 < least or (high + 1) // 2 > angles.number - (high % 2 == 0):
+        return -math.inf, math.inf
+    return _at(angles, low, measure), _at(angles, high, measure)
+
+
+def _intercept_ends(x: FloatArray, y: FloatArray, slopes: tuple[float, float]) -> tuple[float, float]:
+    if not all(math.isfinite(slope) and abs(slope) < 1e15 for slope in slopes):
+        return -math.inf, math.inf
+    return float(np.median(y - slopes[1] * x)), float(np.median(y - slopes[0] * x))
+
+
+def _at(angles: PairAngles, twice: int, measure: Measure) -> float:
+    """The slope at rank (twice + 1) / 2: one ordered angle, or the middle of two."""
+    rank = (twice + 1) // 2
+    first = angles.ranked(rank)
+    if twice % 2:
+        return math.tan(first)
+    second = angles.ranked(rank + 1)
+    if measure == "tangent":
+        return (math.tan(first) + math.tan(second)) / 2
+    return math.tan((first + second) / 2)
+
+
+# --- Straight lines between two methods: least squares, Deming and weighted Deming regression.
+#
+# x is the reference and y the method under test. The Deming lines take `error_ratio`, the variance of the error of
+# x over that of y, as Linnet (1990) does; 1 is orthogonal regression, and 0 and infinity are the two least-squares
+# lines.
 
 MAX_ITERATIONS = 30
 THRESHOLD = 1e-6
@@ -219,3 +469,79 @@ def _need_ratio(error_ratio: float) -> None:
 
 def _about(value: float, reach: float) -> tuple[float, float]:
     return value - reach, value + reach
+
+
+# --- Lin's concordance correlation: precision and accuracy about the line of identity.
+
+
+@dataclass(frozen=True, slots=True)
+class Concordance:
+    """Concordance coefficient and its parts.
+
+    Attributes
+    ----------
+    coefficient
+        Lin's, -1 to 1: `pearson_r` times `bias_correction`.
+    bias_correction
+        C_b, above 0 to 1: 1 when means and standard deviations agree.
+    scale_shift
+        SD of y over that of x.
+    location_shift
+        Mean of y less that of x, over the geometric mean of the SDs (divisor n).
+    interval
+        By Fisher's z; None for fewer than 4 pairs or a perfect or uncorrelated sample.
+    """
+
+    coefficient: float
+    pearson_r: float
+    bias_correction: float
+    scale_shift: float
+    location_shift: float
+    interval: tuple[float, float] | None
+
+
+def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Concordance:
+    r"""Concordance of y with x, as if the pairs were independent.
+
+    Notes
+    -----
+    .. math:: \rho_c = \frac{2 s_{xy}}{s_x^2 + s_y^2 + (\bar y - \bar x)^2}
+
+    with divisor n throughout: Lin (1989), Biometrics 45, 255; the variance as corrected in Lin (2000), Biometrics 56,
+    324, with n - 2.
+
+    Raises
+    ------
+    UndefinedError
+        When x or y does not vary.
+    """
+    n = len(x)
+    if n < 2 or all_equal(x) or all_equal(y):
+        raise UndefinedError("concordance needs sizes and ex-vivo sizes that vary")
+    sx2, sy2 = float(np.var(x)), float(np.var(y))
+    sxy = float(np.mean((x - x.mean()) * (y - y.mean())))
+    r = min(1.0, max(-1.0, sxy / math.sqrt(sx2 * sy2)))
+    rho = 2 * sxy / (sx2 + sy2 + float(y.mean() - x.mean()) ** 2)
+    shift = float(y.mean() - x.mean()) / (sx2 * sy2) ** 0.25
+    scale = math.sqrt(sy2 / sx2)
+    return Concordance(
+        coefficient=rho,
+        pearson_r=r,
+        bias_correction=2 / (scale + 1 / scale + shift**2),
+        scale_shift=scale,
+        location_shift=shift,
+        interval=_fisher(rho, r, shift, n, confidence),
+    )
+
+
+def _fisher(rho: float, r: float, shift: float, n: int, confidence: float) -> tuple[float, float] | None:
+    from scipy.special import ndtri
+
+    if n < 4 or r == 0 or abs(rho) >= 1:
+        return None
+    spread = (1 - r**2) * rho**2 * (1 - rho**2) / r**2 + 2 * rho**3 * (1 - rho) * shift**2 / r
+    variance = (spread - 0.5 * rho**4 * shift**4 / r**2) / (n - 2)
+    if variance <= 0:
+        return None
+    reach = float(ndtri(0.5 + 0.5 * confidence)) * math.sqrt(variance) / (1 - rho**2)
+    return math.tanh(math.atanh(rho) - reach), math.tanh(math.atanh(rho) + reach)

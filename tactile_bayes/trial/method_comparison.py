@@ -9,16 +9,34 @@ from typing import TypeVar
 
 import numpy as np
 
-from tactile_bayes.trial import bland_altman, patient_limits
-from tactile_bayes.trial.bland_altman import Limits, Trend
-from tactile_bayes.trial.bootstrap import method_of
-from tactile_bayes.trial.concordance import Concordance, concordance
-from tactile_bayes.trial.figures import Figure, Statistic, figure
-from tactile_bayes.trial.jackknife import Scale, UndefinedError
-from tactile_bayes.trial.lines import EQUAL, Line, centred, deming, jackknife_errors, least_squares, weighted_deming
-from tactile_bayes.trial.passing_bablok import PassingBablok, passing_bablok
+from tactile_bayes.trial import limits as bland_altman
+from tactile_bayes.trial import limits as patient_limits
+from tactile_bayes.trial.figures import (
+    Figure,
+    Scale,
+    Statistic,
+    SumStatistic,
+    UndefinedError,
+    columns,
+    figure,
+    method_of,
+    ratio,
+)
+from tactile_bayes.trial.limits import Limits, Trend
+from tactile_bayes.trial.lines import (
+    EQUAL,
+    Concordance,
+    Line,
+    PassingBablok,
+    centred,
+    concordance,
+    deming,
+    jackknife_errors,
+    least_squares,
+    passing_bablok,
+    weighted_deming,
+)
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
-from tactile_bayes.trial.sums import SumStatistic, columns, ratio
 
 # Lines that are not sums are fitted anew without each patient; beyond so many masses that takes too long.
 MOST_REFITTED = 300

@@ -27,7 +27,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tactile_bayes.trial.jackknife import MIN_PATIENTS
+from tactile_bayes.trial.figures import MIN_PATIENTS
 from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, gather, mass_numbers
 
 # Largest total SD of ln size; normal prior SDs of bias and slope - 1.

@@ -9,24 +9,38 @@ from dataclasses import field
 import numpy as np
 
 from tactile_bayes.records import dataclass
-from tactile_bayes.trial import accuracy, origin_line, replicates, spread
-from tactile_bayes.trial.bootstrap import SEED
-from tactile_bayes.trial.calibration import Calibration, Prediction, calibration, log_normal, predictions
-from tactile_bayes.trial.cautions import cautions
-from tactile_bayes.trial.comparison import ModalityRatio, mape_ratios
-from tactile_bayes.trial.coverage import Coverage, coverage
-from tactile_bayes.trial.figures import Figure
-from tactile_bayes.trial.jackknife import effective_number
+from tactile_bayes.trial import accuracy, replicates
+from tactile_bayes.trial import accuracy as origin_line
+from tactile_bayes.trial import replicates as spread
+from tactile_bayes.trial.accuracy import ModalityRatio, PairedComparison, cautions, mape_ratios, paired_comparisons
+from tactile_bayes.trial.calibration import (
+    Calibration,
+    Coverage,
+    Prediction,
+    calibration,
+    coverage,
+    log_normal,
+    predictions,
+)
+from tactile_bayes.trial.figures import SEED, Figure, clopper_pearson, effective_number
 from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
-from tactile_bayes.trial.paired import PairedComparison, paired_comparisons
-from tactile_bayes.trial.plausibility import unit_doubts
-from tactile_bayes.trial.proportion import clopper_pearson
-from tactile_bayes.trial.readings import MassKey, ModalitySizes, Reading, gather, mass_numbers, patient_numbers
-from tactile_bayes.trial.replicates import reader_components
-from tactile_bayes.trial.variance_components import Components
+from tactile_bayes.trial.readings import (
+    MassKey,
+    ModalitySizes,
+    Reading,
+    gather,
+    mass_numbers,
+    patient_numbers,
+    unit_doubts,
+)
+from tactile_bayes.trial.replicates import Components, reader_components
 from tactile_bayes.trial.visits import OtherVisits
 
-FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (accuracy.figures, origin_line.figures, spread.figures)
+FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
+    accuracy.accuracy_figures,
+    origin_line.origin_line_figures,
+    spread.spread_figures,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +216,7 @@ def modality_report(
         figures={name: one for family in FAMILIES for name, one in family(sizes, confidence=confidence).items()},
         coverage=tuple(coverage(sizes.intervals, confidence=float(confidence))),
         methods=compare_methods(sizes, confidence=confidence, error_ratio=error_ratio),
-        replicates=replicates.figures(sizes, confidence=confidence),
+        replicates=replicates.replicate_figures(sizes, confidence=confidence),
         components=None if beside is None else beside.components(sizes.name),
         calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
         prediction=prediction,

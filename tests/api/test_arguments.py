@@ -11,11 +11,11 @@ import pandas
 import pytest
 
 import tactile_bayes as tb
+from tactile_bayes.api import settings
 from tactile_bayes.api.arguments import in_keywords
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.schema import load_schema
-from tactile_bayes.files.settings_toml import SCHEMA
-from tactile_bayes.pipeline import settings
+from tactile_bayes.files.documents import SETTINGS_SCHEMA as SCHEMA
+from tactile_bayes.files.documents import load_schema
 
 DEMO = Path(tb.__file__).parent / "demo"
 FAST = {"method": "laplace"}

@@ -16,7 +16,8 @@ import tactile_bayes as tb
 from tactile_bayes.cli import cli
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.run import TAKES
-from tactile_bayes.report import exam_files, printed
+from tactile_bayes.report import exam_page as exam_files
+from tactile_bayes.report import exam_page as printed
 
 DEMO = Path(tb.__file__).parent / "demo"
 FAST = {"method": "laplace"}

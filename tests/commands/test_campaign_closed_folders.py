@@ -10,8 +10,8 @@ import pytest
 from campaign_files import JOURNAL, thinned, write
 from in_process import run_here
 
+from tactile_bayes.campaign.inputs import open_campaign
 from tactile_bayes.errors import UsageError
-from tactile_bayes.pipeline.campaign_folder import open_campaign
 
 DRY = ("campaign", "run", "exams.csv", "-o", "out", "--dry-run")
 

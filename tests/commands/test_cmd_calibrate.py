@@ -12,9 +12,9 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes
+from tactile_bayes.api.size_calibration import table_recipe
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.pipeline.size_calibration import table_recipe
 from tactile_bayes.size.terms import Recipe
 
 Run = Callable[..., "CompletedProcess[str]"]

@@ -20,13 +20,13 @@ import pytest
 from campaign_files import JOURNAL, ROWS, contents, rows_of, steps, thinned, write, write_study, write_table
 from in_process import run_here
 
+from tactile_bayes.campaign.inputs import open_campaign
+from tactile_bayes.campaign.steps import Task, run_step
+from tactile_bayes.campaign.tables import Row
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.manifest_csv import Exam as Listed
-from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.pipeline.campaign_folder import open_campaign
-from tactile_bayes.pipeline.campaign_steps import Task, run_step
-from tactile_bayes.pipeline.campaign_tables import Row
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 FAST = ("--method", "laplace")

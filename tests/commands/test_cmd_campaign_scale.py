@@ -17,9 +17,10 @@ import pytest
 from campaign_files import ROWS, contents, rows_of, steps, write_study, write_table
 from in_process import run_here
 
+from tactile_bayes.campaign import inputs as campaign_inputs
+from tactile_bayes.campaign import report as campaign_report
+from tactile_bayes.campaign import run as campaigns
 from tactile_bayes.files import remote
-from tactile_bayes.pipeline import campaign as campaigns
-from tactile_bayes.pipeline import campaign_inputs, campaign_report
 
 FAST = ("--method", "laplace")
 

@@ -12,9 +12,9 @@ from in_process import run_here
 from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import load_schema
 from tactile_bayes.files.tables import read_table
 
 HEAD = "file,patient,visit,mass,replicate,date,side"

@@ -13,17 +13,16 @@ from posterior_maps import bump_map
 from settings_files import settings
 
 import tactile_bayes as tb
-from tactile_bayes.commands.visits_command import numbered
+from tactile_bayes.commands.compare import numbered
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
+from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import check_document
 from tactile_bayes.geometry import rigid
-from tactile_bayes.inference.normal import normal_quantile
+from tactile_bayes.inference.points import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare_document import verdict
-from tactile_bayes.report.compare_text import _signed, compare_summary
+from tactile_bayes.report.compare import _signed, compare_summary, verdict
 from tactile_bayes.size.visits import Change
 
 FAST = ("--method", "laplace")

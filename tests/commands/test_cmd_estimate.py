@@ -18,7 +18,7 @@ from posterior_files import write_calibration, write_maps
 from settings_files import settings
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.schema import check_document, load_schema
+from tactile_bayes.files.documents import check_document, load_schema
 
 Run = Callable[..., "CompletedProcess[str]"]
 FAST = ("--method", "laplace")
@@ -125,7 +125,7 @@ def kill_worker_of_b(path: Path, *, settings: Any) -> Any:
     import os
     import signal
 
-    from tactile_bayes.pipeline.one_map import answer_file
+    from tactile_bayes.api.estimating import answer_file
 
     if path.name == "b.nc":
         os.kill(os.getpid(), signal.SIGKILL)
@@ -374,7 +374,7 @@ def test_a_map_of_far_too_many_cells_is_told_before_the_work(folder: Path, monke
     words = ("estimate", "a.nc", *FAST, "--size-calibration", "size.json", "--json")
     plain = run_here(*words, cwd=folder)
     assert plain.stderr == ""
-    monkeypatch.setattr("tactile_bayes.mapping.fine_cells.MANY_CELLS", 500)
+    monkeypatch.setattr("tactile_bayes.mapping.map.MANY_CELLS", 500)
     told = run_here(*words, cwd=folder)
     assert told.stderr.startswith("a.nc: about ")
     assert told.stderr.count("\n") == 1

@@ -14,6 +14,7 @@ from map_files import assert_same
 from posterior_files import MADE
 from posterior_maps import bump_map
 
+from tactile_bayes.api.size_calibration import table_recipe
 from tactile_bayes.commands import population
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
@@ -22,9 +23,8 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.forward.scene import Head, Lump, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.head_shape import DEFAULT_HEAD, HeadShape
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.pipeline.size_calibration import table_recipe
+from tactile_bayes.scan import DEFAULT_HEAD, HeadShape
 from tactile_bayes.studies.population import MassRow, head_columns
 
 FLAT = Head(rows=12, columns=12, pitch_mm=2.0, radius_mm=100_000.0)

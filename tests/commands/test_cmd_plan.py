@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 import tactile_bayes
 from tactile_bayes.commands.plan import command
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.schema import check_document
+from tactile_bayes.files.documents import check_document
 from tactile_bayes.presets import RESEARCH_USE
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo"

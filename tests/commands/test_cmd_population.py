@@ -13,10 +13,9 @@ from tactile_bayes.commands import population
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.forward.population import BodyPrior, centred, draw_mass
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.studies.population import MassRow, head_columns, measure_mass
+from tactile_bayes.studies.population import BodyPrior, MassRow, centred, draw_mass, head_columns, measure_mass
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
 

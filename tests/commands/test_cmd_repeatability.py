@@ -12,7 +12,7 @@ from in_process import run_here
 from repeated_exams import shape, write_done, write_exam, write_repeats
 
 import tactile_bayes as tb
-from tactile_bayes.files.schema import check_document
+from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.shipped import size_calibration_path
 
 FAST = ("--method", "laplace")

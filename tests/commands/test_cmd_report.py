@@ -16,7 +16,7 @@ from tactile_bayes.commands import report as command
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.report import printed
+from tactile_bayes.report import exam_page as printed
 
 DEMO = Path(__file__).resolve().parents[2] / "tactile_bayes" / "demo" / "scan.mcap"
 
@@ -63,14 +63,14 @@ def test_the_json_of_an_estimate_gives_the_same_page_without_estimating(
 ) -> None:
     assert run_here("report", "a.nc", "-o", "alone.html", cwd=folder).returncode == 0
 
-    monkeypatch.setattr("tactile_bayes.pipeline.exam_report.estimate_one", None)
+    monkeypatch.setattr("tactile_bayes.api.exam_report.estimate_one", None)
     done = run_here("report", "a.json", "a.nc", "-o", "both.html", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert (folder / "both.html").read_bytes() == (folder / "alone.html").read_bytes()
 
 
 def test_a_posterior_gives_the_page_of_its_estimate(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactile_bayes.pipeline.exam_report.estimate_one", None)
+    monkeypatch.setattr("tactile_bayes.api.exam_report.estimate_one", None)
     run_here("report", "a.json", "a.nc", "-o", "by_json.html", cwd=folder)
     done = run_here("report", "a.nc", "post.nc", "-o", "by_posterior.html", cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -189,7 +189,9 @@ def test_a_browser_that_fails_is_one_line(folder: Path, monkeypatch: pytest.Monk
 
 
 def test_the_printed_file_is_private_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactile_bayes.report.printed.find_printer", lambda: lambda page: b"%PDF-" + page[:9].encode())
+    monkeypatch.setattr(
+        "tactile_bayes.report.exam_page.find_printer", lambda: lambda page: b"%PDF-" + page[:9].encode()
+    )
     assert run_here("report", "a.nc", "-o", "p.html", "--pdf", "p.pdf", cwd=folder).returncode == 0
     assert (folder / "p.pdf").read_bytes() == b"%PDF-<!doctype"
     assert (folder / "p.pdf").stat().st_mode & 0o777 == 0o600

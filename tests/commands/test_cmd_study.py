@@ -55,8 +55,8 @@ def test_processes_make_no_difference(folder: Path, run_cli: Run) -> None:
 
 
 def test_the_table_is_one_that_calibrate_reads(folder: Path) -> None:
+    from tactile_bayes.api.size_calibration import size_table
     from tactile_bayes.files.tables import read_table
-    from tactile_bayes.pipeline.size_calibration import size_table
 
     table = read_table(folder / "study.csv", "size_table.table.json")
     assert table.columns["detectable"] == [True] * 9
@@ -181,8 +181,8 @@ def test_four_figures_are_drawn(folder: Path, run_cli: Run) -> None:
 
 
 def test_a_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
-    from tactile_bayes.forward.plane.study import StudyRow
-    from tactile_bayes.report.study_figures import figure_8
+    from tactile_bayes.report.study import figure_8
+    from tactile_bayes.studies.paper import StudyRow
 
     rows = [
         StudyRow("centred", d, h, 100.0, 0.3 / h**3, d * h / 4, 0.01, True) for d in (5.0, 15.0) for h in (0.6, 1.0)

@@ -12,8 +12,9 @@ import pytest
 
 from tactile_bayes.errors import EXIT_BAD_DATA
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.forward.plane.study import LineFit
-from tactile_bayes.forward.plane.tables import (
+from tactile_bayes.report.tables_text import heads_text, tables_text
+from tactile_bayes.studies.paper import LineFit
+from tactile_bayes.studies.paper_tables import (
     NEAREST_HEADS,
     OTHER_DEFINITIONS,
     PRINTED_FRAMES,
@@ -26,7 +27,6 @@ from tactile_bayes.forward.plane.tables import (
     table_distance,
     table_scenes,
 )
-from tactile_bayes.report.tables_text import heads_text, tables_text
 
 Run = Callable[..., "CompletedProcess[str]"]
 

@@ -14,7 +14,7 @@ from synthetic_trial import excision_csv, trial_csv
 import tactile_bayes
 from tactile_bayes.commands.validate import command
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError, UsageError
-from tactile_bayes.files.schema import check_document
+from tactile_bayes.files.documents import check_document
 from tactile_bayes.presets import RESEARCH_USE
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo"

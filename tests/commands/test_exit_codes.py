@@ -11,7 +11,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes import errors
-from tactile_bayes.interruption import ended_in_order
+from tactile_bayes.shell import ended_in_order
 from tests.conftest import ROOT
 
 INTERRUPTED = """

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.exports.identity import Identity, Moment
-from tactile_bayes.exports.worklist import read_worklist
+from tactile_bayes.exports.identity import Identity, Moment, read_worklist
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.bodies_toml import read_bodies
-from tactile_bayes.files.schema import load_schema
-from tactile_bayes.forward.population import BodyPrior, ExamPrior, draw_mass
+from tactile_bayes.files.documents import load_schema, read_bodies
+from tactile_bayes.studies.population import BodyPrior, ExamPrior, draw_mass
 
 
 def written(folder: Path, text: str) -> Path:

@@ -14,7 +14,7 @@ from repeated_exams import estimate_document
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.estimate_json import MOST_MM, SCHEMAS, check_estimate
-from tactile_bayes.report.exam_ruler import size_ruler
+from tactile_bayes.report.svg import size_ruler
 
 FIELDS = ("kind", "text", "remedy", "on_paper", "about")
 

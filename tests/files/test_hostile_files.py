@@ -16,23 +16,20 @@ import pytest
 
 from tactile_bayes.batch_store import open_store
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.arrays_npz import read_arrays
-from tactile_bayes.files.checkpoint_npz import CheckpointFile
 from tactile_bayes.files.column_map import read_mapping
-from tactile_bayes.files.documents import parse_toml
-from tactile_bayes.files.grid_import import read_grid
+from tactile_bayes.files.documents import parse_toml, read_protocol, read_settings
+from tactile_bayes.files.estimate_json import read_stated_size
 from tactile_bayes.files.identify import describe
+from tactile_bayes.files.imports import read_arrays, read_grid
 from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
-from tactile_bayes.files.protocol import read_protocol
+from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.files.scene_toml import read_scene
-from tactile_bayes.files.settings_toml import read_settings
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.files.size_posterior import read_stated_size
 from tactile_bayes.files.tables import read_table
-from tactile_bayes.inference.chain_state import ChainState
+from tactile_bayes.inference.ensemble import ChainState
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tactile_bayes"
 SCAN = PACKAGE / "demo" / "scan.mcap"

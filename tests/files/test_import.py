@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.arrays_npz import read_arrays
-from tactile_bayes.files.grid_import import read_grid
+from tactile_bayes.files.imports import read_arrays, read_grid
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.posterior.lump.cells import window_cells
+from tactile_bayes.posterior.fit_window import window_cells
 
 Arrays = dict[str, Any]
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from tactile_bayes.files.grid_import import read_grid
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.files.imports import read_grid
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate

@@ -18,7 +18,7 @@ from map_files import PROVENANCE, assert_same, plain_map
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.map_nc import read_map, write_map
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
 ENGINES = ("netcdf4", "h5netcdf")
 

@@ -22,7 +22,7 @@ from mapping_scans import rotation
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.map_nc import SCHEMA, read_map, read_map_header, write_map
 from tactile_bayes.geometry import rigid
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
 FINITE = st.floats(-1e12, 1e12)  # larger ones are refused where a file is read
 MODERATE = st.floats(-1e6, 1e6)

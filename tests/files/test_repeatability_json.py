@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from repeated_exams import write_repeats
 
+from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.repeatability_json import read_repeatability
-from tactile_bayes.pipeline.repeatability import exams_in, learn_from_exams
 
 
 @pytest.fixture(scope="module")

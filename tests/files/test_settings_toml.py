@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.schema import load_schema
-from tactile_bayes.files.settings_toml import PRIORS, read_settings
-from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.files.documents import PRIORS, load_schema, read_settings
+from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES, MOST_FIELD_COSINES
 
 

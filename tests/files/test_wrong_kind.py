@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 from tactile_bayes.cli import cli
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.kinds import kind_of
 from tactile_bayes.files.map_nc import read_map
+from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import read_size_calibration
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import tactile_bayes
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
-from tactile_bayes.files.schema import load_schema
 from tactile_bayes.forward import scene as scene_types
 from tactile_bayes.forward.instrument import head_positions, level_kpa
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, SceneLandmarks, Strokes, Taxels, Tracker

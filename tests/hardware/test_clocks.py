@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from tactile_bayes.errors import BadDataError, DeviceError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter, read_scan
-from tactile_bayes.hardware.account import Report
 from tactile_bayes.hardware.clocks import (
     HEAD_STILL_NS,
     LATEST_NS,
@@ -23,7 +22,7 @@ from tactile_bayes.hardware.clocks import (
     wrap_period,
 )
 from tactile_bayes.hardware.readings import MOST_LOST, EndReading, FrameReading, PoseReading, SequenceCheck
-from tactile_bayes.hardware.recorder import Line, Recorder
+from tactile_bayes.hardware.recorder import Line, Recorder, Report
 
 S = 1_000_000_000
 FRAME_NS = S // 200

@@ -12,14 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError, DeviceError
-from tactile_bayes.hardware.framing import Packet, PacketParser, cobs_decode, cobs_encode, encode_packet
 from tactile_bayes.hardware.head import (
     HeadParser,
+    Packet,
+    PacketParser,
     check_link_rate,
+    cobs_decode,
+    cobs_encode,
     encode_command,
     encode_end,
     encode_frame,
     encode_hello,
+    encode_packet,
     encode_pose,
     frame_bytes_on_wire,
     needed_baud,

@@ -11,9 +11,8 @@ from emulated_devices import short_scan
 from test_resync import NAMES, parser_of, stream_of
 
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedHead, EmulatedTracker
-from tactile_bayes.hardware.emulated_ndi import EmulatedNdi
-from tactile_bayes.hardware.framing import encode_packet
+from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedHead, EmulatedNdi, EmulatedTracker
+from tactile_bayes.hardware.head import encode_packet
 from tactile_bayes.hardware.readings import HelloReading
 
 MEGABYTE = 1 << 20

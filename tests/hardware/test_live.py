@@ -21,14 +21,22 @@ from websockets.sync.client import connect
 
 from tactile_bayes.commands.live_view import Turn, live_estimate
 from tactile_bayes.errors import UsageError
-from tactile_bayes.hardware.account import Report
-from tactile_bayes.hardware.feed import Feed, FeedReader, SeenFrame, SeenLandmark, SeenPose
-from tactile_bayes.hardware.live import LiveMap, LiveState, grey_levels
+from tactile_bayes.hardware.live import (
+    Feed,
+    FeedReader,
+    LiveMap,
+    LiveState,
+    SeenFrame,
+    SeenLandmark,
+    SeenPose,
+    grey_levels,
+)
 from tactile_bayes.hardware.readings import PoseReading
+from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.hardware.serve import LiveServer, address_of, document
-from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator
-from tactile_bayes.mapping.poses import poses_at
-from tactile_bayes.report.live_text import colours_wanted, live_line, live_text
+from tactile_bayes.mapping.growing import Instrument, MapAccumulator
+from tactile_bayes.mapping.plane import poses_at
+from tactile_bayes.report.live import colours_wanted, live_line, live_text
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,7 @@ from emulated_devices import serving, short_scan
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware import ndi
 from tactile_bayes.hardware.drivers import TRACKERS, open_tracker
-from tactile_bayes.hardware.emulated import EmulatedHead
-from tactile_bayes.hardware.emulated_ndi import EmulatedNdi, crc16
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, crc16
 from tactile_bayes.hardware.emulator import PtyLink, TcpLink
 from tactile_bayes.hardware.ndi import NdiTracker
 from tactile_bayes.hardware.readings import HelloReading, PoseReading

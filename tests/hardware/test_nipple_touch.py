@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from test_orientation import scan_of
 
-from tactile_bayes.commands.record_keys import Keys
-from tactile_bayes.commands.record_parts import calibration_age
-from tactile_bayes.hardware.feed import SeenFrame, SeenLandmark, SeenPose
-from tactile_bayes.hardware.live import LiveMap
+from tactile_bayes.commands.record import Keys, calibration_age
+from tactile_bayes.hardware.live import LiveMap, SeenFrame, SeenLandmark, SeenPose
 
 
 @pytest.mark.parametrize(("key", "name"), [("n", "sternal_notch"), ("x", "xiphoid"), ("p", "nipple")])

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from mapping_scans import gaussian, make_scan, strokes
 
-from tactile_bayes.hardware.feed import SeenFrame, SeenLandmark, SeenPose
-from tactile_bayes.hardware.live import LiveMap, LiveState
+from tactile_bayes.hardware.live import LiveMap, LiveState, SeenFrame, SeenLandmark, SeenPose
 from tactile_bayes.hardware.serve import document
 from tactile_bayes.mapping import build_map
-from tactile_bayes.mapping.orientation import orientation_of
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.posterior.abstention import missing_strokes
-from tactile_bayes.report.live_text import live_text
+from tactile_bayes.report.live import live_text
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.scan import Landmarks, Scan
 

@@ -25,9 +25,9 @@ from tactile_bayes.hardware import reading
 from tactile_bayes.hardware.clocks import ArrivalClock, PoseClock
 from tactile_bayes.hardware.drivers import TRACKERS
 from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedTracker, Faults
-from tactile_bayes.hardware.landmarks import LandmarkTouch
 from tactile_bayes.hardware.ports import Port, shown
 from tactile_bayes.hardware.readings import PoseReading
+from tactile_bayes.hardware.recorder import LandmarkTouch
 from tactile_bayes.hardware.streams import Stream, read_in_process
 
 

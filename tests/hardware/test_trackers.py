@@ -12,18 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_bayes.geometry import quaternion_from_rotation, rotation_from_quaternion
-from tactile_bayes.hardware.bird import BirdParser, record_bytes
-from tactile_bayes.hardware.crc64 import crc64
 from tactile_bayes.hardware.head import HeadParser, encode_pose
-from tactile_bayes.hardware.igtlink import IgtlinkParser, encode_transform
-from tactile_bayes.hardware.polhemus import (
+from tactile_bayes.hardware.igtlink import IgtlinkParser, crc64, encode_transform
+from tactile_bayes.hardware.readings import PoseReading
+from tactile_bayes.hardware.serial_trackers import (
     FASTRAK_ASCII,
+    BirdParser,
     FastrakParser,
     LibertyAsciiParser,
     LibertyParser,
     quaternion_from_euler,
+    record_bytes,
 )
-from tactile_bayes.hardware.readings import PoseReading
 
 AS_AFTER_A_RESET = (2, 4, 1)
 """Records of a FASTRAK that nobody asked for others: position and Euler angles."""

@@ -9,11 +9,11 @@ import pytest
 from posterior_maps import bump_map, find_bump
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
-from tactile_bayes.inference.cache import Solution, Solved
-from tactile_bayes.posterior.correlated.draw import draw_scene
-from tactile_bayes.posterior.correlated.fit import FieldFit
-from tactile_bayes.posterior.lump.bump import Bump, BumpPrior
-from tactile_bayes.posterior.lump.cells import window_cells
+from tactile_bayes.inference.draws import Solution, Solved
+from tactile_bayes.posterior.bump import Bump, BumpPrior
+from tactile_bayes.posterior.draw import draw_scene
+from tactile_bayes.posterior.fit import FieldFit
+from tactile_bayes.posterior.fit_window import window_cells
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 

@@ -15,10 +15,9 @@ from nist import DATASETS, Certified, read
 
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
-from tactile_bayes.inference.laplace import laplace, mode_and_covariance
-from tactile_bayes.inference.optimise import optimise
-from tactile_bayes.posterior.white.residuals import ErrorModel
-from tactile_bayes.posterior.white.target import Target, flat_prior
+from tactile_bayes.inference.modes import laplace, mode_and_covariance, optimise
+from tactile_bayes.posterior.detection import ErrorModel
+from tactile_bayes.posterior.white import Target, flat_prior
 
 DOF = 242.0
 T_FACTOR = np.sqrt(DOF / (DOF - 2))

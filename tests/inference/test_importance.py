@@ -10,15 +10,16 @@ from scipy.stats import genpareto, qmc
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import (
+    TRUSTED_SHAPE,
+    Gaussians,
     ImportanceOptions,
+    fit_generalised_pareto,
     importance,
+    smooth_weights,
     systematic,
     weighted_quantile,
 )
-from tactile_bayes.inference.normal import normal_quantile
-from tactile_bayes.inference.pareto import TRUSTED_SHAPE, fit_generalised_pareto, smooth_weights
-from tactile_bayes.inference.proposal import Gaussians
-from tactile_bayes.inference.sobol import BITS, MOST_DIMENSIONS, shifted_sobol, sobol_integers
+from tactile_bayes.inference.points import BITS, MOST_DIMENSIONS, normal_quantile, shifted_sobol, sobol_integers
 
 MEAN = np.array([1.0, -2.0, 0.5])
 COVARIANCE = np.array([[1.0, 0.6, 0.1], [0.6, 2.0, -0.3], [0.1, -0.3, 0.5]])

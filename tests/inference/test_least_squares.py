@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from nist import DATASETS, read
 from scipy.optimize import least_squares
 
-from tactile_bayes.inference.least_squares import fit_least_squares, inverse_information, numerical_jacobian
+from tactile_bayes.inference.modes import fit_least_squares, inverse_information, numerical_jacobian
 
 SIX_DIGITS = 1e-6
 

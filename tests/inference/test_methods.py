@@ -10,17 +10,15 @@ from posterior_maps import TRUTH, bump_map, correlated_field
 from scipy.stats import kstest, t
 
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.inference.derivatives import finite_differences, stencil
 from tactile_bayes.inference.draws import ParameterDraws, student_draws
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
-from tactile_bayes.inference.laplace import find_mode, laplace, mode_and_covariance
-from tactile_bayes.inference.optimise import optimise
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.inference.modes import find_mode, finite_differences, laplace, mode_and_covariance, optimise, stencil
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.detection import ErrorModel
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white.residuals import ErrorModel
-from tactile_bayes.posterior.white.target import Target, flat_prior
+from tactile_bayes.posterior.white import Target, flat_prior
 from tactile_bayes.presets import METHODS
 
 ROWS, DIMENSION = 30, 3

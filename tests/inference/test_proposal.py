@@ -8,9 +8,8 @@ from scipy.optimize import brentq
 from scipy.stats import multivariate_normal, norm
 
 from tactile_bayes.errors import NotConvergedError
-from tactile_bayes.inference import adaptation
-from tactile_bayes.inference.importance import STRETCH, TOO_WIDE, importance
-from tactile_bayes.inference.proposal import Gaussians, Proposal
+from tactile_bayes.inference import importance as adaptation
+from tactile_bayes.inference.importance import STRETCH, TOO_WIDE, Gaussians, Proposal, importance
 
 P, WIDE_SHARE, WIDE_SD = 4, 0.03, 3.0
 PARTS = Gaussians(

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from tactile_bayes.inference.summary import quantiles_of, summarise
-from tactile_bayes.report.size_text import decimals
+from tactile_bayes.inference.draws import quantiles_of, summarise
+from tactile_bayes.report.estimate_text import decimals
 
 N = 40_000
 NORMAL = 10.0 + 2.0 * np.random.default_rng(41).standard_normal(N)

@@ -13,9 +13,9 @@ from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.geometry import apply, rigid
 from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid, TactileMap, build_map
-from tactile_bayes.mapping.poses import FramePoses
+from tactile_bayes.mapping.plane import FramePoses
 from tactile_bayes.posterior.options import FitOptions
-from tactile_bayes.posterior.white.fit import fit_bump
+from tactile_bayes.posterior.white import fit_bump
 from tactile_bayes.scan import Scan
 
 TRUE_POSES = Noise(tracker_mm=0.0, tracker_deg=0.0)

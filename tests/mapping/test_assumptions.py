@@ -12,8 +12,8 @@ from benchmarks.stress_frames import on_sphere
 from tactile_bayes.forward.instrument import head_positions
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.mapping.assumptions import broken_assumptions, skewed
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.map import broken_assumptions, skewed
 from tactile_bayes.scan import PressureFrames, Scan
 
 TRUE_POSES = Noise(element_kpa=0.1, tracker_mm=0.0, tracker_deg=0.0)

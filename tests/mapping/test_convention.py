@@ -13,7 +13,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from tactile_bayes.mapping import build_map, convention
 from tactile_bayes.mapping.convention import CONVENTIONS, check_convention
-from tactile_bayes.mapping.frames import SelectedFrames, select_frames
+from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scan import HeadGeometry, Scan, TrackerPoses
 

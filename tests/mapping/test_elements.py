@@ -8,7 +8,7 @@ import mapping_scans as scans
 import numpy as np
 import pytest
 
-from tactile_bayes.mapping.elements import find_faults
+from tactile_bayes.mapping.select import find_faults
 from tactile_bayes.scan import ElementCalibration, Scan
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from posterior_maps import bump_map, grid_map
 
-from tactile_bayes.mapping.fine_cells import MANY_CELLS, many_cells
+from tactile_bayes.mapping.map import MANY_CELLS, many_cells
 
 
 def test_a_map_of_very_fine_cells_is_told_with_cells_that_would_do() -> None:

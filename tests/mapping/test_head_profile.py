@@ -12,25 +12,27 @@ import pytest
 from numpy.polynomial import legendre
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.arrays_npz import read_arrays
+from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.files.shipped import DEFAULT, size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.forward.scene import Background, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
-from tactile_bayes.mapping.accumulator import Instrument, MapAccumulator, MapGrid
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.frame_marks import NO_LIMIT, frame_marks, marks_limit
-from tactile_bayes.mapping.head_profile import (
+from tactile_bayes.mapping.cells import Readout
+from tactile_bayes.mapping.growing import Instrument, MapAccumulator, MapGrid
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.plane import poses_at
+from tactile_bayes.mapping.profile import (
     LEAST_FRAMES,
     MOST_FRAMES,
+    NO_LIMIT,
     GrowingProfile,
     ProfileReader,
+    frame_marks,
+    marks_limit,
     profile_figures,
 )
-from tactile_bayes.mapping.poses import poses_at
-from tactile_bayes.mapping.readout import Readout
-from tactile_bayes.mapping.tactile_map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.presets import HEAD_PROFILE

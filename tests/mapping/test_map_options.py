@@ -10,8 +10,8 @@ import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping import build_map
-from tactile_bayes.mapping.advice import advise_cell
-from tactile_bayes.mapping.timing import timing_figures
+from tactile_bayes.mapping.map import advise_cell
+from tactile_bayes.mapping.select import timing_figures
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scan import ElementCalibration, Landmarks, PressureFrames, Scan, TrackerPoses
 

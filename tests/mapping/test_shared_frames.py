@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid, build_map
-from tactile_bayes.mapping.poses import poses_at
-from tactile_bayes.mapping.shared_frames import LEAST_SHARE
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.errors import LEAST_SHARE
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.plane import poses_at
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scan import Scan
 

@@ -11,8 +11,8 @@ import pytest
 import tactile_bayes as tb
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping import build_map
-from tactile_bayes.mapping.coarse_frames import POOL_S, every_stretch, thinning
-from tactile_bayes.mapping.thinning import every_nth, first_seconds
+from tactile_bayes.mapping.convention import POOL_S, every_stretch, thinning
+from tactile_bayes.mapping.select import every_nth, first_seconds
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.scan import PressureFrames
 

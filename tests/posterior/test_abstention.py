@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map, bump_values, grid_map
 
-from tactile_bayes.abstention import CODES, NO_LUMP
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import NotConvergedError, UsageError
+from tactile_bayes.errors import CODES, NO_LUMP, NotConvergedError, UsageError
+from tactile_bayes.posterior import draw as methods
 from tactile_bayes.posterior import estimate, search
 from tactile_bayes.posterior.abstention import extend_advice, missing_strokes, no_bump, shape_fault
-from tactile_bayes.posterior.correlated import draw as methods
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.lump_probability import Weighed
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white.detection import Detection
-from tactile_bayes.posterior.white.fit import Candidate, fit_bump
+from tactile_bayes.posterior.white import Candidate, fit_bump
 from tactile_bayes.report.estimate_text import estimate_text
 
 FIELD = FitOptions(background="free", noise="field")

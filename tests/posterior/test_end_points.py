@@ -18,10 +18,10 @@ from scipy.stats import t as student
 
 from tactile_bayes.inference.draws import END_ERROR
 from tactile_bayes.inference.importance import importance
-from tactile_bayes.inference.laplace import mode_and_covariance
-from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
-from tactile_bayes.posterior.correlated.fit import FieldFit
-from tactile_bayes.posterior.correlated.scene import Scene
+from tactile_bayes.inference.modes import mode_and_covariance
+from tactile_bayes.posterior.draw import Sampled, importance_draws
+from tactile_bayes.posterior.fit import FieldFit
+from tactile_bayes.posterior.scene import Scene
 from tests.inference.test_methods import LINEAR
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 from tests.posterior.correlated.test_scene_draws import half_covered, strong, weak

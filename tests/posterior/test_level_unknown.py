@@ -16,10 +16,10 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.white.fit import default_errors, fit_bump
+from tactile_bayes.posterior.white import default_errors, fit_bump
 
 UNIT = 37.0
 SLOPE = 0.002 * (np.arange(41) - 20.0)

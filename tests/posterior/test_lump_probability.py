@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, grid_map
 
+from tactile_bayes.posterior.detection import detection_from_odds
 from tactile_bayes.posterior.lump_probability import LIKELY, Weighed, weigh
-from tactile_bayes.posterior.white.detection import detection_from_odds
 
 CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4.5), "fault": ""}
 

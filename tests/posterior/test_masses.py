@@ -14,20 +14,20 @@ from posterior_maps import bump_values, correlated_field, grid_map
 
 import tactile_bayes as tb
 from tactile_bayes.api.estimates import SizeEstimate
+from tactile_bayes.api.estimating import Outcome, answer_of, estimate_one
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import check_document
 from tactile_bayes.findings import Finding
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import Outcome, answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import masses as masses_module
+from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import by_evidence, with_masses
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate, Mass, ModalBump, Rise
-from tactile_bayes.posterior.white.detection import Detection
 from tactile_bayes.size.draws import SizePosterior
 
 WIDE, NARROW = (-17.0, 2.0), (16.0, 2.0)

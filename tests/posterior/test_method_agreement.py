@@ -7,9 +7,8 @@ import pytest
 
 from benchmarks.method_agreement import MAPS, differences, fit_of, rms, under_other_prior
 from tactile_bayes.inference import importance as sampling
-from tactile_bayes.inference.importance import TOO_WIDE
-from tactile_bayes.inference.proposal import Gaussians
-from tactile_bayes.posterior.correlated.draw import Sampled, importance_draws
+from tactile_bayes.inference.importance import TOO_WIDE, Gaussians
+from tactile_bayes.posterior.draw import Sampled, importance_draws
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ from in_process import run_here
 from posterior_maps import bump_values, correlated_field, grid_map
 
 import tactile_bayes as tb
+from tactile_bayes.api.pooled import apart_from_others, elsewhere, one_place
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_mass import apart_from_others, elsewhere, one_place
+from tactile_bayes.mapping.map import TactileMap
 
 FAST = ("--method", "laplace")
 CALIBRATION = "solid"

@@ -14,8 +14,8 @@ from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.masses import _stands_out, other_rises
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.other_rises import _stands_out, other_rises
 from tactile_bayes.posterior.result import Estimate, Rise
 
 HALF_MM = 35.0
@@ -80,7 +80,7 @@ def test_a_place_without_a_mode_is_no_rise(monkeypatch: pytest.MonkeyPatch) -> N
     def no_mode(*_: object, **__: object) -> None:
         raise NotConvergedError("no mode")
 
-    monkeypatch.setattr("tactile_bayes.posterior.correlated.estimate.look", no_mode)
+    monkeypatch.setattr("tactile_bayes.posterior.correlated.look", no_mode)
     assert other_rises(tactile_map, found, options) == ()
 
 

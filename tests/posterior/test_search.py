@@ -8,13 +8,13 @@ from posterior_maps import bump_map, bump_values, grid_map
 from scipy.ndimage import gaussian_filter
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import search
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.lump.cells import levelled
+from tactile_bayes.posterior.fit_window import levelled
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white.fit import BumpFit
+from tactile_bayes.posterior.white import BumpFit
 
 FIELD = EstimateOptions(method="laplace", fit=FitOptions("free", 20.0, "off", None, "field"))
 

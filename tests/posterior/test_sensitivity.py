@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.sensitivity import prior_sensitivity
-from tactile_bayes.report.scene_text import prior_line, sensitivity_line
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.result import prior_sensitivity
+from tactile_bayes.report.estimate_document import prior_line, sensitivity_line
 
 
 def test_every_prior_is_printed() -> None:

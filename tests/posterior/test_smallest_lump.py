@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, grid_map
 
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.lump_probability import WIDTHS_MM, needed_amplitudes, smallest_lumps
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.smallest_lump import WIDTHS_MM, needed_amplitudes, smallest_lumps
 
 FIELD = EstimateOptions(method="laplace", fit=FitOptions(background="free", noise="field"), draws=400)
 

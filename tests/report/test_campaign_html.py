@@ -14,7 +14,7 @@ from posterior_maps import bump_map
 from tactile_bayes.findings import Finding
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card, campaign_html, worst
-from tactile_bayes.report.thumbnail import LONGEST_PX, thumbnail_png
+from tactile_bayes.report.svg import LONGEST_PX, thumbnail_png
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></article></main>"
 SIZE = {"median": 14.0, "low": 12.0, "high": 17.5, "probability": 0.95, "sd": 1.4}
@@ -111,7 +111,7 @@ def test_a_thumbnail_is_small_whatever_the_map(shape: tuple[int, int]) -> None:
 
     from PIL import Image
 
-    from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+    from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
     ny, nx = shape
     values = 1.0 + 0.01 * np.random.default_rng(1).standard_normal(shape)

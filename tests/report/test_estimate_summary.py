@@ -15,23 +15,23 @@ from posterior_maps import bump_values, correlated_field, grid_map
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding
-from tactile_bayes.inference.summary import summarise
-from tactile_bayes.mapping.assumptions import broken_assumptions
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.correlated.selection import Structure
+from tactile_bayes.inference.draws import summarise
+from tactile_bayes.mapping.map import TactileMap, broken_assumptions
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.posterior.result import Estimate, Mass
-from tactile_bayes.posterior.sensitivity import Sensitivity
+from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
+from tactile_bayes.posterior.selection import Structure
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_summary import MOST_LINES, estimate_summary
-from tactile_bayes.report.estimate_text import estimate_text
-from tactile_bayes.report.masses_document import masses_document
-from tactile_bayes.report.narrowing import joined, width_lines
+from tactile_bayes.report.estimate_document import _change, masses_document, sensitivity_line, supposed_line
+from tactile_bayes.report.estimate_text import (
+    MOST_LINES,
+    decimals,
+    estimate_summary,
+    estimate_text,
+    joined,
+    width_lines,
+)
 from tactile_bayes.report.quantities import estimate_quantities
-from tactile_bayes.report.scene_text import _change, sensitivity_line
-from tactile_bayes.report.size_text import decimals
-from tactile_bayes.report.supposed_text import supposed_line
 
 
 def mass(seed: int, *, amplitude: float = 0.4, second: float = 0.0, **made) -> TactileMap:

@@ -24,9 +24,14 @@ from in_process import run_here
 from posterior_maps import bump_map
 
 import tactile_bayes as tb
-from tactile_bayes.api.comparisons import Comparison
+from tactile_bayes.api.comparing import ComparedOutcome, Comparison, drawn_maps
 from tactile_bayes.api.estimates import PooledSize, SizeEstimate
+from tactile_bayes.api.estimating import answer_of, estimate_one
+from tactile_bayes.api.exam_report import EstimatedMap, Given, make_exam
 from tactile_bayes.api.maps import Map
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.campaign.match import growth_text
+from tactile_bayes.campaign.tables import Row, done_text
 from tactile_bayes.exports.exam import MapFile, estimate_of
 from tactile_bayes.exports.fhir import bundle_of
 from tactile_bayes.exports.identity import Identity
@@ -39,19 +44,12 @@ from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import KINDS, LEADS, Finding, by_weight, verdict
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.overlap import scan_findings
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
-from tactile_bayes.pipeline.campaign_growth import growth_text
-from tactile_bayes.pipeline.campaign_tables import Row, done_text
-from tactile_bayes.pipeline.compared import ComparedOutcome, drawn_maps
-from tactile_bayes.pipeline.exam_report import EstimatedMap, Given, make_exam
-from tactile_bayes.pipeline.one_map import answer_of, estimate_one
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.report.campaign_html import SIZED, Card, campaign_html
+from tactile_bayes.report.compare import Growth, compare_summary, compare_text, of_document
 from tactile_bayes.report.compare_figure import draw_comparison
-from tactile_bayes.report.compare_text import compare_summary, compare_text
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.growth import Growth, of_document
 from tactile_bayes.report.map_figure import map_figure
 from tactile_bayes.report.map_text import map_text
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
@@ -171,7 +169,7 @@ def exam_words(made: Made, *, several: bool) -> str:
 
 def nrrd(made: Made) -> str:
     pytest.importorskip("nrrd")
-    from tactile_bayes.exports.nrrd_map import nrrd_bytes
+    from tactile_bayes.exports.nrrd import nrrd_bytes
 
     return nrrd_bytes(made.map_file).partition(b"\n\n")[0].decode()
 

@@ -20,12 +20,10 @@ from mapping_scans import gaussian, make_scan, strokes
 import tactile_bayes as tb
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.exam import Exam, exam_map
-from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.exam_words import headline, reach_text
-from tactile_bayes.report.printed import BROWSERS, find_printer
+from tactile_bayes.report.exam_page import BROWSERS, exam_page, find_printer
+from tactile_bayes.report.exam_words import Exam, exam_map, headline, reach_text
 from tactile_bayes.scan import Landmarks
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></svg></body>"

@@ -12,12 +12,12 @@ import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import rigid
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
+from tactile_bayes.report import estimate_figures as sizes
 from tactile_bayes.report import map_figure as maps
-from tactile_bayes.report import size_figure as sizes
+from tactile_bayes.report.estimate_figures import SizeInterval, size_figure
 from tactile_bayes.report.map_figure import FitContour, Place, map_figure
 from tactile_bayes.report.posterior_figures import corner_figure
-from tactile_bayes.report.size_figure import SizeInterval, size_figure
 
 INTERVALS = {
     "max": SizeInterval(12.0, 18.0, 0.95, "equal-tailed"),
@@ -322,7 +322,7 @@ def test_no_window_system_is_asked_for(run_python, tmp_path):
         [
             "import sys, numpy as np",
             "from pathlib import Path",
-            "from tactile_bayes.report.size_figure import size_figure",
+            "from tactile_bayes.report.estimate_figures import size_figure",
             "r = np.random.default_rng(0)",
             "size_figure(r.normal(15, 1, 99), r.normal(12, 1, 99), Path('s.png'), intervals={})",
             "assert 'matplotlib.pyplot' not in sys.modules, 'pyplot'",
@@ -338,7 +338,7 @@ def test_every_command_that_draws_refuses_another_suffix_before_any_work():
     import click
 
     from tactile_bayes.cli import COMMANDS
-    from tactile_bayes.commands.figure_path import FigurePath
+    from tactile_bayes.commands.options import FigurePath
 
     def commands(command: click.Command) -> list[click.Command]:
         if not isinstance(command, click.Group):

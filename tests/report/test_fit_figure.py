@@ -13,8 +13,8 @@ import tactile_bayes as tb
 from tactile_bayes.api.estimates import SizeEstimate
 from tactile_bayes.api.maps import Map
 from tactile_bayes.files.posterior_nc import read_posterior
-from tactile_bayes.posterior.fitted import fitted_cells
-from tactile_bayes.report.figure_title import named_exam
+from tactile_bayes.posterior.arviz_groups import fitted_cells
+from tactile_bayes.report.figure_file import named_exam
 
 NOISE_SD = 0.004
 SLOPE = 0.003

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tactile_bayes.report.size_text import shape_text
+from tactile_bayes.report.estimate_text import shape_text
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from tactile_bayes.report.masses_document import mass_words
-from tactile_bayes.report.touching import touching_findings, touching_masses
+from tactile_bayes.report.estimate_document import mass_words
+from tactile_bayes.report.quantities import touching_findings, touching_masses
 
 
 def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> dict[str, Any]:

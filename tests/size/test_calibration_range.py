@@ -17,7 +17,7 @@ from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import tactile_bayes as tb
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.pipeline.settings import Settings
 from tactile_bayes.size.draws import SIZES
 from tactile_bayes.size.pooling import SizePriors
 from tactile_bayes.size.site import Repeatability, size_alone

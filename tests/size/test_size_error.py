@@ -16,13 +16,11 @@ from test_pooling import BODY_SD, calibration, shape
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.inference.draws import ParameterDraws, even_replicates
-from tactile_bayes.inference.normal import normal_cdf
-from tactile_bayes.inference.paired import evened, paired_points
-from tactile_bayes.inference.summary import Quantity, summarise
-from tactile_bayes.posterior import drawn
-from tactile_bayes.posterior.assessment import MapDraws
+from tactile_bayes.inference.draws import ParameterDraws, Quantity, even_replicates, summarise
+from tactile_bayes.inference.points import evened, normal_cdf, paired_points
+from tactile_bayes.posterior import search as drawn
 from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.search import MapDraws
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration, push_sizes
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size

@@ -16,25 +16,30 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, correlated_field, grid_map
 
+from tactile_bayes.api.estimating import estimate_inputs
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.schema import check_document
 from tactile_bayes.inference import importance as importance_module
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.pipeline.one_map import estimate_inputs
-from tactile_bayes.pipeline.settings import Settings
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
-from tactile_bayes.report.ladder_advice import advice
-from tactile_bayes.report.ladder_document import ladder_document
-from tactile_bayes.report.ladder_figure import draw_ladder
-from tactile_bayes.report.ladder_text import ladder_text
+from tactile_bayes.report.tradeoff import advice, draw_ladder, ladder_document, ladder_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Recipe
 from tactile_bayes.studies import estimate_tradeoff as study
-from tactile_bayes.studies.cost_ladder import Ladder, PooledRow, Priced, Reference, Work, priced
-from tactile_bayes.studies.estimate_tradeoff import Estimator, measure
+from tactile_bayes.studies.estimate_tradeoff import (
+    Estimator,
+    Ladder,
+    PooledRow,
+    Priced,
+    Reference,
+    Work,
+    measure,
+    priced,
+)
 from tactile_bayes.studies.size_answers import SIZE, SizeAnswer, deviation
 
 Run = Callable[..., "CompletedProcess[str]"]
@@ -291,7 +296,7 @@ def test_the_command_says_how_long_it_takes_and_pools(tmp_path: Path, run_cli: R
 
 
 def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
-    from tactile_bayes.pipeline.tradeoff import pooled_rows
+    from tactile_bayes.api.tradeoffs import pooled_rows
 
     paths = []
     for seed in (1, 2, 3):

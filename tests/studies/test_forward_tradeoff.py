@@ -19,28 +19,30 @@ from tactile_bayes.commands.study import fit_line
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
-from tactile_bayes.forward.plane.study import Geometry, StudyRow, StudySettings, run_geometry
 from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.report.tradeoff_text import TradeoffReport, tradeoff_document, tradeoff_text
+from tactile_bayes.report.forward_tradeoff import TradeoffReport, tradeoff_document, tradeoff_text
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.studies.forward_tradeoff import (
+from tactile_bayes.studies.paper import Geometry, StudyRow, StudySettings, run_geometry
+from tactile_bayes.studies.paper_solid import fit_raster
+from tactile_bayes.studies.tradeoffs import (
     EMPIRICAL,
     PLANE,
     SOLID,
     LumpCase,
     Measured,
+    SizeRule,
+    calibrated_rule,
     case_of,
     cheapest,
-    measure,
-    settings_of,
+    learned_rule,
 )
-from tactile_bayes.studies.raster import fit_raster
-from tactile_bayes.studies.size_rules import SizeRule, calibrated_rule, learned_rule
+from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
+from tactile_bayes.studies.tradeoffs import measure_forward as measure
 
 Run = Callable[..., "CompletedProcess[str]"]
 BALL = SolidLump(seat=0.0)
@@ -218,7 +220,7 @@ def test_the_document_is_plain_data() -> None:
 
 
 def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
-    from tactile_bayes.report.tradeoff_figures import draw_tradeoff
+    from tactile_bayes.report.forward_tradeoff import draw_tradeoff
 
     for name in ("one.png", "two.png"):
         draw_tradeoff(report(), tmp_path / name)

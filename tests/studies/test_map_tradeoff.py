@@ -10,18 +10,17 @@ from pathlib import Path
 import pytest
 
 import tactile_bayes
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.tradeoffs import tradeoff_of_scan
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.documents import check_document
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.schema import check_document
-from tactile_bayes.mapping.thinning import first_seconds
-from tactile_bayes.pipeline.settings import Settings
-from tactile_bayes.pipeline.tradeoff import tradeoff_of_scan
-from tactile_bayes.report.ladder_document import ladder_document
-from tactile_bayes.report.ladder_text import ladder_text
+from tactile_bayes.mapping.select import first_seconds
+from tactile_bayes.report.tradeoff import ladder_document, ladder_text
 from tactile_bayes.scan import Scan
 from tactile_bayes.studies import estimate_tradeoff
-from tactile_bayes.studies import map_tradeoff as study
-from tactile_bayes.studies.cost_ladder import Ladder, Priced, Work
+from tactile_bayes.studies import tradeoffs as study
+from tactile_bayes.studies.estimate_tradeoff import Ladder, Priced, Work
 from tactile_bayes.studies.size_answers import SIZE, WIDTHS
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"

@@ -10,23 +10,27 @@ import pytest
 
 from tactile_bayes.commands.sbc import _shipped
 from tactile_bayes.declarations import replace
-from tactile_bayes.inference.rank_tests import (
+from tactile_bayes.posterior import draw
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.draws import MapPosterior
+from tactile_bayes.posterior.field import LENGTHS_MM
+from tactile_bayes.report.sbc import verdict
+from tactile_bayes.studies import sbc
+from tactile_bayes.studies.sbc import (
     BAND,
+    DRAWS,
+    ELSEWHERE,
+    MapRanks,
     RankTest,
+    Truth,
     chi2_p,
     coverage,
     ecdf_band,
     ecdf_counts,
+    other_rises,
     rank_test,
     uniform_strays,
 )
-from tactile_bayes.posterior.correlated import draw
-from tactile_bayes.posterior.correlated.noise import LENGTHS_MM
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.lump.posterior import MapPosterior
-from tactile_bayes.report.sbc_text import verdict
-from tactile_bayes.studies import sbc
-from tactile_bayes.studies.sbc import DRAWS, ELSEWHERE, MapRanks, Truth, other_rises
 
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
 

@@ -13,7 +13,7 @@ from posterior_maps import bump_map
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
 PERSON = {"subject": "S01", "side": "left", "posture": "supine", "examiner": "E1", "visit": "2", "mass": "1"}
 PHANTOM = {"side": "phantom", "posture": "phantom"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 
 PROVENANCE = Provenance("map", {"cell_mm": 1.0}, {"scan_1": "0" * 64})
 

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
-from tactile_bayes.mapping.tactile_map import MapRecipe, TactileMap
+from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.posterior.options import FitOptions
-from tactile_bayes.posterior.white.fit import Candidate, fitted_candidates
+from tactile_bayes.posterior.white import Candidate, fitted_candidates
 
 TRUTH = {"amplitude": 0.3, "x": 1.3, "y": -0.8, "sigma_x": 6.0, "sigma_y": 4.5}
 

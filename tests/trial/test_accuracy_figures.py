@@ -9,11 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from tactile_bayes.files.schema import dump_json
-from tactile_bayes.report.trial_document import as_document
-from tactile_bayes.trial import accuracy, origin_line, spread
-from tactile_bayes.trial.comparison import mape_ratios
-from tactile_bayes.trial.jackknife import UndefinedError
+from tactile_bayes.files.documents import dump_json
+from tactile_bayes.report.trial import as_document
+from tactile_bayes.trial import accuracy
+from tactile_bayes.trial import accuracy as origin_line
+from tactile_bayes.trial import replicates as spread
+from tactile_bayes.trial.accuracy import mape_ratios
+from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.readings import ModalitySizes, Reading
 from tactile_bayes.trial.summary import TrialReport, modality_report, summarise
 
@@ -63,12 +65,12 @@ def test_accuracy_by_hand() -> None:
     assert accuracy.mape_percent(case.only_detected()) == pytest.approx(40)
     assert accuracy.mae_mm(case) == pytest.approx(53 / 3)
     assert accuracy.mae_mm(case.only_detected()) == pytest.approx(6.5)
-    figures = accuracy.figures(case, confidence=0.95)
+    figures = accuracy.accuracy_figures(case, confidence=0.95)
     assert figures["bias_percent"].value == pytest.approx(100 * (math.sqrt(1.3 * 0.5) - 1))
 
 
 def test_bias_cancels_twice_with_half() -> None:
-    figures = accuracy.figures(single([10, 10], [20, 5]), confidence=0.95)
+    figures = accuracy.accuracy_figures(single([10, 10], [20, 5]), confidence=0.95)
     assert figures["bias_percent"].value == pytest.approx(0, abs=1e-12)
 
 

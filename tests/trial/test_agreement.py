@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from tactile_bayes.trial.bland_altman import limits, limits_unlinked, trend
-from tactile_bayes.trial.concordance import concordance
-from tactile_bayes.trial.jackknife import UndefinedError
-from tactile_bayes.trial.lines import least_squares
+from tactile_bayes.trial.figures import UndefinedError
+from tactile_bayes.trial.limits import content_factor, limits, limits_unlinked, percentile_factor, trend
+from tactile_bayes.trial.lines import concordance, least_squares
 from tactile_bayes.trial.readings import ModalitySizes
-from tactile_bayes.trial.replicates import figures, icc, log_sd_within, reader_components
-from tactile_bayes.trial.tolerance import content_factor, percentile_factor
-from tactile_bayes.trial.variance_components import components
+from tactile_bayes.trial.replicates import components, icc, log_sd_within, reader_components
+from tactile_bayes.trial.replicates import replicate_figures as figures
 
 # Bland & Altman (1986), Lancet i, 307, table 1: peak expiratory flow in l/min, first readings of both meters.
 WRIGHT = np.array([494, 395, 516, 434, 476, 557, 413, 442, 650, 433, 417, 656, 267, 478, 178, 423, 427], dtype=float)

@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_bayes.trial.accuracy import mape_figure
-from tactile_bayes.trial.bland_altman import limits, limits_unlinked
-from tactile_bayes.trial.bootstrap import Intervals
-from tactile_bayes.trial.check_intervals import ErrorModel, check_intervals
-from tactile_bayes.trial.comparison import mape_ratios
-from tactile_bayes.trial.jackknife import effective_number, interval_from_values, kurtosis_freedom
+from tactile_bayes.trial.accuracy import mape_figure, mape_ratios, share_interval
+from tactile_bayes.trial.figures import Intervals, effective_number, interval_from_values, kurtosis_freedom
+from tactile_bayes.trial.limits import figures, limits, limits_unlinked
 from tactile_bayes.trial.method_comparison import compare_methods
-from tactile_bayes.trial.misses import share_interval
-from tactile_bayes.trial.patient_limits import figures
+from tactile_bayes.trial.planning import ErrorModel, check_intervals
 from tactile_bayes.trial.readings import ModalitySizes, Reading, gather
 
 CORRECTED = Intervals(0.95, method="corrected")

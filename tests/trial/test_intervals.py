@@ -7,10 +7,15 @@ import pytest
 from scipy import stats
 
 from tactile_bayes.trial import accuracy
-from tactile_bayes.trial.coverage import coverage
-from tactile_bayes.trial.figures import Figure, figure
-from tactile_bayes.trial.jackknife import MIN_PATIENTS, UndefinedError, interval_from_values
-from tactile_bayes.trial.proportion import clopper_pearson
+from tactile_bayes.trial.calibration import coverage
+from tactile_bayes.trial.figures import (
+    MIN_PATIENTS,
+    Figure,
+    UndefinedError,
+    clopper_pearson,
+    figure,
+    interval_from_values,
+)
 from tactile_bayes.trial.readings import Interval, IntervalReading, ModalitySizes
 
 NOMINAL = 0.95

@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_bayes.trial import pair_angles
-from tactile_bayes.trial.jackknife import UndefinedError
-from tactile_bayes.trial.lines import deming, deming_slope, jackknife_errors, least_squares, weighted_deming
-from tactile_bayes.trial.passing_bablok import passing_bablok
+from tactile_bayes.trial import lines as pair_angles
+from tactile_bayes.trial.figures import UndefinedError
+from tactile_bayes.trial.lines import (
+    deming,
+    deming_slope,
+    jackknife_errors,
+    least_squares,
+    passing_bablok,
+    weighted_deming,
+)
 
 # NCSS Statistical Software, chapter "Deming Regression", example 1.
 NCSS_X = np.array([7, 8.3, 10.5, 9, 5.1, 8.2, 10.2, 10.3, 7.1, 5.9])

@@ -10,14 +10,14 @@ import pytest
 from scipy import stats
 
 from benchmarks.next_mass_coverage import DESIGNS, Design, half_normal_log_prior, ranks
+from tactile_bayes.api.trial_sampler import draw
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import ImportanceOptions, importance
-from tactile_bayes.inference.laplace import mode_and_covariance
-from tactile_bayes.pipeline.trial_sampler import draw
+from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.trial import next_mass as model_of
-from tactile_bayes.trial.check_intervals import ErrorModel
 from tactile_bayes.trial.next_mass import LogModel, expected_error_percent, next_mass, variances
+from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import ModalitySizes, Reading
 
 CALIPER = 0.05

@@ -9,16 +9,32 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_bayes.trial import accuracy, origin_line, spread
-from tactile_bayes.trial.bootstrap import Intervals, bca_interval, draw_patients
-from tactile_bayes.trial.check_intervals import ErrorModel, check_all, check_intervals, observed_errors, simulate
-from tactile_bayes.trial.comparison import mape_ratio
-from tactile_bayes.trial.figures import Sample, figure
-from tactile_bayes.trial.jackknife import UndefinedError
-from tactile_bayes.trial.paired import holm, on_common_masses, paired_comparisons, sign_flip
-from tactile_bayes.trial.planning import PlanCase, assumptions_from, designs, map_gains, run_case
+from tactile_bayes.trial import accuracy
+from tactile_bayes.trial import accuracy as origin_line
+from tactile_bayes.trial import replicates as spread
+from tactile_bayes.trial.accuracy import holm, mape_ratio, on_common_masses, paired_comparisons, sign_flip
+from tactile_bayes.trial.figures import (
+    Intervals,
+    Sample,
+    SumStatistic,
+    UndefinedError,
+    bca_interval,
+    draw_patients,
+    figure,
+)
+from tactile_bayes.trial.planning import (
+    ErrorModel,
+    PlanCase,
+    assumptions_from,
+    check_all,
+    check_intervals,
+    designs,
+    map_gains,
+    observed_errors,
+    run_case,
+    simulate,
+)
 from tactile_bayes.trial.readings import ModalitySizes
-from tactile_bayes.trial.sums import SumStatistic
 
 
 def sizes(

@@ -14,15 +14,12 @@ import tactile_bayes
 from tactile_bayes.commands.plan import command as plan_command
 from tactile_bayes.commands.validate import command as validate_command
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.files.schema import check_document
-from tactile_bayes.report.trial_text import trial_text
-from tactile_bayes.trial.bland_altman import errors_are_proportional
-from tactile_bayes.trial.bootstrap import Intervals
-from tactile_bayes.trial.figures import Figure
-from tactile_bayes.trial.jackknife import UndefinedError
+from tactile_bayes.files.documents import check_document
+from tactile_bayes.report.trial import trial_text
+from tactile_bayes.trial.figures import Figure, Intervals, UndefinedError
+from tactile_bayes.trial.limits import errors_are_proportional
 from tactile_bayes.trial.lines import deming
-from tactile_bayes.trial.plausibility import unit_doubts
-from tactile_bayes.trial.readings import ModalitySizes, Reading
+from tactile_bayes.trial.readings import ModalitySizes, Reading, unit_doubts
 from tactile_bayes.trial.summary import TrialReport, summarise
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.tables import Table
-from tactile_bayes.report.trial_document import as_document
+from tactile_bayes.report.trial import as_document
 from tactile_bayes.trial.readings import Reading, gather, readings_from_columns
 from tactile_bayes.trial.summary import TrialReport, summarise
 

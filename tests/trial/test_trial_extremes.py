@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_bayes.files.schema import check_document, dump_json
-from tactile_bayes.report.trial_document import as_document
+from tactile_bayes.files.documents import check_document, dump_json
+from tactile_bayes.report.trial import as_document, trial_text
 from tactile_bayes.report.trial_html import trial_html
-from tactile_bayes.report.trial_text import trial_text
 from tactile_bayes.trial.lines import weighted_deming
 from tactile_bayes.trial.readings import Reading
 from tactile_bayes.trial.summary import TrialReport, summarise

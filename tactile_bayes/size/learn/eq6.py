@@ -23,7 +23,7 @@ from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.ensemble import EnsembleOptions, Progress, ensemble
-from tactile_bayes.inference.laplace import mode_and_covariance
+from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.terms import Recipe
 

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.laplace import mode_and_covariance
+from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.size.process import Kernel, Residual
 
 POINTS: Final = 100

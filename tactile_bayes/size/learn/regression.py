@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.laplace import mode_and_covariance
+from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.size.terms import INVERTED, HiddenTerms, RoundLumps
 
 LEAST_BODIES = 20

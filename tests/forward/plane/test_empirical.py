@@ -9,19 +9,20 @@ from hypothesis import strategies as st
 
 from tactile_bayes.commands.study import fit_line
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.plane.empirical import (
+from tactile_bayes.forward.line import (
     SHARE,
     EmpiricalModel,
+    build_line,
     fit_empirical,
     fit_shape,
+    head_positions,
     homogeneous_pressure,
     kappa,
     lump_pressure,
     outside_range,
 )
-from tactile_bayes.forward.plane.line import build_line, head_positions
-from tactile_bayes.forward.plane.study import StudySettings
-from tactile_bayes.forward.plane.tables import (
+from tactile_bayes.studies.paper import StudySettings
+from tactile_bayes.studies.paper_tables import (
     PHANTOMS,
     PRINTED_FRAMES,
     PRINTED_MAPS,

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.forward.plane.lookalikes import CentredFrame, Lookalikes, centred_frame, find_lookalikes
-from tactile_bayes.forward.plane.study import StudySettings
-from tactile_bayes.report.study_figures import lookalikes_text
+from tactile_bayes.report.study import lookalikes_text
+from tactile_bayes.studies.paper import CentredFrame, Lookalikes, StudySettings, centred_frame, find_lookalikes
 
 COARSE = StudySettings(fineness=1)
 DEPTHS = (0.8, 1.0, 1.2, 1.5)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from in_process import run_here
 
-from tactile_bayes.commands.study_figures import read_frames
+from tactile_bayes.commands.study import read_frames
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.plane.measured import MeasuredFrame, compare_frames
-from tactile_bayes.forward.plane.study import StudySettings
 from tactile_bayes.presets import HEAD_PITCH_MM
+from tactile_bayes.studies.paper import StudySettings
+from tactile_bayes.studies.paper_tables import MeasuredFrame, compare_frames
 
 COARSE = StudySettings(fineness=1)
 LUMP = {"d_mm": 12.5, "depth_ratio": 0.825, "seat": 0.0}

@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
-from tactile_bayes.files.csv_cells import separator_in
+from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.identify import describe
-from tactile_bayes.files.schema import load_schema
-from tactile_bayes.files.tables import check_references, read_table
+from tactile_bayes.files.tables import check_references, read_table, separator_in
 
 TRIAL = "trial.table.json"
 EXCISION = "excision.table.json"

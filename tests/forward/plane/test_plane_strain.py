@@ -15,13 +15,19 @@ from scipy.sparse.linalg import spsolve
 
 from tactile_bayes.commands.study import fit_line
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward import plane_strain as strain
 from tactile_bayes.forward.body import Body, Layers, parse_seat
-from tactile_bayes.forward.plane import strain
-from tactile_bayes.forward.plane.condense import SurfaceCompliance, condense
-from tactile_bayes.forward.plane.layers import surface_compliance, surface_transfer
-from tactile_bayes.forward.plane.line import build_line, slide
-from tactile_bayes.forward.plane.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
-from tactile_bayes.forward.plane.strain import assemble, lame, skin_average
+from tactile_bayes.forward.line import build_line, slide
+from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
+from tactile_bayes.forward.plane_strain import (
+    SurfaceCompliance,
+    assemble,
+    condense,
+    lame,
+    skin_average,
+    surface_compliance,
+    surface_transfer,
+)
 
 NEARLY_INCOMPRESSIBLE = pytest.mark.parametrize("poisson", [0.3, 0.495, 0.4999])
 

@@ -13,8 +13,11 @@ from tactile_bayes.commands.study import fit_line, table_text
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.gaussian import cell_mean_gaussian
-from tactile_bayes.forward.plane.line import TactileLine
-from tactile_bayes.forward.plane.study import (
+from tactile_bayes.forward.line import TactileLine
+from tactile_bayes.inference.modes import fit_least_squares
+from tactile_bayes.presets import HEADS
+from tactile_bayes.report.study import study_text
+from tactile_bayes.studies.paper import (
     DETECTABLE,
     Geometry,
     StudyRow,
@@ -27,9 +30,6 @@ from tactile_bayes.forward.plane.study import (
     stiffness_changes,
     width_changes,
 )
-from tactile_bayes.inference.least_squares import fit_least_squares
-from tactile_bayes.presets import HEADS
-from tactile_bayes.report.study_text import study_text
 
 X = 0.5 * (np.arange(240) - 119.5)
 

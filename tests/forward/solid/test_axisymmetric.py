@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import splu
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.solid.axisymmetric import (
+from tactile_bayes.forward.axisymmetric import (
     CondensedLump,
     Tissue,
     _assemble,
@@ -20,8 +20,8 @@ from tactile_bayes.forward.solid.axisymmetric import (
     orders_needed,
     skin_spline,
 )
-from tactile_bayes.forward.solid.layers import LayeredBody, layering_compliance
-from tactile_bayes.forward.solid.mesh import EXTERIOR_GLAND, INTERIOR_FAT, LumpGeometry, LumpMesh, MeshSize, lump_mesh
+from tactile_bayes.forward.layers import LayeredBody, layering_compliance
+from tactile_bayes.forward.mesh import EXTERIOR_GLAND, INTERIOR_FAT, LumpGeometry, LumpMesh, MeshSize, lump_mesh
 
 CENTRED = LumpGeometry(7.5, 7.5, 15.0, 15.0, 70.0)
 RESTING = LumpGeometry(7.5, 7.5, 15.0, 24.0, 70.0)

@@ -16,9 +16,16 @@ from scipy.optimize import least_squares
 
 from tactile_bayes.commands.study import table_text
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
-from tactile_bayes.forward.plane.study import Geometry, StudyRow
-from tactile_bayes.forward.solid.study import RasterFrames, SolidSettings, mesh_size, raster_frames, run_solid_geometry
-from tactile_bayes.studies.raster import fit_raster, raster_map
+from tactile_bayes.studies.paper import Geometry, StudyRow
+from tactile_bayes.studies.paper_solid import (
+    RasterFrames,
+    SolidSettings,
+    fit_raster,
+    mesh_size,
+    raster_frames,
+    raster_map,
+    run_solid_geometry,
+)
 
 Run = Callable[..., "CompletedProcess[str]"]
 SETTINGS = SolidSettings(fineness=1)
@@ -301,7 +308,7 @@ def test_a_store_of_another_fit_is_refused(option: dict[str, Any], run_cli: Run,
 
 def test_a_store_of_the_other_model_is_refused(run_cli: Run, tmp_path: Path) -> None:
     from tactile_bayes.batch_store import open_store
-    from tactile_bayes.forward.plane.study import StudySettings
+    from tactile_bayes.studies.paper import StudySettings
 
     (tmp_path / "grid.csv").write_text(GRID)
     with open_store(tmp_path / "study.csv.unfinished", settings=StudySettings().as_dict()):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.posterior.correlated import basis as spanned
-from tactile_bayes.posterior.correlated import marginal as collapsed
-from tactile_bayes.posterior.correlated.basis import Spanned
-from tactile_bayes.posterior.correlated.marginal import CollapsedTarget
-from tactile_bayes.posterior.correlated.scene import Scene
+from tactile_bayes.posterior import linear as spanned
+from tactile_bayes.posterior import marginal as collapsed
+from tactile_bayes.posterior.linear import Spanned
+from tactile_bayes.posterior.marginal import CollapsedTarget
+from tactile_bayes.posterior.scene import Scene
 from tests.posterior.correlated.test_marginal import START, TURNED, cells_of, noise, target_of
 
 NEAR = 0.03

@@ -10,7 +10,7 @@ from mapping_scans import shared_scan
 from posterior_maps import bump_map, correlated_field, grid_map
 
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate

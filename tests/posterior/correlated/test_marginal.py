@@ -9,18 +9,16 @@ import pytest
 from posterior_maps import TRUTH, bump_map, correlated_field
 
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
-from tactile_bayes.posterior.correlated import marginal as collapsed
-from tactile_bayes.posterior.correlated.draw import draw_scene
-from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene, shape_draws
-from tactile_bayes.posterior.correlated.linear import _one
-from tactile_bayes.posterior.correlated.marginal import CollapsedTarget, independent_variance
-from tactile_bayes.posterior.correlated.noise import cosine_profiles, gram_of_cosines, spectrum
-from tactile_bayes.posterior.correlated.problem import Problem
-from tactile_bayes.posterior.correlated.scene import Scene
-from tactile_bayes.posterior.correlated.window import Window
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.lump.cells import FitCells, window_cells
+from tactile_bayes.posterior import marginal as collapsed
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.draw import draw_scene
+from tactile_bayes.posterior.field import Window, cosine_profiles, gram_of_cosines, spectrum
+from tactile_bayes.posterior.fit import FieldFit, fit_scene, shape_draws
+from tactile_bayes.posterior.fit_window import FitCells, window_cells
+from tactile_bayes.posterior.linear import _one
+from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance
 from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.scene import Problem, Scene
 
 RADIUS = 20.0
 START = np.array([np.log(6.0), np.log(4.5), 1.3, -0.8, 0.0])

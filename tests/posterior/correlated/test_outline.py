@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from posterior_maps import correlated_field, grid_map
 
-from tactile_bayes.posterior.correlated.outline import outline
+from tactile_bayes.posterior.correlated import outline
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate

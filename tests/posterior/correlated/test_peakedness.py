@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 from posterior_maps import correlated_field, grid_map
 
-from tactile_bayes.posterior.correlated.fit import FieldFit
-from tactile_bayes.posterior.correlated.peakedness import _departure, ask_departure, exponent_covariance
-from tactile_bayes.posterior.correlated.selection import Structure
-from tactile_bayes.posterior.correlated.tangent import tangent_columns
 from tactile_bayes.posterior.estimate import estimate_map
+from tactile_bayes.posterior.fit import FieldFit, tangent_columns
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.report.scene_text import scene_lines
+from tactile_bayes.posterior.selection import Structure, _departure, ask_departure, exponent_covariance
+from tactile_bayes.report.estimate_document import scene_lines
 
 AXIS = np.arange(-26.0, 27.0)
 SIGMA = (4.5, 5.5)

@@ -6,12 +6,12 @@ import numpy as np
 from posterior_maps import bump_map, correlated_field
 from scipy.stats import t
 
-from tactile_bayes.posterior.correlated.fit import FieldFit
-from tactile_bayes.posterior.correlated.marginal import CollapsedTarget, linear_columns
-from tactile_bayes.posterior.correlated.pointwise import pointwise_log_likelihood
-from tactile_bayes.posterior.correlated.window import Profiles
+from tactile_bayes.posterior.field import Profiles
+from tactile_bayes.posterior.fit import FieldFit
+from tactile_bayes.posterior.marginal import CollapsedTarget, linear_columns
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.search import search
+from tactile_bayes.posterior.selection import pointwise_log_likelihood
 
 
 def fit() -> FieldFit:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from posterior_maps import grid_map
 
-from tactile_bayes.posterior.correlated import estimate as field_estimate
+from tactile_bayes.posterior import correlated as field_estimate
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate

@@ -10,16 +10,15 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, NotConvergedError
-from tactile_bayes.files.checkpoint_npz import CheckpointFile
+from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import ImportanceOptions, importance
-from tactile_bayes.posterior.correlated import draw as methods
-from tactile_bayes.posterior.correlated.draw import Sampled, disagreement, draw_scene, importance_draws
-from tactile_bayes.posterior.correlated.fit import FieldFit, fit_scene
-from tactile_bayes.posterior.correlated.problem import Problem
-from tactile_bayes.posterior.correlated.scene import Scene
-from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.posterior import draw as methods
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.draw import Sampled, disagreement, draw_scene, importance_draws
+from tactile_bayes.posterior.fit import FieldFit, fit_scene
 from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.posterior.scene import Problem, Scene
 from tests.posterior.correlated.test_marginal import cells_of, fitted, noise
 from tests.posterior.correlated.test_selection import bump, choose, errors, rib, second
 

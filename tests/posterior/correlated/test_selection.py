@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, correlated_field, grid_map
 
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.correlated import neighbour as beside
-from tactile_bayes.posterior.correlated.marginal import independent_variance
-from tactile_bayes.posterior.correlated.neighbour import add_beside, rising_ribs
-from tactile_bayes.posterior.correlated.problem import Problem
-from tactile_bayes.posterior.correlated.scene import Scene
-from tactile_bayes.posterior.correlated.selection import SceneChoice, Structure, choose_shape
-from tactile_bayes.posterior.correlated.surroundings import Surroundings
-from tactile_bayes.posterior.correlated.window import Window
-from tactile_bayes.posterior.lump.bump import BumpPrior
-from tactile_bayes.posterior.lump.cells import window_cells
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior import neighbours as beside
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.field import Window
+from tactile_bayes.posterior.fit_window import window_cells
+from tactile_bayes.posterior.marginal import independent_variance
+from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
+from tactile_bayes.posterior.scene import Problem, Scene
+from tactile_bayes.posterior.selection import SceneChoice, Structure, choose_shape
 
 RADIUS, HALF, SIZE = 20.0, 35.0, 71
 AXIS = np.arange(SIZE) - HALF
@@ -86,7 +84,7 @@ def test_structures_are_rarely_invented(name: str, most: float) -> None:
 
 def test_independent_errors_would_invent_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control: without a field the same errors make ellipses and tilts."""
-    monkeypatch.setattr("tactile_bayes.posterior.correlated.marginal.SHARES", (0.0,))
+    monkeypatch.setattr("tactile_bayes.posterior.marginal.SHARES", (0.0,))
     choices = [choose(bump() + errors(3000 + seed)) for seed in range(6)]
     assert sum(asked(c, "ellipse").supported or asked(c, "tilt").supported for c in choices) >= 4
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.posterior.correlated.scene import Extra
-from tactile_bayes.posterior.correlated.surroundings import CLEAR_IN_WIDTHS, LEAST_CELLS, PIECE_MM, Surroundings
-from tactile_bayes.posterior.lump.cells import SMOOTHING_MM
+from tactile_bayes.posterior.fit_window import SMOOTHING_MM
+from tactile_bayes.posterior.neighbours import CLEAR_IN_WIDTHS, LEAST_CELLS, PIECE_MM, Surroundings
+from tactile_bayes.posterior.scene import Extra
 
 BUMP = {"bump_mm": (1.0, -2.0), "bump_width_mm": 4.0, "amplitude": 0.3, "middle": (0.5, 0.5)}
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map
 
-from tactile_bayes.posterior.lump.bump import BLOCK, LEAST_BLOCK, Bump, block_size
-from tactile_bayes.posterior.lump.cells import FitCells, window_cells
-from tactile_bayes.posterior.white.residuals import ErrorModel
-from tactile_bayes.posterior.white.target import Target, flat_prior
+from tactile_bayes.posterior.bump import BLOCK, LEAST_BLOCK, Bump, block_size
+from tactile_bayes.posterior.detection import ErrorModel
+from tactile_bayes.posterior.fit_window import FitCells, window_cells
+from tactile_bayes.posterior.white import Target, flat_prior
 
 
 @pytest.fixture(scope="module")

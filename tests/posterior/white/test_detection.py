@@ -14,13 +14,13 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.tactile_map import TactileMap
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.bump import BumpPrior
+from tactile_bayes.posterior.detection import detect
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.lump.bump import BumpPrior
 from tactile_bayes.posterior.options import EstimateOptions, FitOptions
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white.detection import detect
-from tactile_bayes.posterior.white.fit import fitted_candidates
+from tactile_bayes.posterior.white import fitted_candidates
 
 SIZE = 51
 NOISE = 0.02

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map, correlated_field, grid_map
 
-from tactile_bayes.posterior.lump.cells import window_cells
+from tactile_bayes.posterior.detection import count_weights, fitted_tilt, level_offset, residual_autocorrelation
+from tactile_bayes.posterior.fit_window import window_cells
 from tactile_bayes.posterior.options import FitOptions
-from tactile_bayes.posterior.white.fit import BumpFit, fit_bump
-from tactile_bayes.posterior.white.residuals import count_weights, fitted_tilt, level_offset, residual_autocorrelation
+from tactile_bayes.posterior.white import BumpFit, fit_bump
 
 NOISE = 0.02
 SIZE = 51

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from posterior_maps import TRUTH, bump_map, bump_values, find_bump, grid_map
 from scipy.special import erf
 
-from tactile_bayes.mapping.tactile_map import TactileMap
-from tactile_bayes.posterior.lump.bump import BumpPrior
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior import white as fit_module
+from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.options import FitOptions
-from tactile_bayes.posterior.white import fit as fit_module
-from tactile_bayes.posterior.white.fit import BumpFit, fit_bump, rotation_odds
+from tactile_bayes.posterior.white import BumpFit, fit_bump, rotation_odds
 
 OFF = FitOptions(rotation="off")
 ON = FitOptions(rotation="on")

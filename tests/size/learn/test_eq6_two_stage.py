@@ -9,7 +9,6 @@ import pytest
 from plain_calibration import RECIPE
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.plane.study import StudyRow, learn_as_printed
 from tactile_bayes.report.calibration_text import calibration_text
 from tactile_bayes.size.eq6 import AxisCalibration
 from tactile_bayes.size.learn.eq6 import (
@@ -21,6 +20,7 @@ from tactile_bayes.size.learn.eq6 import (
     other_fit,
     width_changes,
 )
+from tactile_bayes.studies.paper import StudyRow, learn_as_printed
 
 TRUTH = np.array([6.6, -6.8, 0.59, -0.32])
 DEPTHS = (0.6, 0.8, 1.0, 1.2, 1.5)

@@ -1,0 +1,487 @@
+"""The maps of two visits and more, compared."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tactile_bayes.api.arguments import door, plain, sequence_of
+from tactile_bayes.api.estimates import SizeEstimate, estimated, of_one_mass, settings_of
+from tactile_bayes.api.estimating import Answer, size_priors
+from tactile_bayes.api.maps import Map, PathLike, path_of
+from tactile_bayes.api.pooled import common_calibration
+from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest, repeatability_setting
+from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
+from tactile_bayes.api.sized import Draws
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
+from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
+from tactile_bayes.presets import REGISTRATION_MM, RESEARCH_USE
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from tactile_bayes.mapping.map import TactileMap
+    from tactile_bayes.report.compare_figure import DrawnMap
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.pooling import SizePriors
+    from tactile_bayes.size.spread import BetweenMaps
+    from tactile_bayes.size.visits import Apart, Change, Compared, JointSizes
+
+
+# --- Two visits and more compared: whether they are of one mass, and the change of its size.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ComparedOutcome:
+    """A comparison with its JSON object."""
+
+    compared: Compared
+    document: dict[str, Any]
+
+    @property
+    def exit_code(self) -> int:
+        """0 for a comparison, else 6."""
+        return EXIT_DONE if self.compared.joint is not None else EXIT_NO_ESTIMATE
+
+
+def compare_answers(
+    visits: Sequence[Sequence[Answer]],
+    settings: Settings,
+    *,
+    comparing: Comparing,
+    names: Sequence[Sequence[str]],
+    inputs: Mapping[str, Path],
+) -> ComparedOutcome:
+    """Compare the visits of one mass.
+
+    Parameters
+    ----------
+    visits
+        Answers for the maps of each visit, in order of time; none of them an error.
+    names
+        Of the maps, for the report.
+    inputs
+        Files that the maps came from, by role, for the provenance.
+
+    Raises
+    ------
+    BadDataError
+        When the maps were normalised in several ways, one was made with another head than the calibration's, or the
+        site's repeatability is of sizes by another calibration.
+    UsageError
+        When there are fewer than two visits, two maps are of one scan, days do not fit, or the calibration cannot pool
+        maps.
+    """
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.report.compare import compare_document
+
+    if len(visits) < 2 or not all(visits):
+        raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
+    comparing.check_visits(len(visits))
+    if settings.calibration == "none":
+        raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
+    every = list(chain.from_iterable(visits))
+    path, calibration = common_calibration(every, settings, names=list(chain.from_iterable(names)))
+    _refuse_repeated(visits, list(chain.from_iterable(names)))
+    digests = hash_inputs(**inputs, **({"size_calibration": path} if path else {})) | repeatability_digest(settings)
+    check_repeatability(settings, calibration, digests)
+    compared = _compared(visits, calibration, settings, comparing)
+    compared = replace(compared, findings=by_weight((*compared.findings, *_of_visits(visits))))
+    scans = [scan for one in visits for scan in _scans(one)]
+    provenance = Provenance("compare", _recorded(settings, comparing), digests, seed=settings.seed, scans=scans)
+    document = compare_document(
+        compared,
+        [[answer.document or {} for answer in one] for one in visits],
+        names,
+        days=comparing.days,
+        grown_by=comparing.grown_by,
+        probability=settings.interval,
+        provenance=provenance,
+        repeatability=settings.repeatability,
+    )
+    return ComparedOutcome(compared, document)
+
+
+def drawn_maps(maps: Sequence[Sequence[TactileMap]], visits: Sequence[Sequence[Answer]]) -> list[list[DrawnMap]]:
+    """The maps of each visit with the places of their lumps, for the figure."""
+    from tactile_bayes.report.compare_figure import DrawnMap
+
+    def place(answer: Answer) -> tuple[float, float] | None:
+        centre = None if answer.document is None or answer.shape is None else answer.document["centre_mm"]
+        return None if centre is None else (centre["x"]["median"], centre["y"]["median"])
+
+    return [
+        [DrawnMap(one, place(answer)) for one, answer in zip(some, answers, strict=True)]
+        for some, answers in zip(maps, visits, strict=True)
+    ]
+
+
+def _compared(
+    visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: Comparing
+) -> Compared:
+    from tactile_bayes.size.visits import Compared, contradictions
+
+    found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
+    missing = [
+        f"a lump was found on {len(some)} of {len(maps)} maps of visit {number}"
+        for number, (some, maps) in enumerate(zip(found, visits, strict=True), start=1)
+        if not some or 2 * len(some) < len(maps)
+    ]
+    contradicted = contradictions([_scans(one) for one in visits])
+    if contradicted:
+        advice = "compare exams of one mass; where a code is wrong, correct it in the scans' session and map them again"
+        return Compared("not_one_mass", "; ".join(contradicted), advice)
+    if missing:
+        return Compared("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
+    refused, apart, doubts = _by_place(found, comparing)
+    if refused is not None:
+        return refused
+    return _sized(found, calibration, settings, apart=apart, doubts=doubts)
+
+
+def _by_place(
+    visits: Sequence[Sequence[Answer]], comparing: Comparing
+) -> tuple[Compared | None, tuple[Apart | None, ...], list[Finding]]:
+    """Refusal where the places do not show one mass, the distances from the first visit, and what else speaks of it."""
+    from tactile_bayes.api.pooled import place_of
+    from tactile_bayes.size.spread import LEAST_PROBABILITY
+    from tactile_bayes.size.visits import Compared, Place, apart, one_place_probability
+
+    of_maps = [[place for answer in maps if (place := place_of(answer.document)) is not None] for maps in visits]
+    places = [Place.mean_of(one) for one in of_maps]
+    found = tuple(
+        None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
+        for first, later in ((places[0], later) for later in places[1:])
+    )
+    doubts = [
+        f"the masses of visits 1 and {number} lie {one.words}"
+        for number, one in enumerate(found, start=2)
+        if one is not None and one.doubtful
+    ]
+    doubts += [
+        f"the masses on the maps of visit {number} lie too far apart for one"
+        for number, maps in enumerate(of_maps, start=1)
+        if one_place_probability(maps, registration_mm=comparing.registration_mm) < LEAST_PROBABILITY
+    ]
+    unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
+    if not comparing.same_mass and doubts:
+        advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
+        return Compared("not_one_mass", "; ".join(doubts), advice, found), (), []
+    if not comparing.same_mass and unknown:
+        reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
+        return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", found), (), []
+    doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
+    return None, found, [Finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
+
+
+def _sized(
+    visits: Sequence[Sequence[Answer]],
+    calibration: BodyCalibration,
+    settings: Settings,
+    *,
+    apart: tuple[Apart | None, ...],
+    doubts: Sequence[Finding],
+) -> Compared:
+    """Sizes of visits that are of one mass, or why there are none."""
+    import numpy as np
+
+    from tactile_bayes.size.pooling import MOST_INVALID
+    from tactile_bayes.size.visits import Compared, joint_sizes, visit_calibrations
+
+    # one order whatever the caller's, so that the order of a visit's maps leaves no trace
+    shapes: list[list[ShapeDraws]] = [
+        sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
+        for maps in visits
+    ]
+    fitted = visit_calibrations(shapes, calibration)
+    far = _by_visit(shapes, [one.too_far for one in fitted])
+    if far:
+        return Compared("no_estimate", f"outside the calibration's range: {'; '.join(far)}", "", apart)
+    priors = size_priors(settings)
+    words = sorted(answer.fingerprint for maps in visits for answer in maps)
+
+    def joint(between: BetweenMaps | None) -> JointSizes:
+        rng = np.random.default_rng([settings.seed, *words])
+        return joint_sizes(shapes, calibration=calibration, priors=priors, rng=rng, between=between)
+
+    sizes = joint(None)
+    if np.isnan(sizes.log_size).mean() > MOST_INVALID:
+        return Compared("no_estimate", "too many draws have no positive size", "", apart)
+    outside = _by_visit(shapes, [one.outside for one in fitted])
+    findings = [
+        *doubts,
+        *(Finding("outside_calibration", f"outside the calibration's range: {text}") for text in outside),
+        *_fat_apart(shapes, calibration),
+        *_sizes_apart(shapes, fitted, priors),
+    ]
+    another = None if priors.another_exam is None else joint(priors.another_exam)
+    return Compared("compared", "", "", apart, tuple(findings), sizes, another)
+
+
+def _by_visit(
+    shapes: Sequence[Sequence[ShapeDraws]], texts: Sequence[Callable[[float, float], list[str]]]
+) -> list[str]:
+    """What is to be said of the middles of the maps, once for each visit."""
+    found = [
+        f"visit {number}: {text}"
+        for number, (maps, texts_of) in enumerate(zip(shapes, texts, strict=True), start=1)
+        for one in maps
+        for text in texts_of(*one.middle)
+    ]
+    return list(dict.fromkeys(found))
+
+
+def _sizes_apart(
+    shapes: Sequence[Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], priors: SizePriors
+) -> list[Finding]:
+    """Cautions where the maps of one visit are not of one size."""
+    from tactile_bayes.report.pooled import disagreement
+    from tactile_bayes.size.pooling import log_sizes
+    from tactile_bayes.size.spread import LEAST_PROBABILITY, one_size_of
+
+    found = []
+    for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
+        chance = one_size_of(log_sizes(at, maps), priors.between_maps)
+        if chance < LEAST_PROBABILITY:
+            found.append(disagreement("its maps show different sizes", chance).at(f"visit {number}"))
+    return found
+
+
+def _fat_apart(shapes: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[Finding]:
+    """Caution where the maps differ too much in the depth of fat to be of one breast."""
+    from tactile_bayes.report.pooled import fat_apart
+
+    fat = calibration.depth
+    depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
+    return [] if depths is None else [fat_apart(depths)]
+
+
+def _of_visits(visits: Sequence[Sequence[Answer]]) -> list[Finding]:
+    """What speaks against the maps of each visit; a size alone outside its calibration is judged anew."""
+    return [
+        one.at(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
+        for number, maps in enumerate(visits, start=1)
+        for i, answer in enumerate(maps, start=1)
+        for one in answer.findings
+        if one.kind != "outside_calibration"
+    ]
+
+
+def _refuse_repeated(visits: Sequence[Sequence[Answer]], names: Sequence[str]) -> None:
+    """Refuse two maps of one scan: they are no two exams, and less apart than those would be."""
+    from tactile_bayes.files.provenance import repeated_scans
+
+    for index, earlier in repeated_scans([_scans([one]) for one in chain.from_iterable(visits)]).items():
+        raise UsageError(f"{names[index]} and {names[earlier]} are of one scan; give one map of each scan")
+
+
+def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
+    from tactile_bayes.files.provenance import scans_of
+
+    return [scan for one in answers if one.document is not None for scan in scans_of(one.document["provenance"])]
+
+
+def _recorded(settings: Settings, comparing: Comparing) -> dict[str, Any]:
+    """Settings for the provenance."""
+    return {
+        "size_calibration": settings.calibration_name,
+        "method": settings.method,
+        "interval": settings.interval,
+        "scene": settings.scene,
+        "between_map_sd": settings.between_map_sd,
+        **repeatability_setting(settings),
+        "days": None if comparing.days is None else list(comparing.days),
+        "grown_by": list(comparing.grown_by),
+        "same_mass": comparing.same_mass,
+        "registration_mm": comparing.registration_mm,
+    }
+
+
+# --- Comparison of a mass's size at several visits.
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Comparison:
+    """The size of one mass at several visits, and its change from the first to the last.
+
+    Parameters
+    ----------
+    outcome
+        The comparison and its JSON object.
+    visits
+        The estimates of each visit's maps alone.
+    probability
+        Of the intervals that are shown where none is asked for.
+    """
+
+    outcome: ComparedOutcome
+    visits: tuple[tuple[SizeEstimate, ...], ...]
+    probability: float
+
+    @property
+    def _change(self) -> Change | None:
+        joint = self.outcome.compared.joint
+        return None if joint is None else joint.change(0, len(self.visits) - 1)
+
+    @property
+    def status(self) -> str:
+        """``"compared"``, ``"not_one_mass"`` or ``"no_estimate"``."""
+        return self.outcome.compared.status
+
+    @property
+    def why(self) -> str:
+        """Why nothing is compared; empty where something is."""
+        return self.outcome.compared.reason
+
+    @property
+    def change_percent(self) -> Draws | None:
+        """Change of the diameter in percent; None where nothing is compared."""
+        change = self._change
+        if change is None:
+            return None
+        percent = 100.0 * np.expm1(change.log_ratio)
+        return Draws(np.atleast_2d(percent), "%", self.probability, change.replicates)
+
+    @property
+    def sizes_mm(self) -> tuple[Draws, ...]:
+        """Largest diameter at each visit; empty where nothing is compared."""
+        joint = self.outcome.compared.joint
+        if joint is None:
+            return ()
+        drawn = np.exp(joint.log_size)
+        return tuple(Draws(np.atleast_2d(one), "mm", self.probability, joint.replicates) for one in drawn)
+
+    def probability_grown(self, share: float = 0.0) -> float | None:
+        """Probability that the diameter has grown by more than a share of it (0.2: by more than 20 %)."""
+        change = self._change
+        return None if change is None else change.probability_above(share)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the comparison, cautions first."""
+        return self.outcome.compared.findings
+
+    @property
+    def verdict(self) -> Verdict:
+        """``"sound"``, ``"doubtful"`` where a caution stands, or ``"no_answer"`` where nothing is compared."""
+        return verdict(self.findings, answered=self._change is not None)
+
+    @property
+    def growth(self) -> str | None:
+        """``"grown"``, ``"shrunk"`` or ``"no_change_shown"``; None where nothing is compared."""
+        changes = self.document["changes"]
+        return str(changes[-1]["verdict"]) if changes else None
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What ``compare --json`` prints."""
+        return self.outcome.document
+
+    @property
+    def text(self) -> str:
+        """What ``compare`` prints."""
+        from tactile_bayes.report.compare import compare_summary
+
+        return compare_summary(self.document)
+
+    @property
+    def full_text(self) -> str:
+        """What ``compare -v`` prints."""
+        from tactile_bayes.report.compare import compare_text
+
+        return compare_text(self.document)
+
+    @door
+    def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
+        """Draw the visits' maps, their difference and the change; with a path also write it."""
+        from tactile_bayes.report.compare_figure import draw_comparison
+
+        maps = [[one.outcome.tactile_map for one in visit] for visit in self.visits]
+        drawn = drawn_maps(maps, [[one.answer for one in visit] for visit in self.visits])
+        return draw_comparison(self.outcome.compared, self.document, drawn, path_of(path), force=force)
+
+    def __repr__(self) -> str:
+        cautions = finding_lines(self.findings, "caution", paper=True)
+        words = f"not compared: {self.why}" if self.growth is None else f"{self.change_percent}, {self.growth}"
+        return f"<Comparison {' '.join([*cautions, f'of {len(self.visits)} visits: {words}'])}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre><p><small>{escape(RESEARCH_USE)}</small></p>"
+
+
+@door
+def compare(
+    first: Any,
+    second: Any,
+    *more: Any,
+    days: Sequence[float] | None = None,
+    dates: Sequence[str] | None = None,
+    grown_by: Sequence[float] = GROWN_BY,
+    same_mass: bool = False,
+    registration_mm: float = REGISTRATION_MM,
+    **settings: Any,
+) -> Comparison:
+    """Compare the size of a mass at two visits and more.
+
+    Parameters
+    ----------
+    first, second, *more
+        A visit each, in order of time: a map, a path or an estimate, or a list of them.
+    days
+        Days from the first visit to each later one; with them growth rates are told.
+    dates
+        The visits' dates in place of days, such as ``["2026-01-15", "2026-04-20"]``.
+    grown_by
+        Shares of the diameter (0.2 for 20 %) that the probability of a larger growth is told for.
+    same_mass
+        Say that the visits are of one mass where landmarks are missing, or place it too far apart.
+    registration_mm
+        SD each way of one mass's place between visits.
+    **settings
+        As of `estimate`; estimates that are given keep their own.
+
+    Raises
+    ------
+    UsageError
+        When a visit has no map, a map is given twice, or days do not fit.
+    BadDataError
+        As of `estimate`, and when the maps were normalised in several ways.
+    """
+    used = settings_of(settings)
+    refuse_checkpoint(used)
+    times = times_of(
+        None
+        if days is None
+        else [plain(day) for day in sequence_of("days", days, "numbers, one for each later visit")],
+        None if dates is None else sequence_of("dates", dates, "dates, one for each visit"),
+    )
+    shares = tuple(plain(one) for one in sequence_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
+    comparing = Comparing(times, shares, same_mass, plain(registration_mm))
+    comparing.check_visits(2 + len(more))
+    visits = tuple(_visit(one, settings) for one in (first, second, *more))
+    prints = [one.outcome.tactile_map.fingerprint for visit in visits for one in visit]
+    if len(set(prints)) < len(prints):
+        raise UsageError("a map is given twice; give each map once, at its own visit")
+    same = iter(of_one_mass([one for visit in visits for one in visit]))
+    visits = tuple(tuple(next(same) for _ in visit) for visit in visits)
+    names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
+    answers = [[one.answer for one in visit] for visit in visits]
+    outcome = compare_answers(answers, used, comparing=comparing, names=names, inputs={})
+    return Comparison(outcome, visits, used.interval)
+
+
+def _visit(given: Any, settings: dict[str, Any]) -> tuple[SizeEstimate, ...]:
+    """Estimates of a visit's maps."""
+    several = (
+        [given] if isinstance(given, str | Path | Map | SizeEstimate) or not isinstance(given, Sequence) else given
+    )
+    return estimated(several, settings)

@@ -1,0 +1,439 @@
+"""One map: the calibration and options that fit it, the estimate, its report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.api.repeatability import check_repeatability, repeatability_digest, repeatability_setting
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, NO_LUMP, BadDataError, TactileBayesError
+from tactile_bayes.findings import Finding, by_weight, findings_in
+from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.mapping.map import TactileMap
+    from tactile_bayes.posterior.arviz_groups import DrawGroup
+    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+    from tactile_bayes.posterior.result import Estimate
+    from tactile_bayes.scan import HeadShape
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.pooling import Calibration, SizePriors
+
+NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
+Progress = Callable[[int, int], None]
+Notice = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Answer for one map: its JSON object and its text, or an error with its exit code.
+
+    `text` is the report in at most 12 lines, `full_text` all of it. `shape` holds what pooling
+    needs of a map on which a lump was found, `normalise` how the map's frames were, `head` what it was made with,
+    `fingerprint` what its values seed random numbers with.
+    """
+
+    document: dict[str, Any] | None
+    text: str
+    exit_code: int
+    shape: ShapeDraws | None = None
+    normalise: str = ""
+    fingerprint: int = 0
+    full_text: str = ""
+    head: HeadShape | None = None
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What speaks against the answer, cautions first; nothing for an error."""
+        return () if self.document is None else findings_in(self.document["findings"])
+
+
+@dataclass(frozen=True, slots=True)
+class NoSize:
+    """Reason for widths without a size where no calibration was named, and a remedy."""
+
+    reason: str
+    advice: str = ""
+
+
+_LEAST_SQUARES = NoSize(
+    "optimise is the paper's least squares, and the shipped calibrations were learned with correlated errors (its "
+    "widths are up to 30 % wider, docs/decisions/0093); widths only",
+    "--method laplace --size-calibration eq6 gives a size by Eq 6 as quickly; for least squares throughout, learn Eq 6 "
+    "from phantoms fitted by --method optimise (`calibrate size`) and give that file",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """One map with its estimate, provenance and settings."""
+
+    tactile_map: TactileMap
+    estimate: Estimate
+    provenance: Provenance
+    settings: Settings
+    calibration: Calibration | None = None
+
+    def write(self, path: Path, *, document: Mapping[str, Any] | None = None, force: bool = False) -> None:
+        """Write all draws, and what goes with them, as netCDF that arviz opens.
+
+        Parameters
+        ----------
+        document
+            The JSON object of `answer_of`, where it was made already.
+        """
+        from tactile_bayes.files.posterior_nc import write_posterior
+
+        told = document or answer_of(self).document
+        assert told is not None  # only the answer of an error has none
+        provenance = self.provenance
+        write_posterior(path, self.estimate, provenance=provenance, groups=self.groups(), document=told, force=force)
+
+    def groups(self) -> dict[str, DrawGroup]:
+        """What goes with the draws, see `inference_groups`."""
+        import numpy as np
+
+        from tactile_bayes.posterior.arviz_groups import inference_groups
+
+        rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
+        return inference_groups(
+            self.estimate, calibration=self.calibration, size_priors=size_priors(self.settings), rng=rng
+        )
+
+
+def answer_file(path: Path, *, settings: Settings) -> Answer:
+    """Answer for a map file, in any process; an error with this map becomes its answer."""
+    try:
+        return answer_of(estimate_file(path, settings))
+    except TactileBayesError as error:
+        text = str(error) if str(path) in str(error) else f"{path}: {error}"
+        return Answer(None, f"error: {text}", error.exit_code)
+
+
+def estimate_file(
+    path: Path, settings: Settings, *, progress: Progress | None = None, notice: Notice | None = None
+) -> Outcome:
+    """Read a map and estimate it; see `estimate_one`."""
+    from tactile_bayes.files.map_nc import read_map_and_scans
+
+    tactile_map, scans = read_map_and_scans(path)
+    try:
+        return estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def estimate_one(
+    tactile_map: TactileMap,
+    settings: Settings,
+    *,
+    inputs: Mapping[str, Path] | None = None,
+    scans: Sequence[Mapping[str, str]] = (),
+    progress: Progress | None = None,
+    notice: Notice | None = None,
+) -> Outcome:
+    """Choose the calibration and the options that fit a map, and estimate.
+
+    Parameters
+    ----------
+    inputs
+        Files that the map came from, by role, for the provenance.
+    scans
+        The scans at the beginning, as `Provenance.scans` has them.
+    progress
+        Called with draws done and wanted.
+    notice
+        Called before the work with a line that a user may want to read while waiting.
+
+    Raises
+    ------
+    BadDataError
+        When the calibration that was named does not fit the map.
+    UsageError
+        When settings contradict each other, or the map.
+    NotConvergedError
+        When the method asked for does not converge.
+    """
+    import math
+
+    import numpy as np
+
+    from tactile_bayes.files.provenance import Provenance, hash_inputs
+    from tactile_bayes.files.shipped import SHIPPED, default_for
+    from tactile_bayes.mapping.map import many_cells
+    from tactile_bayes.posterior.estimate import calibration_for, estimate_map
+    from tactile_bayes.posterior.masses import with_masses
+    from tactile_bayes.report.calibration import calibration_line, site_words
+    from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
+
+    shipped = default_for(tactile_map.recipe.normalise)
+    source, calibration, why_none = choose_calibration(settings, tactile_map)
+    options = _options(settings, calibration, tactile_map)
+    if notice is not None and (line := many_cells(tactile_map, options.fit.radius_mm)) is not None:
+        notice(line)
+    files = {**(inputs or {}), **({"size_calibration": source} if source else {})}
+    files |= {"settings": settings.settings_file} if settings.settings_file else {}
+    digests = hash_inputs(**files) | repeatability_digest(settings)
+    if calibration is not None:
+        check_repeatability(settings, calibration, digests)
+        calibration = calibration_for(tactile_map, calibration)
+    if settings.checkpoint is not None:
+        from tactile_bayes.files.npz import CheckpointFile
+
+        context = digests.get("size_calibration", "no calibration")
+        options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
+
+    # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history,
+    # and a mass has the numbers that its place alone would give
+    def estimated(a_map: TactileMap, given: EstimateOptions) -> Estimate:
+        rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
+        told = progress if given is options else None
+        return estimate_map(a_map, calibration=calibration, options=given, rng=rng, progress=told)
+
+    estimate = with_masses(tactile_map, estimated(tactile_map, options), options, estimated)
+    estimate = _with_place(estimate, tactile_map, scans, probability=settings.interval)
+    if why_none is not None and estimate.status == "estimate":
+        estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice, on_paper=NO_CALIBRATION_ON_PAPER)
+    if estimate.code in NO_LUMP and tactile_map.covered.any():
+        from tactile_bayes.posterior.lump_probability import smallest_lumps
+
+        fat_mm = None if calibration is None else calibration.fat_mm
+        estimate = replace(estimate, smallest=smallest_lumps(tactile_map, fat_mm=fat_mm))
+    posterior = estimate.map_posterior
+    used = None if posterior is None or calibration is None else calibration.fitting(*posterior.medians)
+    if posterior is not None and used is not None and estimate.size is not None:
+        name = settings.calibration_name or shipped
+        by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"
+        sigma_mm = mean_width_mm(*posterior.medians[1:])
+        if isinstance(used, BodyCalibration) and used.site is not None:
+            by += f" ({site_words(used.site, math.log(sigma_mm))})"
+        words = calibration_line(by, used, sigma_mm=sigma_mm)
+        assert estimate.diagnostics is not None
+        site = "" if settings.repeatability is None else settings.repeatability.words()
+        diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words, repeatability=site)
+        estimate = replace(estimate, diagnostics=diagnostics)
+    named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
+    recorded = _recorded(settings, options, calibration=named)
+    provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
+    return Outcome(tactile_map, estimate, provenance, settings, used)
+
+
+def _with_place(
+    estimate: Estimate, tactile_map: TactileMap, scans: Sequence[Mapping[str, str]], *, probability: float
+) -> Estimate:
+    """The estimate with what speaks against the place of its masses: side and landmarks, and how near they lie."""
+    from tactile_bayes.report.estimate_document import patient_mm
+    from tactile_bayes.report.quantities import side_findings, side_of, touching_findings, touching_masses
+
+    here = [patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
+    side = side_findings(side_of(scans), here[0] if here else None)
+    sized = [
+        {
+            "number": number,
+            "centre_mm": {"x": one.x_mm, "y": one.y_mm},
+            "max_size_mm": one.estimate.size.summarise("max_size_mm", probability=probability).as_dict(),
+        }
+        for number, one in enumerate(estimate.masses, start=1)
+        if one.estimate.size is not None
+    ]
+    touching = touching_findings(touching_masses(sized)) if len(sized) > 1 else []
+    return replace(estimate, findings=by_weight((*side, *estimate.findings, *touching)))
+
+
+def _recorded(settings: Settings, options: EstimateOptions, *, calibration: str) -> dict[str, Any]:
+    """Settings for an answer's provenance."""
+    return {
+        "size_calibration": calibration,
+        "method": settings.method,
+        "interval": settings.interval,
+        "background": options.fit.background,
+        "fit_radius_mm": options.fit.radius_mm,
+        "rotation": settings.rotation,
+        "centre_mm": list(settings.centre_mm) if settings.centre_mm else None,
+        "noise": options.fit.noise,
+        "field_cosines": options.fit.field_cosines or "auto",
+        "accuracy_sd": settings.accuracy_sd,
+        "accuracy_mm": settings.accuracy_mm,
+        "scene": settings.scene,
+        "between_map_sd": settings.between_map_sd,
+        **repeatability_setting(settings),
+        "known": dict(settings.known),
+    }
+
+
+def choose_calibration(
+    settings: Settings, tactile_map: TactileMap
+) -> tuple[Path | None, Calibration | None, NoSize | None]:
+    """The calibration that was named, or the shipped one if none was and it fits map and options.
+
+    Returns
+    -------
+    path, calibration
+        None where there is none.
+    why_none
+        Why the shipped one was not used; None when it was, or when the user decided.
+    """
+    from tactile_bayes.files.shipped import default_for, size_calibration_path
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.posterior.estimate import OTHER_HEAD, recipe_differences
+
+    if settings.calibration is None or isinstance(settings.calibration, str):
+        path = size_calibration_path(settings.calibration or default_for(tactile_map.recipe.normalise))
+        if path is None:
+            return None, None, None
+        calibration = read_size_calibration(path)
+    else:
+        path, calibration = None, settings.calibration
+    if tactile_map.background is None and calibration.recipe.normalise != tactile_map.recipe.normalise:
+        why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map).fit)
+        if settings.calibration is None:
+            return None, None, replace(why_none, reason=f"{why_none.reason}; widths only")
+        raise BadDataError(f"{settings.calibration_name} does not fit: {why_none.reason}", way_out=why_none.advice)
+    if settings.calibration is not None:
+        return path, calibration, None
+    fit = _options(settings, calibration, tactile_map).fit
+    differs = recipe_differences(tactile_map, calibration, fit)
+    if settings.method == "optimise":
+        return None, None, _LEAST_SQUARES
+    if differs:
+        advice = OTHER_HEAD if calibration.recipe.head_differences(tactile_map.head) else ""
+        return None, None, NoSize(f"the shipped calibration does not fit: {'; '.join(differs)}; widths only", advice)
+    return path, calibration, None
+
+
+def _level_unknown(tactile_map: TactileMap, fit: FitOptions) -> NoSize:
+    """Reason for widths only where a map's level is unknown, with the commands that lead to a size."""
+    made = f"--normalise {tactile_map.recipe.normalise} --background {fit.background} --noise {fit.noise}"
+    learn = (
+        "estimate maps of at least 8 lumps of known size made the same way, list their d_mm, amplitude, sigma_x_mm and "
+        f"sigma_y_mm in LUMPS.csv, run `tactile-bayes calibrate size LUMPS.csv {made} --fit-radius-mm "
+        f"{fit.radius_mm:g} -o size.json` and give --size-calibration size.json"
+    )
+    if tactile_map.recipe.source == "scan":
+        reason = "the map is in kPa, and the shipped calibrations are for maps of normalised frames"
+        return NoSize(reason, f"map the scan again without --normalise none; or {learn}")
+    reason = "the grid's level is not known, and the shipped calibrations need the amplitude relative to it"
+    declare = "if its values were divided by their level already, import it again with --normalise gain"
+    return NoSize(reason, f"{declare} (frames divided by their means: mean); otherwise {learn}")
+
+
+def _options(settings: Settings, calibration: Calibration | None, tactile_map: TactileMap) -> EstimateOptions:
+    """Options of an estimate: unset ones from the calibration's recipe, else from the paper.
+
+    Without a calibration `default_errors` decides; a background that is given alone goes with independent errors.
+    """
+    from tactile_bayes.posterior.bump import BumpPrior
+    from tactile_bayes.posterior.options import EstimateOptions, FitOptions
+    from tactile_bayes.posterior.white import default_errors
+
+    background, noise = default_errors(tactile_map)
+    if settings.background or settings.method == "optimise":
+        noise = "independent"
+    if calibration is not None:
+        background, noise = calibration.recipe.background, calibration.recipe.noise
+    noise = settings.noise or noise
+    if calibration is None and noise == "field":
+        background = "free"
+    background = settings.background or background
+    radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
+    fit = FitOptions(
+        background=background,
+        radius_mm=radius,
+        rotation=settings.rotation,
+        centre_mm=settings.centre_mm,
+        noise=noise,
+        field_cosines=settings.field_cosines,
+    )
+    return EstimateOptions(
+        method=settings.method,
+        fit=fit,
+        max_steps=settings.max_steps,
+        accuracy_sd=settings.accuracy_sd,
+        size_priors=size_priors(settings),
+        prior=BumpPrior(**(settings.prior or {})),
+        scene=settings.scene,
+        accuracy_mm=settings.accuracy_mm,
+    )
+
+
+def estimate_inputs(
+    settings: Settings, tactile_map: TactileMap
+) -> tuple[Calibration | None, EstimateOptions, NoSize | None]:
+    """What `estimate_one` takes for a map: calibration and options, and why there is no calibration if nobody said so.
+
+    Raises
+    ------
+    BadDataError
+        When the calibration that was named does not fit the map.
+    """
+    _, calibration, why_none = choose_calibration(settings, tactile_map)
+    return calibration, _options(settings, calibration, tactile_map), why_none
+
+
+def size_priors(settings: Settings) -> SizePriors:
+    """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
+    from tactile_bayes.size.pooling import SizePriors
+    from tactile_bayes.size.spread import BetweenMaps
+
+    fixed, learned = settings.between_map_sd, settings.repeatability
+    if learned is None and fixed is None:
+        return SizePriors(known=dict(settings.known))
+    between = learned.between_maps if learned is not None else BetweenMaps(fixed or 0.0, 0.0)
+    return SizePriors(between_maps=between, another_exam=None, known=dict(settings.known))
+
+
+def answer_of(outcome: Outcome) -> Answer:
+    """Report of an outcome as JSON and text."""
+    from tactile_bayes.posterior.bump import BumpPrior
+    from tactile_bayes.report.estimate_document import estimate_document
+    from tactile_bayes.report.estimate_text import estimate_summary, estimate_text
+    from tactile_bayes.report.quantities import estimate_quantities, lump_place
+
+    tactile_map, estimate, settings = outcome.tactile_map, outcome.estimate, outcome.settings
+    prior = BumpPrior(**(settings.prior or {}))
+    quantities = estimate_quantities(estimate, tactile_map, probability=settings.interval)
+    place = lump_place(estimate.map_posterior, tactile_map, outcome.provenance.scans)
+    document = estimate_document(
+        estimate,
+        tactile_map,
+        probability=settings.interval,
+        prior=prior,
+        provenance=outcome.provenance,
+        quantities=quantities,
+        place=place,
+    )
+    told: dict[str, Any] = {"probability": settings.interval, "masses": document["masses"], "place": place}
+    text = estimate_summary(estimate, quantities, **told)
+    full_text = estimate_text(estimate, tactile_map, prior=prior, quantities=quantities, **told)
+    exit_code = EXIT_DONE if estimate.status == "estimate" else EXIT_NO_ESTIMATE
+    shape, normalise = pooling_shape(tactile_map, estimate), tactile_map.recipe.normalise
+    return Answer(document, text, exit_code, shape, normalise, tactile_map.fingerprint, full_text, tactile_map.head)
+
+
+def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
+    """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
+    import math
+
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.fat import head_profile
+
+    posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
+    if posterior is None or estimate.draws is None:
+        return None
+    angle = 0.0 if turn is None else math.atan2(float(turn[1, 0]), float(turn[0, 0]))
+    return ShapeDraws.of(
+        posterior.amplitude,
+        posterior.sigma_x_mm,
+        posterior.sigma_y_mm,
+        posterior.angle_rad,
+        turn_rad=angle,
+        profile=head_profile(tactile_map.quality),
+        labels=estimate.draws.replicates,
+        oblique=posterior.oblique,
+        irregular=posterior.irregular,
+    )

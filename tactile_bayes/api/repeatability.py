@@ -1,0 +1,334 @@
+"""A site's repeatability: learned from the repeated exams of a campaign's folder, and found for an estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
+from tactile_bayes.records import dataclass
+
+if TYPE_CHECKING:
+    from tactile_bayes.api.settings import Settings
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.learn.site import RepeatedExams
+    from tactile_bayes.size.pooling import Calibration
+    from tactile_bayes.size.site import Repeatability
+
+COMMAND: Final = "calibrate repeatability"
+_AGAIN: Final = "run the campaign again"
+_LEARN: Final = "learn one from exams that were sized so: `calibrate repeatability`; or leave --repeatability out"
+
+
+@dataclass(frozen=True, slots=True)
+class ExamFolder:
+    """An exam that was estimated, of a mass at a visit.
+
+    Parameters
+    ----------
+    name
+        Of the exam.
+    of_mass, mass
+        Names of the mass at this visit, and at any.
+    folder
+        Which holds what its estimate left.
+    """
+
+    name: str
+    of_mass: str
+    mass: str
+    folder: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnedRepeatability:
+    """A repeatability and its JSON object, see data_schema/repeatability.schema.json."""
+
+    repeatability: Repeatability
+    document: dict[str, Any]
+
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write the file that `estimate --repeatability` takes."""
+        from tactile_bayes.files.repeatability_json import write_repeatability
+
+        write_repeatability(path, self.document, force=force)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Repeat:
+    """A repeated exam with a size.
+
+    Parameters
+    ----------
+    calibration, calibration_sha256
+        That sized it, as its estimate names it.
+    scans
+        Recordings that it came from, as `recordings` names them; empty where its estimate does not say.
+    digest
+        Of the draws that pooling keeps.
+    size
+        The largest, with its interval.
+    spread
+        Between exams, that the size was estimated with.
+    """
+
+    exam: ExamFolder
+    calibration: str
+    calibration_sha256: str
+    scans: tuple[str, ...]
+    digest: str
+    size: Mapping[str, float]
+    spread: float
+
+    @property
+    def shape_path(self) -> Path:
+        return self.exam.folder / SHAPE
+
+
+def exams_in(folder: Path) -> list[ExamFolder]:
+    """Exams that a campaign estimated, by its ``exams_done.csv``.
+
+    Raises
+    ------
+    BadDataError
+        When the folder is no campaign's output.
+    """
+    from tactile_bayes.files.tables import read_raw
+
+    table = folder / DONE
+    if not table.is_file():
+        raise BadDataError(f"holds no {DONE}", way_out="give a folder of `campaign run`", path=str(folder))
+    found = []
+    for row in read_raw(table).rows:
+        try:
+            patient, visit, mass, replicate = (row[name] for name in ("patient", "visit", "mass", "replicate"))
+        except KeyError as missing:
+            raise BadDataError(f"has no column {missing}", way_out=_AGAIN, path=str(table)) from None
+        of_mass = mass_name(patient=patient, visit=visit, mass=mass)
+        name = exam_name(of_mass, replicate)
+        if Path(name).name != name:
+            raise BadDataError(f"names an exam {name!r}", way_out=_AGAIN, path=str(table))
+        found.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / EXAMS / name))
+    return found
+
+
+def learn_from_exams(
+    exams: Sequence[ExamFolder], *, size_calibration: str | None = None, fewest: int | None = None
+) -> LearnedRepeatability:
+    """Learn the spread between exams of one mass from those that were repeated within a visit.
+
+    Parameters
+    ----------
+    exams
+        Estimated ones; those without a size and those of a scan that another exam has are left out.
+    size_calibration
+        Name or path of the calibration that they were sized by, where it is in no file that the estimates name.
+    fewest
+        Masses with repeated exams that it takes. Default: `size.learn.repeatability.FEWEST_MASSES`.
+
+    Raises
+    ------
+    BadDataError
+        When too few masses have repeated exams, or the exams were sized by several calibrations or another one.
+    UsageError
+        When the calibration's file is not found, or it is not learned over bodies.
+    """
+    from tactile_bayes.declarations import to_plain
+    from tactile_bayes.files.provenance import Provenance
+    from tactile_bayes.files.repeatability_json import repeatability_document
+    from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, learn_repeatability
+
+    groups, left_out = _repeats(exams)
+    one_by_one = [repeat for group in groups for repeat in group]
+    name, digest = _calibration_named(one_by_one)
+    calibration = _calibration(name, digest, size_calibration) if one_by_one else None
+    masses = [] if calibration is None else [_repeated(group, calibration) for group in groups]
+    learned = learn_repeatability(masses, fewest=fewest or FEWEST_MASSES)
+    assert calibration is not None
+    found = replace(
+        learned.repeatability,
+        calibration=Path(name).name,  # a file's folder may say whose it is
+        calibration_sha256=digest,
+        normalise=calibration.recipe.normalise,
+    )
+    entries = [
+        {
+            "name": mass.name,
+            "exams": [repeat.exam.name for repeat in group],
+            "log_size": [to_plain(value) for value in mass.centre],
+            "map_sd": [to_plain(math.sqrt(value)) for value in mass.noise],
+            "by_chance": to_plain(chance),
+        }
+        for mass, group, chance in zip(masses, groups, learned.by_chance, strict=True)
+    ]
+    settings = {"prior": {"median": PRIOR_MEDIAN, "log_sd": PRIOR_LOG_SD}}
+    inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(one_by_one, start=1)}
+    provenance = Provenance(COMMAND, settings, {"size_calibration": digest, **inputs})
+    half_width = _half_widths(one_by_one, found.sd)
+    document = repeatability_document(
+        found, repeats=entries, left_out=left_out, half_width=half_width, provenance=provenance
+    )
+    return LearnedRepeatability(found, document)
+
+
+def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str]]:
+    """Exams with a size by mass and visit, where there are several, and why others of such masses take no part."""
+    by_mass: dict[str, list[ExamFolder]] = {}
+    for exam in exams:
+        by_mass.setdefault(exam.of_mass, []).append(exam)
+    groups, left_out = [], []
+    for same in by_mass.values():
+        if len(same) < 2:
+            continue
+        group: list[_Repeat] = []
+        scans: dict[str, str] = {}
+        for exam in same:
+            repeat = _read(exam)
+            if repeat is None:
+                left_out.append(f"{exam.name}: it has no size")
+                continue
+            if shared := [scan for scan in repeat.scans if scan in scans]:
+                left_out.append(f"{exam.name}: of the same scan as {scans[shared[0]]}")
+                continue
+            scans |= dict.fromkeys(repeat.scans, exam.name)
+            group.append(repeat)
+        if len(group) > 1:
+            groups.append(group)
+    return groups, left_out
+
+
+def _read(exam: ExamFolder) -> _Repeat | None:
+    """What an exam's estimate says of it; None where it has no size."""
+    from tactile_bayes.files.atomic import sha256
+    from tactile_bayes.files.documents import check_document, load_json
+    from tactile_bayes.files.provenance import recordings, scans_of
+
+    path = exam.folder / ESTIMATE
+    document: Any = load_json(path, way_out=_AGAIN)
+    check_document(document, "estimate.schema.json", path=path)
+    if document["max_size_mm"] is None:
+        return None
+    provenance = document["provenance"]
+    try:
+        calibration = str(provenance["settings"]["size_calibration"]).removesuffix(" (shipped)")
+        digests = {one["role"]: one["sha256"] for one in provenance["inputs"]}
+    except (KeyError, TypeError):
+        raise BadDataError("does not say by which calibration", way_out=_AGAIN, path=str(path)) from None
+    return _Repeat(
+        exam,
+        calibration,
+        digests.get("size_calibration", ""),
+        tuple(recordings(scans_of(provenance))),
+        sha256(exam.folder / SHAPE),
+        document["max_size_mm"],
+        document["diagnostics"].get("between_map_sd") or 0.0,
+    )
+
+
+def _calibration_named(repeats: Sequence[_Repeat]) -> tuple[str, str]:
+    """Name and digest of the one calibration that sized all exams; empty without exams."""
+    found: dict[str, _Repeat] = {}
+    for repeat in repeats:
+        found.setdefault(repeat.calibration_sha256, repeat)
+    if len(found) > 1:
+        named = ", ".join(f"{one.exam.name} by {one.calibration}" for one in list(found.values())[:2])
+        way_out = "their spreads are not comparable: run the campaign with one"
+        raise BadDataError(f"the exams were sized by {len(found)} calibrations ({named})", way_out=way_out)
+    first = next(iter(found.values()), None)
+    return ("", "") if first is None else (first.calibration, first.calibration_sha256)
+
+
+def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
+    """The calibration with this digest: the one given, or that of the name, or a shipped one."""
+    from tactile_bayes.files.atomic import sha256
+    from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.size.bodies import BodyCalibration
+
+    names = [name, *SHIPPED] if given is None else [given]
+    paths = [path for one in names if (path := size_calibration_path(one)) is not None]
+    path = next((path for path in paths if (given is not None or path.is_file()) and sha256(path) == digest), None)
+    if path is None and given is not None:
+        what = f"{given} is not the calibration that the exams were sized by ({name})"
+        raise BadDataError(what, way_out="give that one, or run the campaign again with this one")
+    if path is None:
+        raise UsageError(f"calibration {name}, which sized the exams, is not found; name it by --size-calibration")
+    calibration = read_size_calibration(path)
+    if not isinstance(calibration, BodyCalibration):
+        raise UsageError(f"the spread between exams is learned through a calibration over bodies, which {name} is not")
+    return calibration
+
+
+def _repeated(group: Sequence[_Repeat], calibration: BodyCalibration) -> RepeatedExams:
+    import numpy as np
+
+    from tactile_bayes.files.npz import read_shape
+    from tactile_bayes.size.learn.site import RepeatedExams
+    from tactile_bayes.size.site import log_size_alone
+
+    first = group[0].exam
+    values = np.array([log_size_alone(calibration, read_shape(repeat.shape_path)) for repeat in group])
+    return RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1])
+
+
+def _half_widths(repeats: Sequence[_Repeat], sd: float) -> dict[str, float]:
+    """Half width of a single exam's 95 % interval, as estimated and with this spread: medians over the exams.
+
+    Each interval is taken as a normal of ln d, of which the spread that it was made with is a part.
+    """
+    import numpy as np
+
+    from tactile_bayes.inference.points import normal_quantile
+
+    before, after = [], []
+    for repeat in repeats:
+        size, spread = repeat.size, repeat.spread
+        score = float(normal_quantile(np.array(0.5 + 0.5 * size["probability"])))
+        variance = (math.log(size["high"] / size["low"]) / (2.0 * score)) ** 2
+        before.append(variance)
+        after.append(max(variance - spread**2, 0.0) + sd**2)
+    names = {"as_estimated": before, "with_it": after}
+    return {name: math.expm1(1.96 * float(np.median(np.sqrt(values)))) for name, values in names.items()}
+
+
+def repeatability_digest(settings: Settings) -> dict[str, str]:
+    """Digest of the repeatability's file, as an input of the provenance; empty where there is none."""
+    found = settings.repeatability
+    return {} if found is None or not found.sha256 else {"repeatability": found.sha256}
+
+
+def repeatability_setting(settings: Settings) -> dict[str, Any]:
+    """The repeatability among the settings of a provenance; empty where there is none."""
+    found = settings.repeatability
+    return {} if found is None else {"repeatability": found.as_dict()}
+
+
+def check_repeatability(settings: Settings, calibration: Calibration, digests: Mapping[str, str]) -> None:
+    """Refuse a repeatability of sizes by another calibration: another form has another slope, so another spread.
+
+    Parameters
+    ----------
+    calibration
+        The one that sizes.
+    digests
+        Of the inputs, by role.
+
+    Raises
+    ------
+    BadDataError
+        Naming both.
+    """
+    from tactile_bayes.files.shipped import default_for
+
+    found = settings.repeatability
+    if found is None or digests.get("size_calibration") == found.calibration_sha256:
+        return
+    normalise = calibration.recipe.normalise
+    by = f"{found.calibration} (frames normalised by {found.normalise})"
+    this = f"{settings.calibration_name or default_for(normalise)} (frames normalised by {normalise})"
+    another = "another version of " if this == by else ""
+    raise BadDataError(f"the repeatability is of sizes by {by}, and this size is by {another}{this}", way_out=_LEARN)

@@ -1,0 +1,270 @@
+"""A size calibration corrected by a site's phantoms, from a table of their bumps or of their map files."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.presets import LEAST_HARD_RATIO
+
+if TYPE_CHECKING:
+    from tactile_bayes.api.estimating import Progress
+    from tactile_bayes.files.tables import Sheet, Table
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.learn.site import PhantomMap
+
+HARDEST_RATIO = 100.0
+"""Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """A corrected calibration, with what its file holds.
+
+    Parameters
+    ----------
+    base
+        Document of the calibration that was corrected.
+    settings
+        For the provenance.
+    inputs
+        Files by role, for the provenance.
+    seed
+        Of the random numbers, where maps were estimated.
+    """
+
+    calibration: BodyCalibration
+    base: dict[str, Any]
+    settings: dict[str, Any]
+    inputs: dict[str, Path]
+    seed: int | None = None
+
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write the file that `estimate --size-calibration` takes."""
+        from tactile_bayes.files.provenance import Provenance, hash_inputs
+        from tactile_bayes.files.size_json import write_size_calibration
+
+        assert self.calibration.site is not None
+        provenance = Provenance("calibrate size", self.settings, hash_inputs(**self.inputs), seed=self.seed)
+        write_size_calibration(path, self.calibration, base=self.base, provenance=provenance, force=force)
+
+
+@dataclass(frozen=True, slots=True)
+class _Phantoms:
+    maps: list[PhantomMap]
+    left_out: list[str]
+    inputs: dict[str, Path]
+
+
+def correct_size(
+    table: Path | Sheet, base: str, declared: Mapping[str, Any], *, seed: int = 1, progress: Progress | None = None
+) -> Corrected:
+    """Correct a calibration over bodies by phantoms.
+
+    Parameters
+    ----------
+    table
+        A row for each map of a phantom: its bump (size_table) or its file (phantom_maps).
+    base
+        Name or path of the calibration.
+    declared
+        As for `table_recipe`; for a table of bumps.
+    seed
+        Of the random numbers with which maps are estimated.
+
+    Raises
+    ------
+    BadDataError
+        When the table is not what it must be, its maps were made by another recipe or under another head than the
+        calibration's, or fewer than three phantoms are in its range.
+    UsageError
+        When the calibration cannot be corrected, or options do not go with the table.
+    """
+    from tactile_bayes.files.documents import load_json
+    from tactile_bayes.files.shipped import SHIPPED, size_calibration_path
+    from tactile_bayes.files.size_json import read_size_calibration
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.learn.site import correct_calibration
+
+    path = size_calibration_path(base)
+    calibration = None if path is None else read_size_calibration(path)
+    if path is None or not isinstance(calibration, BodyCalibration):
+        raise UsageError(
+            f"{base} cannot be corrected: it was not learned over bodies; "
+            "give --correct solid, solid-mean or eq6, or a file learned from a table of `population`"
+        )
+    where = table if isinstance(table, Path) else table.name
+    by_files = "file" in _header(table)
+    try:
+        if by_files:
+            _refuse(declared)
+            found = _from_maps(table, base, seed=seed, progress=progress)
+        else:
+            found = _from_bumps(table, calibration, declared)
+        name = base if base in SHIPPED else path.name
+        corrected = correct_calibration(calibration, found.maps, base=name, left_out=found.left_out)
+    except BadDataError as error:
+        raise error.at(where) from None
+    document: Any = load_json(path)
+    inputs = {**({"table": table} if isinstance(table, Path) else {}), "size_calibration": path, **found.inputs}
+    return Corrected(
+        corrected, document, {"correct": name, "of": "maps" if by_files else "bumps", "seed": seed}, inputs
+    )
+
+
+def _header(source: Path | Sheet) -> list[str]:
+    """The names in a table's first line."""
+    if isinstance(source, Path):
+        from tactile_bayes.files.reading import open_input
+
+        with open_input(source) as file:
+            first = file.readline(4096).decode("utf-8-sig", errors="replace")
+    else:
+        first = source.text.partition("\n")[0]
+    return [name.strip() for name in next(csv.reader(io.StringIO(first)), [])]
+
+
+def _refuse(declared: Mapping[str, Any]) -> None:
+    for name, value in declared.items():
+        if value is not None:
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option} is for tables of amplitudes and widths: map files state how they were made")
+
+
+def _from_bumps(source: Path | Sheet, calibration: BodyCalibration, declared: Mapping[str, Any]) -> _Phantoms:
+    """The phantoms of a table of amplitudes and widths."""
+    import numpy as np
+
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.presets import HEAD_PROFILE
+    from tactile_bayes.size.draws import ShapeDraws
+    from tactile_bayes.size.learn.site import PhantomMap
+
+    rows = read_table(source, "size_table.table.json")
+    _check_recipe(rows, calibration, declared)
+    _check_head(rows, calibration)
+    columns, maps, left_out = rows.columns, [], []
+    for i, name in enumerate(_names(rows, [f"line {line}" for line in rows.line_numbers])):
+        if columns["sigma_y_mm"][i] is None:
+            raise rows.error(i, "sigma_y_mm", "is blank", way_out="give both widths of the map")
+        if columns["detectable"][i] is False:
+            left_out.append(f"{name}: its row says that it is not detectable")
+        elif (why := _too_soft(rows, i)) is not None:
+            left_out.append(f"{name}: {why}")
+        else:
+            amplitude, sigma_x, sigma_y = (
+                np.array([columns[one][i]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm")
+            )
+            told = tuple(columns[one][i] for one in HEAD_PROFILE)
+            profile = None if None in told else told
+            shape = ShapeDraws.of(amplitude, sigma_x, sigma_y, np.zeros(1), profile=profile)
+            maps.append(PhantomMap(name, columns["d_mm"][i], shape, _known(rows, i)))
+    return _Phantoms(maps, left_out, {})
+
+
+def _from_maps(source: Path | Sheet, base: str, *, seed: int, progress: Progress | None) -> _Phantoms:
+    """The phantoms of a table of map files, each estimated by the calibration's recipe."""
+    from tactile_bayes.api.estimating import estimate_file, pooling_shape
+    from tactile_bayes.api.settings import Settings
+    from tactile_bayes.files.tables import read_table
+    from tactile_bayes.size.learn.site import PhantomMap
+
+    rows = read_table(source, "phantom_maps.table.json")
+    folder = source.parent if isinstance(source, Path) else Path()
+    settings, columns = Settings(calibration=base, seed=seed), rows.columns
+    maps, left_out, inputs = [], [], {}
+    for i, name in enumerate(_names(rows, [str(one) for one in columns["file"]])):
+        path = folder / columns["file"][i]
+        inputs[f"map_{i + 1}"] = path
+        if (why := _too_soft(rows, i)) is not None:
+            left_out.append(f"{name}: {why}")
+            continue
+        outcome = estimate_file(path, settings)
+        shape = pooling_shape(outcome.tactile_map, outcome.estimate)
+        if shape is None:
+            left_out.append(f"{columns['file'][i]}: {outcome.estimate.reason}")
+        else:
+            maps.append(PhantomMap(name, columns["d_mm"][i], shape, _known(rows, i)))
+        if progress is not None:
+            progress(i + 1, len(rows))
+    return _Phantoms(maps, left_out, inputs)
+
+
+def _names(rows: Table, otherwise: list[str]) -> list[str]:
+    """Name of the phantom of each row; rows of one phantom must state the same properties."""
+    told = rows.columns["phantom"]
+    names = [other if name is None else name for name, other in zip(told, otherwise, strict=True)]
+    first: dict[str, int] = {}
+    for i, name in enumerate(names):
+        j = first.setdefault(name, i)
+        for column in ("d_mm", "depth_ratio", "stiffness_ratio", "seat"):
+            here, there = rows.columns[column][i], rows.columns[column][j]
+            if here != there:
+                what = f"is {here}, but {there} in another row of {name}"
+                raise rows.error(i, column, what, way_out="give each lump a name of its own")
+    return names
+
+
+def _known(rows: Table, i: int) -> dict[str, float]:
+    """The properties of a row's phantom, by the names of `HiddenTerms`."""
+    from tactile_bayes.forward.body import parse_seat
+
+    row = {name: values[i] for name, values in rows.columns.items()}
+    found: dict[str, float] = {}
+    if row["depth_ratio"] is not None:
+        found["depth_mm"] = row["depth_ratio"] * row["d_mm"]
+    if row["stiffness_ratio"] is not None:
+        found["stiffness_ratio"] = min(row["stiffness_ratio"], HARDEST_RATIO)
+    if row["seat"] is not None:
+        try:
+            found["seat"] = parse_seat(row["seat"])
+        except BadDataError as error:
+            raise rows.error(i, "seat", f"is {row['seat']!r}", way_out=error.way_out) from None
+    return found
+
+
+def _too_soft(rows: Table, i: int) -> str | None:
+    """Why a lump is too soft for a calibration over bodies with hard ones."""
+    ratio = rows.columns["stiffness_ratio"][i]
+    if ratio is None or ratio >= LEAST_HARD_RATIO:
+        return None
+    return f"its stiffness_ratio is {ratio:g}, and the calibration's lumps have {LEAST_HARD_RATIO:g} and more"
+
+
+def _check_recipe(rows: Table, calibration: BodyCalibration, declared: Mapping[str, Any]) -> None:
+    """Refuse a table of maps that were made or fitted otherwise than the calibration's."""
+    from tactile_bayes.api.size_calibration import table_recipe
+
+    recipe, ours = table_recipe(rows, declared), calibration.recipe
+    differs = ours.differences(
+        normalise=recipe.normalise,
+        background=recipe.background,
+        radius_mm=recipe.radius_mm,
+        noise=recipe.noise,
+        flat_field=recipe.flat_field,
+        head=recipe.head,
+    )
+    if differs:
+        raise BadDataError(
+            f"its maps were made by another recipe: {'; '.join(differs)}",
+            way_out=f"a correction needs maps made with {ours.map_command}, fitted by `estimate` with the calibration "
+            f"({ours}), and the table's columns must say so; or list the map files in a column named file",
+        )
+
+
+def _check_head(rows: Table, calibration: BodyCalibration) -> None:
+    """Refuse a table of maps from a head with another radius than the calibration's, where it names no more of it."""
+    head = calibration.recipe.head
+    if head is None:
+        return
+    ours = "that is flat" if head.radius_mm is None else f"with a radius of {head.radius_mm:g} mm"
+    for i, radius_mm in enumerate(rows.columns["head_radius_mm"]):
+        if radius_mm is not None and head.differences(replace(head, radius_mm=radius_mm)):
+            what = f"is {radius_mm:g}, and the calibration is for a head {ours}"
+            raise rows.error(i, "head_radius_mm", what, way_out="learn a calibration for this head")

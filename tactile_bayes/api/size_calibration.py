@@ -1,0 +1,352 @@
+"""Size calibrations of either form from a table of lumps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.presets import FIT_RADIUS_MM, LEAST_HARD_RATIO, Background, Noise
+
+if TYPE_CHECKING:
+    from tactile_bayes.api.estimating import Progress
+    from tactile_bayes.files.tables import Sheet, Table
+    from tactile_bayes.scan import HeadShape
+    from tactile_bayes.size.bodies import BodyCalibration
+    from tactile_bayes.size.eq6 import LeftOutErrors, SizeCalibration
+    from tactile_bayes.size.learn.eq6 import OtherFit, SizeTable, StudyCases
+    from tactile_bayes.size.terms import Normalise, Recipe
+
+_SOURCE = "balls in a population of bodies, scanned by the solid model"
+
+
+EqSixFit = Literal["joint", "two-stage"]
+PopulationForm = Literal["eq6", "eq6-residual"]
+FORMS: tuple[PopulationForm, ...] = ("eq6", "eq6-residual")
+"""What can be learned from a table of `population`; only the first from a table of lumps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """A learned size calibration, with its table and the settings for its provenance.
+
+    Parameters
+    ----------
+    lumps
+        Rows of the table as Eq 6 takes them.
+    not_left_out
+        Why no geometry could be left out; empty where they were, or the table is no study.
+    other_fit
+        What the other of the two fits makes of the table; None where it has none.
+    """
+
+    calibration: SizeCalibration
+    lumps: SizeTable
+    not_left_out: str
+    settings: dict[str, Any]
+    other_fit: OtherFit | None = None
+
+
+def learn_eq6(
+    rows: Table,
+    declared: Mapping[str, Any],
+    *,
+    fit: EqSixFit = "joint",
+    least_stiffness_ratio: float = 0.0,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> Learned:
+    """Learn Eq 6 from a table of lumps.
+
+    Parameters
+    ----------
+    declared
+        As for `table_recipe`.
+    fit
+        ``"joint"``: the posterior of all coefficients from all rows; ``"two-stage"``: as printed, with a bootstrap.
+    least_stiffness_ratio
+        Softer lumps take no part.
+
+    Raises
+    ------
+    BadDataError
+        When the table does not hold what Eq 6 needs.
+    NotConvergedError
+        When the sampler does not converge.
+    """
+    import numpy as np
+
+    from tactile_bayes.declarations import replace
+    from tactile_bayes.size.learn.eq6 import learn_size_calibration, learn_two_stage, other_fit
+
+    recipe = table_recipe(rows, declared)
+    try:
+        lumps = size_table(rows, least_stiffness_ratio=least_stiffness_ratio)
+        rng = np.random.default_rng(seed)
+        if fit == "two-stage":
+            calibration = learn_two_stage(lumps, recipe=recipe, rng=rng)
+        else:
+            calibration = learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
+        other = other_fit(calibration, lumps)
+        left_out, silent = _left_out(lumps, fit, least_stiffness_ratio=least_stiffness_ratio)
+    except BadDataError as error:
+        raise error.at(rows.path) from None
+    settings = {
+        "normalise": recipe.normalise,
+        "background": recipe.background,
+        "fit_radius_mm": recipe.radius_mm,
+        "noise": recipe.noise,
+        "least_stiffness_ratio": least_stiffness_ratio,
+        "fit": fit,
+    }
+    cautions = table_cautions(rows.columns, least_stiffness_ratio=least_stiffness_ratio)
+    learned = replace(calibration, left_out=left_out, cautions=cautions)
+    return Learned(learned, lumps, silent, settings, other)
+
+
+def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
+    """What makes sizes by Eq 6 of a table of lumps doubtful, in words; see docs/decisions/0093 for the figures."""
+    found, seats = [], set(columns["seat"])
+    if set(columns["sigma_y_mm"]) == {None}:
+        found.append(
+            "its lumps have one width; if they were cylinders, as in a study in two dimensions, "
+            "balls come out 40 to 110 % too large"
+        )
+    if len(seats) == 1 and None not in seats:
+        found.append(f"its lumps have one seat ({seats.pop()}); one of another seat may come out half too large")
+    softest = min((ratio for ratio in columns["stiffness_ratio"] if ratio is not None), default=LEAST_HARD_RATIO)
+    if max(softest, least_stiffness_ratio) < LEAST_HARD_RATIO:
+        found.append("it holds soft lumps, beside which hard ones come out too large (--least-stiffness-ratio 8)")
+    return tuple(found)
+
+
+def learn_population(
+    rows: Table, form: PopulationForm, normalise: str | None = None, *, against: Table | None = None
+) -> tuple[BodyCalibration, dict[str, Any]]:
+    """Learn a calibration from a table of `population`; the calibration, and settings for its provenance.
+
+    Parameters
+    ----------
+    form
+        One of `FORMS`.
+    normalise
+        Of the rows to learn from; may be left out where all are alike.
+    against
+        Lumps of another origin, in the same columns: they tell by how much such bodies depart.
+
+    Raises
+    ------
+    BadDataError
+        When bodies are too few or do not vary.
+    NotConvergedError
+        When the posterior has no mode.
+    """
+    from tactile_bayes.declarations import replace
+    from tactile_bayes.size.learn import bodies as learning
+    from tactile_bayes.size.terms import Recipe
+    from tactile_bayes.studies.population import measuring_options, population_table, table_bodies, table_head
+
+    fit = measuring_options().fit
+    way, columns = rows_of_one_way(rows, normalise)
+    settings: dict[str, Any] = {"form": form, "masses": len(set(columns["body"])), "bodies": table_bodies(columns)}
+    try:
+        head = table_head(columns)
+        recipe = Recipe(
+            way, fit.background, fit.radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
+        )
+        found = learning.learn_population(
+            population_table(columns), recipe=recipe, source=_SOURCE, residual=form == "eq6-residual"
+        )
+    except BadDataError as error:
+        raise error.at(rows.path) from None
+    if form == "eq6-residual" and found.residual is None:
+        raise BadDataError(
+            f"fewer than {learning.LEAST_BODIES} bodies have a lump and a head profile: too few for a residual",
+            way_out="give a larger population, or --form eq6",
+            path=str(rows.path),
+        )
+    found = replace(found, bodies=settings["bodies"])
+    if against is not None:
+        _, others = rows_of_one_way(against, way)
+        other_table = population_table(others)
+        source = f"{len(set(other_table.body.tolist()))} lumps of {against.path.name}"
+        found = learning.learn_other_sd(found, other_table, source=source)
+        settings["other_masses"] = len(set(other_table.body.tolist()))
+    return found, settings
+
+
+def is_population(source: Path | Sheet) -> bool:
+    """Whether a table is one of `population`: exams of bodies, by its header."""
+    if isinstance(source, Path):
+        from tactile_bayes.files.reading import open_input
+
+        with open_input(source) as file:
+            header = file.readline(4096).decode("utf-8-sig", errors="replace")
+    else:
+        header = source.text.partition("\n")[0]
+    return {"body", "exam"} <= {name.strip() for name in header.split(",")}
+
+
+def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
+    """Recipe of a size table's maps: from its columns, else as declared, else the default.
+
+    Parameters
+    ----------
+    declared
+        The options ``normalise``, ``background``, ``fit_radius_mm`` and ``noise``; None where one was not given.
+
+    Raises
+    ------
+    BadDataError
+        When rows differ in it, or the table says something else than an option.
+    UsageError
+        When a level is to be fixed on maps that have none.
+    """
+    from tactile_bayes.errors import UsageError
+    from tactile_bayes.size.terms import Recipe
+
+    said = {name: _alike(table, name) for name in (*declared, "flat_field")}
+    for name, value in declared.items():
+        if None not in (value, said[name]) and value != said[name]:
+            raise _contradiction(table, name, said[name], value)
+    found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
+    normalise: Normalise = found["normalise"] or "mean"
+    background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
+    if normalise == "none" and background == "fixed":
+        raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
+    radius_mm = found["fit_radius_mm"] or FIT_RADIUS_MM
+    noise: Noise = found["noise"] or "independent"
+    by_hand = any(said[name] is None for name in declared)
+    return Recipe(
+        normalise,
+        background,
+        radius_mm,
+        declared=by_hand,
+        noise=noise,
+        flat_field=said["flat_field"],
+        head=_named_head(table),
+    )
+
+
+def _named_head(table: Table) -> HeadShape | None:
+    """Head that a table of lumps names; None where it does not."""
+    from tactile_bayes.scan import HeadShape
+
+    names = ("head_rows", "head_columns", "head_pitch_mm")
+    values = [_alike(table, name) for name in names]
+    if values == [None, None, None]:
+        return None
+    if None in values:
+        what = f"names a head without {names[values.index(None)]}"
+        raise BadDataError(what, way_out=f"give {', '.join(names)} and head_radius_mm", path=str(table.path))
+    return HeadShape(values[0], values[1], values[2], _alike(table, "head_radius_mm"))
+
+
+def _alike(table: Table, name: str) -> Any:
+    """Value of a column that must be the same in all rows."""
+    values = table.columns[name]
+    if len(set(values)) > 1:
+        what = f"{name} differs between rows"
+        raise BadDataError(what, way_out="join tables of maps made alike only", path=str(table.path))
+    return values[0]
+
+
+def _contradiction(table: Table, name: str, said: object, declared: object) -> BadDataError:
+    option = f"--{name.replace('_', '-')}"
+    way_out = f"leave out {option}"
+    if name == "normalise":
+        way_out += f", and size maps made with `map --normalise {said}`"
+        way_out += "; `population` gives a table for --normalise gain"
+    what = f"its {name} is {said}, not {declared} as {option} says"
+    return BadDataError(what, way_out=way_out, path=str(table.path))
+
+
+def _left_out(lumps: SizeTable, fit: EqSixFit, *, least_stiffness_ratio: float) -> tuple[LeftOutErrors | None, str]:
+    """Cross-validated errors, or the reason why Eq 6 has none."""
+    from tactile_bayes.errors import NotConvergedError
+    from tactile_bayes.size.learn.cross_validation import left_out_of_study
+    from tactile_bayes.size.learn.eq6 import axis_in_two_stages
+
+    one_axis = axis_in_two_stages if fit == "two-stage" else None
+    try:
+        return left_out_of_study(lumps, least_stiffness_ratio=least_stiffness_ratio, fit=one_axis), ""
+    except (NotConvergedError, BadDataError) as error:
+        return None, str(error)
+
+
+def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict[str, list[Any]]]:
+    """How a `population` table's maps were normalised, and its columns for the rows that were.
+
+    Tables without the column, and empty cells, are of maps normalised by the mean.
+    """
+    ways = [str(value or "mean") for value in rows.columns.get("normalise", ["mean"] * len(rows))]
+    found = sorted(set(ways))
+    if normalise is None and len(found) > 1:
+        raise BadDataError(
+            f"its maps were normalised in several ways ({', '.join(found)})",
+            way_out=f"learn from the rows of one way: --normalise {found[0]}",
+            path=str(rows.path),
+        )
+    chosen = normalise or found[0]
+    if chosen not in found:
+        raise BadDataError(
+            f"none of its maps were made with --normalise {chosen}",
+            way_out=f"give --normalise {found[0]}",
+            path=str(rows.path),
+        )
+    kept = [i for i, way in enumerate(ways) if way == chosen]
+    return cast("Normalise", chosen), {name: [values[i] for i in kept] for name, values in rows.columns.items()}
+
+
+def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> SizeTable:
+    """Columns of a table as arrays, with Delta sigma where depths are given; without softer lumps."""
+    import numpy as np
+
+    from tactile_bayes.errors import BadDataError
+    from tactile_bayes.size.learn.eq6 import SizeTable, width_changes
+
+    # only lumps marked as detectable: fits to the others describe a trough
+    shown = [
+        flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
+        for flag, ratio in zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
+    ]
+    columns = {
+        name: [v for v, keep in zip(values, shown, strict=True) if keep] for name, values in table.columns.items()
+    }
+
+    def array(name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None:
+        values = columns[name]
+        if all(value is None for value in values):
+            return None
+        if any(value is None for value in values):
+            row = table.columns[name].index(None)
+            raise table.error(row, name, "is blank in some rows only", way_out="fill the column or leave it out")
+        return np.asarray(values, dtype=np.float64)
+
+    d_mm, amplitude, sigma_x, sigma_y = (array(n) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))
+    depth = array("depth_ratio")
+    if d_mm is None or amplitude is None or sigma_x is None:
+        raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
+    if depth is None:
+        return SizeTable(d_mm, amplitude, sigma_x, sigma_y)
+    same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]
+    group = list(zip(*same, strict=True))
+    change_x = width_changes(sigma_x, depth_ratio=depth, group=group)
+    change_y = None if sigma_y is None else width_changes(sigma_y, depth_ratio=depth, group=group)
+    return SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns), depth)
+
+
+def _study_cases(columns: dict[str, list[Any]]) -> StudyCases | None:
+    """Study case of each row; None where a row lacks the lump's stiffness."""
+    import numpy as np
+
+    from tactile_bayes.size.learn.eq6 import StudyCases
+
+    if None in columns["stiffness_ratio"]:
+        return None
+    depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))
+    told = {name: columns[name] for name in ("thickness_mm", "head_radius_mm") if None not in columns[name]}
+    others = {name: np.asarray(values, dtype=np.float64) for name, values in told.items()}
+    return StudyCases(tuple(columns["seat"]), depth, ratio, others)

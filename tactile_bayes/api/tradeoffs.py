@@ -1,0 +1,117 @@
+"""The trade of time for accuracy on a user's own maps and scans: calibration and options as `estimate` takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tactile_bayes.api.estimating import Answer, answer_of, estimate_file, estimate_inputs
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError, UsageError
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.map import TactileMap
+    from tactile_bayes.posterior.options import EstimateOptions
+    from tactile_bayes.scan import Scan
+    from tactile_bayes.size.pooling import Calibration, PooledEstimate
+    from tactile_bayes.studies.estimate_tradeoff import Clock, Ladder, PooledRow, Work
+    from tactile_bayes.studies.size_answers import SizeAnswer
+
+
+def tradeoff_of_map(path: Path, settings: Settings, work: Work) -> tuple[TactileMap, Ladder]:
+    """Every setting of `estimate` on a map that need not be built again; the map too.
+
+    Raises
+    ------
+    BadDataError
+        When the file is no map, or the calibration that was named does not fit it.
+    UsageError
+        When the settings name a checkpoint: the runs are many.
+    """
+    from tactile_bayes.files.map_nc import read_map
+    from tactile_bayes.studies.estimate_tradeoff import measure
+
+    _refuse_checkpoint(settings)
+    tactile_map = read_map(path)
+    try:
+        calibration, options, _ = estimate_inputs(settings, tactile_map)
+        return tactile_map, measure(tactile_map, calibration=calibration, options=options, work=_of(settings, work))
+    except BadDataError as error:
+        raise error.at(path) from None
+
+
+def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
+    """The size by the first map of one mass, by the first two, and so on.
+
+    Raises
+    ------
+    BadDataError
+        When a file is no map, or the maps were normalised in several ways.
+    UsageError
+        When the calibration cannot pool maps.
+    """
+    from tactile_bayes.api.pooled import of_one_mass, pool_answers
+    from tactile_bayes.studies.estimate_tradeoff import PooledRow
+
+    def at_place(i: int, place: tuple[float, float]) -> Answer:
+        return answer_of(estimate_file(paths[i], replace(settings, centre_mm=place)))
+
+    rows, answers, spent = [], [], 0.0
+    for number, path in enumerate(paths, start=1):
+        begun = clock()
+        answers.append(answer_of(estimate_file(path, settings)))
+        spent += clock() - begun
+        begun = clock()
+        if settings.centre_mm is None:
+            answers = of_one_mass(answers, at_place)
+        pooled = pool_answers(answers, settings, names=[one.stem for one in paths[:number]], inputs={}).pooled
+        pooling = clock() - begun
+        rows.append(PooledRow(number, spent + pooling, *_pooled_answer(pooled, settings)))
+    return tuple(rows)
+
+
+def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnswer, float]:
+    """The size of this exam, and half the width of the interval of another one."""
+    from tactile_bayes.studies.size_answers import SIZE, SizeAnswer
+
+    if pooled.size is None:
+        return SizeAnswer(pooled.reason), float("nan")
+    found = {SIZE: pooled.size.summarise(SIZE, probability=settings.interval)}
+    answer = SizeAnswer("", None, found, settings.method, pooled.size.variance_share)
+    if pooled.size.another_exam is None:
+        return answer, float("nan")
+    another = pooled.size.another_exam.summarise(SIZE, probability=settings.interval)
+    return answer, 0.5 * (another.high - another.low)
+
+
+def tradeoff_of_scan(scan: Scan, settings: Settings, work: Work) -> Ladder:
+    """Every setting of `map` on a scan, each with an estimate by default of the map that it makes.
+
+    Raises
+    ------
+    BadDataError
+        When no map can be built by default.
+    UsageError
+        When the settings name a checkpoint: the runs are many.
+    """
+    from tactile_bayes.studies.tradeoffs import measure_map as measure
+
+    _refuse_checkpoint(settings)
+
+    def inputs(tactile_map: TactileMap) -> tuple[Calibration | None, EstimateOptions]:
+        calibration, options, _ = estimate_inputs(settings, tactile_map)
+        return calibration, options
+
+    return measure(scan, inputs=inputs, work=_of(settings, work))
+
+
+def _of(settings: Settings, work: Work) -> Work:
+    """The work with the settings' seed and interval."""
+    return replace(work, seed=settings.seed, probability=settings.interval)
+
+
+def _refuse_checkpoint(settings: Settings) -> None:
+    if settings.checkpoint is not None:
+        raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")

@@ -1,0 +1,3 @@
+"""Estimation from map files: choice of calibration and options, estimate and report, shared by all callers."""
+
+from __future__ import annotations

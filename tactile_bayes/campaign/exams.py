@@ -1,0 +1,340 @@
+"""The exams of a folder: what is there, a first list of them, and what is said of it."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.campaign_names import JOURNAL
+from tactile_bayes.files.manifest_csv import natural
+from tactile_bayes.files.remote import check_address, fetched, files_below, is_address
+from tactile_bayes.records import dataclass
+
+# --- What a file says of its exam: facts of the session, and the files that it was made from.
+
+SCANS: Final = (".mcap", ".npz")
+MAP: Final = ".nc"
+_FACTS: Final = {"patient": "subject", "visit": "visit", "mass": "mass", "side": "side", "reader": "examiner"}
+"""Columns of the table of exams, and what a scan calls the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What a file says of its exam.
+
+    Parameters
+    ----------
+    facts
+        By the columns of the table of exams.
+    sources
+        SHA-256 of the files that it was made from.
+    """
+
+    facts: Mapping[str, str] = field(default_factory=dict)
+    sources: frozenset[str] = frozenset()
+
+
+def said_by(path: Path, name: str) -> Said:
+    """What a scan, arrays of a scan or a map say of the exam.
+
+    Raises
+    ------
+    BadDataError
+        When the table takes no such name, or the file is none of these.
+    """
+    check_name(name)
+    if name.lower().endswith(".npz"):
+        return Said()
+    return _of_map(path) if name.lower().endswith(MAP) else _of_scan(path)
+
+
+def check_name(name: str) -> None:
+    """Refuse the name of a file that a table of exams does not take."""
+    if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
+        raise BadDataError("the table takes no such file name: rename it")
+
+
+def _of_scan(path: Path) -> Said:
+    from tactile_bayes.files.scan_mcap import json_object, scan_records
+
+    metadata = scan_records(path, keep=()).metadata
+    made = json_object(metadata.get("provenance", {}).get("json", "{}"), name="provenance").get("inputs")
+    inputs = made if isinstance(made, list) else []
+    sources = frozenset(str(one.get("sha256")) for one in inputs if isinstance(one, dict))
+    return Said(_facts([metadata.get("session", {})]), sources)
+
+
+def _of_map(path: Path) -> Said:
+    from tactile_bayes.files.map_nc import read_map_and_scans
+
+    _, scans = read_map_and_scans(path)
+    return Said(_facts(scans), frozenset(one["sha256"] for one in scans if "sha256" in one))
+
+
+def _facts(sessions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Facts on which all scans of a file agree."""
+    told = {column: {session.get(key) or "" for session in sessions} for column, key in _FACTS.items()}
+    return {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
+
+
+# --- Files of a folder that may be exams, and which of them are the same exam twice.
+
+_ENDINGS: Final = (*SCANS, MAP)
+_ASIDE: Final = (".", "~$")
+"""Names of what systems and spreadsheets leave beside files begin so."""
+
+
+class FolderFiles:
+    """Files of a folder of this computer and of those below it.
+
+    Parameters
+    ----------
+    folder
+        Folders in it that a campaign wrote are passed over.
+    table
+        Where the table of exams will be: names are paths from its folder.
+
+    Attributes
+    ----------
+    paths
+        By name, of files that may be exams, in a fixed order.
+    others
+        How many other files there are, by the ends of their names.
+    closed
+        Folders in it that cannot be read, with the reason.
+
+    Raises
+    ------
+    UsageError
+        When the folder is none or cannot be read, or the table would lie outside it and not above it.
+    """
+
+    def __init__(self, folder: Path, table: Path) -> None:
+        if not folder.is_dir():
+            raise UsageError(f"{folder} is not a directory; give the folder of the scans")
+        base = Path(os.path.realpath(table.parent))
+        if not Path(os.path.realpath(folder)).is_relative_to(base):
+            way_out = "write the table beside the scans"
+            raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; {way_out}")
+        self.paths: dict[str, Path] = {}
+        self.others: Counter[str] = Counter()
+        self.closed: list[str] = []
+        self._digests: dict[str, str] = {}
+        own = Path(os.path.realpath(table))
+        for path in _walk(folder, self.closed):
+            if path.name.lower().endswith(_ENDINGS):
+                name = os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)
+                self.paths[name] = path
+            elif Path(os.path.realpath(path)) != own:
+                self.others[path.suffix.lower() or "no ending"] += 1
+
+    def repeated(self, said: Mapping[str, Said], listed: Collection[str]) -> dict[str, str]:
+        """Names of files that are no further exam, each with the reason.
+
+        Of files of the same bytes the one that is listed stays, else that of the shortest name. Of a scan and its map,
+        and of a scan and the arrays that it was imported from, the scan stays, unless the other is listed.
+
+        Parameters
+        ----------
+        said
+            By name, of the files that can be read.
+        listed
+            Names that the table of exams has already.
+        """
+        found: dict[str, str] = {}
+        for names in self._alike(said):
+            first, *copies = sorted(names, key=lambda name: (name not in listed, len(name), name))
+            found |= {name: f"holds the same bytes as {first}" for name in copies if name not in listed}
+        for made, original in self._made_of({name: one for name, one in said.items() if name not in found}):
+            arrays = original.lower().endswith(".npz")  # which say less of the exam than the scan that they became
+            first, second = (made, original) if arrays else (original, made)
+            if second in listed and first not in listed:
+                first, second = second, first
+            if second not in listed:
+                words = "was made from" if second == made else "was made into"
+                found.setdefault(second, f"{words} {first}, which is an exam")
+        return found
+
+    def _alike(self, said: Mapping[str, Said]) -> Iterator[list[str]]:
+        """Names of readable files of the same bytes."""
+        of_size: dict[int, list[str]] = defaultdict(list)
+        for name in said:
+            of_size[self.paths[name].stat().st_size].append(name)
+        for names in of_size.values():
+            same: dict[str, list[str]] = defaultdict(list)
+            for name in names if len(names) > 1 else ():
+                same[self._digest(name)].append(name)
+            yield from (alike for alike in same.values() if len(alike) > 1)
+
+    def _made_of(self, said: Mapping[str, Said]) -> Iterator[tuple[str, str]]:
+        """Maps and imported scans, each with the name of a file that it was made from."""
+        made = {name: one.sources for name, one in said.items() if one.sources}
+        if not made:
+            return
+        by_digest = {self._digest(name): name for name in said if not name.lower().endswith(MAP)}
+        for name, sources in made.items():
+            original = next((by_digest[digest] for digest in sorted(sources) if digest in by_digest), None)
+            if original is not None and original != name:
+                yield name, original
+
+    def _digest(self, name: str) -> str:
+        from tactile_bayes.files.atomic import sha256
+
+        if name not in self._digests:
+            self._digests[name] = sha256(self.paths[name])
+        return self._digests[name]
+
+
+def _walk(folder: Path, closed: list[str]) -> Iterator[Path]:
+    """Files in a fixed order, without those that systems leave beside others; folders that cannot be read are noted."""
+
+    def skip(error: OSError) -> None:
+        if error.filename == os.fspath(folder):
+            raise UsageError(f"{folder} cannot be read ({error.strerror}); give a folder that can")
+        closed.append(f"{error.filename}: cannot be read ({error.strerror})")
+
+    for place, folders, names in os.walk(folder, onerror=skip):
+        if JOURNAL in names:
+            folders.clear()
+            continue
+        folders.sort()
+        yield from (Path(place) / name for name in sorted(names) if not name.startswith(_ASIDE))
+
+
+# --- A table of exams from a folder of scans and what they carry, new or added to one that is there.
+
+_DEFAULTS: Final = {"patient": "", "visit": "1", "mass": "1", "side": ""}
+"""Cells of a scan that does not say; patient and side are left blank, for somebody to fill in."""
+_CODES: Final = ("patient", "visit", "mass")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Rows for exams.csv, and what somebody should know of the folder.
+
+    Parameters
+    ----------
+    rows
+        Of files that the table does not list yet.
+    skipped
+        Files that give none, with the reason.
+    spelled
+        Codes that a file writes in other capitals than the table, in words.
+    gone
+        Files that the table lists and that are not there.
+    others
+        How many files are no exams by their names, by the ends of these.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    spelled: list[str] = field(default_factory=list)
+    gone: list[str] = field(default_factory=list)
+    others: Mapping[str, int] = field(default_factory=dict)
+
+
+def find_exams(folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = ()) -> Found:
+    """Look through a folder and those below it for scans (.mcap), arrays of scans (.npz) and maps (.nc).
+
+    Parameters
+    ----------
+    folder
+        Of this computer, or the address of one in an object store, whose maps are passed over.
+    table
+        Where the table is or will be: paths are written from its folder.
+    listed
+        Rows that the table has already.
+
+    Raises
+    ------
+    UsageError
+        When the folder is none or cannot be read, or the table would lie outside it and not above it.
+    """
+    known = {_normal(row["file"]): row for row in listed}
+    found = _stored(folder, known) if isinstance(folder, str) else _local(folder, table, known)
+    found.spelled.extend(_spell_as(listed, found.rows))
+    found.rows.sort(key=_order)
+    _number(found.rows, listed)
+    found.gone.extend(row["file"] for name, row in known.items() if _is_gone(table.parent, name))
+    return found
+
+
+def _order(row: Mapping[str, str]) -> tuple[Any, ...]:
+    return natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"]
+
+
+def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]]) -> Found:
+    files = FolderFiles(folder, table)
+    said: dict[str, Said] = {}
+    found = Found(skipped=files.closed, others=files.others)
+    for name, path in files.paths.items():
+        try:
+            said[name] = said_by(path, name)
+        except BadDataError as error:
+            if name not in known:
+                found.skipped.append(f"{name}: {error.what}")
+    repeated = files.repeated(said, known)
+    found.skipped.extend(f"{name}: {reason}" for name, reason in repeated.items())
+    new = (name for name in said if name not in repeated and name not in known)
+    found.rows.extend({"file": name, **_DEFAULTS, **said[name].facts} for name in new)
+    return found
+
+
+def _stored(address: str, known: Mapping[str, Mapping[str, str]]) -> Found:
+    """Scans in an object store, each named by its address."""
+    found = Found()
+    for one in files_below(check_address(address), *SCANS):
+        if one in known:
+            continue
+        try:
+            check_name(one)
+            with fetched(one) as copy:
+                facts = said_by(copy, one).facts
+        except BadDataError as error:
+            found.skipped.append(f"{one}: {error.what}")
+        else:
+            found.rows.append({"file": one, **_DEFAULTS, **facts})
+    return found
+
+
+def _normal(name: str) -> str:
+    return name if is_address(name) else os.path.normpath(name)
+
+
+def _is_gone(folder: Path, name: str) -> bool:
+    return not is_address(name) and not os.path.lexists(folder / name)
+
+
+def _spell_as(listed: Iterable[Mapping[str, str]], rows: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Write codes that differ by capitals alone as the table or the first file does; `campaign run` takes one way."""
+    first: dict[tuple[str, str, str], str] = {}
+    for row in listed:
+        for column in _CODES:
+            first.setdefault(_code_key(row, column), row[column])
+    for new in sorted(rows, key=lambda row: str(row["file"])):
+        for column in _CODES:
+            code = new[column]
+            new[column] = first.setdefault(_code_key(new, column), code)
+            if code != new[column]:
+                yield f"{new['file']}: its {column} {code} is written {new[column]}, as in another row"
+
+
+def _code_key(row: Mapping[str, str], column: str) -> tuple[str, str, str]:
+    """What a code shares with those that differ from it by capitals alone; visits and masses are of one patient."""
+    return column, "" if column == "patient" else row["patient"].casefold(), row[column].casefold()
+
+
+def _number(rows: Sequence[dict[str, Any]], listed: Iterable[Mapping[str, str]]) -> None:
+    """Number the exams of each mass at each visit, in the order of their files, after those listed."""
+    last: dict[tuple[str, ...], int] = {}
+    for row in listed:
+        key = tuple(row[name] for name in _CODES)
+        last[key] = max(last.get(key, 0), int(row["replicate"]) if row["replicate"].isdigit() else 0)
+    for new in rows:
+        key = tuple(new[name] for name in _CODES)
+        new["replicate"] = last[key] = last.get(key, 0) + 1

@@ -1,0 +1,317 @@
+"""What a campaign reads and where it writes."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.batch import CLUSTER_LOST, run_batch
+from tactile_bayes.batch_store import BatchStore, open_store
+from tactile_bayes.campaign.match import Breasts
+from tactile_bayes.campaign.settings import STAGED, clear_staged, put_in_place, stamp
+from tactile_bayes.campaign.steps import FILES, UNWRITTEN, Result
+from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
+from tactile_bayes.files.atomic import sha256, unwritable
+from tactile_bayes.files.campaign_names import EXAMS, GROWTH, JOURNAL, MASSES
+from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.remote import sha256_of, version_of
+from tactile_bayes.records import dataclass
+
+# --- The output folder of a campaign: its journal, and the files that belong to its steps.
+
+_HEADER: Final = {"campaign": 1}
+_BESIDE: Final = ("repeatability",)
+"""Steps whose files lie beside the exams."""
+_OTHERS: Final = ("pool", "compare", *_BESIDE)
+"""Steps that are of no single exam."""
+
+
+@contextlib.contextmanager
+def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | None]:
+    """Open the journal of a folder, which is made if need be; for a dry run read it only, None where there is none.
+
+    Raises
+    ------
+    UsageError
+        When the folder holds something else, another run is using it, or it cannot be made or read.
+    """
+    journal = folder / JOURNAL
+    try:
+        begun, used = journal.exists(), folder.is_dir() and any(folder.iterdir())
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be read ({error.strerror}); choose another folder") from None
+    if not begun:
+        if used:
+            raise UsageError(f"{folder} holds files, and no campaign; choose a new folder")
+        if dry:
+            yield None
+            return
+        _make(folder)
+    with open_store(journal, settings=_HEADER, encode=_taken, read_only=dry) as store:
+        yield store
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error) from None
+
+
+def _taken(result: Result) -> Result:
+    """Put a result's files in place for the journal; the campaign stops where the disk does not take them."""
+    fault = result.get(UNWRITTEN)
+    if fault is None:
+        try:
+            return put_in_place(result)
+        except FileNotFoundError:
+            fault = f"a worker's files are not in {result[STAGED]['folder']}: do all machines see this folder?"
+        except OSError as error:
+            fault = str(error)
+    raise UsageError(f"{fault}; what is done is kept: run again to go on")
+
+
+def unchanged(folder: Path, result: Result) -> bool:
+    """Whether the files of a step are still what it wrote: by their stamps, and where these differ by their digests."""
+    stamps = result.get("stamps", {})
+    return all(_same(folder / name, digest, stamps.get(name)) for name, digest in result["files"].items())
+
+
+def _same(path: Path, digest: str, stamped: str | None) -> bool:
+    try:
+        return stamp(path) == stamped or sha256(path) == digest
+    except (OSError, TactileBayesError):
+        return False
+
+
+class StepResults(Mapping[str, Result]):
+    """Results of one step by the names of the exams or masses, read from the journal when they are asked for."""
+
+    def __init__(self, values: Mapping[str, Result]) -> None:
+        self._values = values
+        self._keys: dict[str, str] = {}
+
+    def add(self, name: str, key: str) -> None:
+        """Note under which key the journal holds a result."""
+        self._keys[name] = key
+
+    def __getitem__(self, name: str) -> Result:
+        return self._values[self._keys[name]]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._keys
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._keys)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+
+def tidy(
+    folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str, Result]], *, unread: Collection[str] = ()
+) -> list[str]:
+    """Remove files of earlier runs that this one would not make, and name the folders of exams no longer listed.
+
+    Parameters
+    ----------
+    folder
+        Of the campaign.
+    results
+        By step, then by the name of the exam or mass.
+    unread
+        Exams whose file could not be read: a disk that is away costs nothing that is done.
+    """
+    left = []
+    spared = {*unread, *(name for exam in exams if exam.name in unread for name in (exam.of_mass, exam.of_visits))}
+    for step in _BESIDE:
+        made = {file for result in results[step].values() for file in result["files"]}
+        _clear(folder, known=FILES[step], made=made)
+    for kind, names, steps in (
+        (EXAMS, {exam.name for exam in exams}, tuple(step for step in results if step not in _OTHERS)),
+        (MASSES, {exam.of_mass for exam in exams}, ("pool",)),
+        (GROWTH, {exam.of_visits for exam in exams}, ("compare",)),
+    ):
+        for name in sorted(_names_in(folder / kind)):
+            if name not in names:
+                left.append(f"{kind}/{name}")
+            if name not in names or name in spared:
+                continue
+            made = {file for step in steps if name in results[step] for file in results[step][name]["files"]}
+            _clear(folder / kind / name, known={file for step in steps for file in FILES[step]}, made=made)
+        _remove_if_empty(folder / kind)
+    return left
+
+
+def _names_in(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)  # noqa: PTH208 (names only: the directory may be large)
+    except OSError:
+        return []
+
+
+def _clear(place: Path, *, known: Collection[str], made: Collection[str]) -> None:
+    """Remove the files of a folder that a step makes and this run did not, and the folder when none is left."""
+    names = _names_in(place)
+    clear_staged(place, names)
+    for name in names:
+        if name in known and name not in made:
+            (place / name).unlink(missing_ok=True)
+    if not made:
+        _remove_if_empty(place)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # it is not empty, or was never made
+        folder.rmdir()
+
+
+# --- The files of a campaign's exams: their digests, and which of them are the same bytes or the same recording.
+#
+# A digest is read once: the journal keeps it under the file's name, size, times and inode. The time of the last
+# change of the inode cannot be set by a program, so a file that was written to or replaced is read again. Files
+# changed within the last seconds are always read, for their times may not yet tell two writes apart.
+
+READ: Final = "read"
+"""Step of the journal that holds a file's digest."""
+_SETTLED_S: Final = 10.0
+"""A file that was last changed so long ago has times that tell this content from a later one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """What the files of the exams are.
+
+    Parameters
+    ----------
+    digests
+        SHA-256 by path.
+    faults
+        Why a file cannot be read, by path.
+    """
+
+    digests: dict[Path, str]
+    faults: dict[Path, str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    path: Path
+    key: str
+    address: str = ""
+
+
+def read_sources(
+    exams: Sequence[Exam],
+    *,
+    store: BatchStore | None,
+    keep: bool = True,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Sources:
+    """Digest of every exam's file, from the journal where the file is as it was then.
+
+    Parameters
+    ----------
+    keep
+        Whether new digests go into the journal. Without, files in object stores that are not known are passed over.
+
+    Raises
+    ------
+    TactileBayesError
+        When the cluster was lost.
+    """
+    settled, fresh = _sorted_out({exam.path: exam for exam in exams})
+    values: Mapping[str, Any] = {} if store is None else store.values
+    found = Sources({one.path: values[one.key]["sha256"] for one in settled if one.key in values}, {})
+    for sources, kept in ((settled, store if keep else None), (fresh, None)):
+        waiting = [one for one in sources if one.path not in found.digests and (keep or not one.address)]
+        outcomes = run_batch(_read, waiting, key=_key, executor=executor, store=kept, progress=progress)
+        for one, outcome in zip(waiting, outcomes, strict=True):
+            if outcome.value is not None:
+                found.digests[one.path] = outcome.value["sha256"]
+            elif outcome.error == CLUSTER_LOST:
+                raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
+            else:
+                found.faults[one.path] = outcome.error.removeprefix(f"{one.address or one.path}: ")
+    return found
+
+
+def _sorted_out(exams: Mapping[Path, Exam]) -> tuple[list[_Source], list[_Source]]:
+    """Files whose times can be trusted, and those changed a moment ago; each with its key."""
+    settled: list[_Source] = []
+    fresh: list[_Source] = []
+    now = time.time()
+    for path, exam in exams.items():
+        try:
+            said, changed = _version(exam)
+        except (OSError, BadDataError):
+            fresh.append(_Source(path, exam.file, exam.address))
+            continue
+        said = hashlib.sha256(said.encode()).hexdigest()[:32]
+        trusted = settled if changed < now - _SETTLED_S else fresh
+        trusted.append(_Source(path, f"{READ} {exam.file} {said}", exam.address))
+    return settled, fresh
+
+
+def _version(exam: Exam) -> tuple[str, float]:
+    """What tells a file's content from a later one, and when it last changed; a store's tag needs no time."""
+    if exam.address:
+        return version_of(exam.address), 0.0
+    known = exam.path.stat()
+    return stamp(exam.path), max(known.st_mtime, known.st_ctime)
+
+
+def _key(source: _Source) -> str:
+    return source.key
+
+
+def _read(source: _Source) -> dict[str, Any]:
+    begun = time.perf_counter()
+    digest = sha256_of(source.address) if source.address else sha256(source.path)
+    return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
+
+
+class Alike:
+    """Exams that share what only masses of one scan may share, told as they come.
+
+    Parameters
+    ----------
+    breasts
+        Of all exams.
+    what
+        What is shared, for people: ``"bytes"`` or ``"recording"``.
+    """
+
+    def __init__(self, breasts: Breasts, what: str) -> None:
+        self._breasts, self._what = breasts, what
+        self._sharing: dict[str, list[Exam]] = defaultdict(list)
+
+    def faults(self, marks: Mapping[Exam, Iterable[str]]) -> dict[str, str]:
+        """Reasons against exams, these and earlier ones, by the exam's name; `marks` says what each of these holds.
+
+        Masses of one scan, each with its place, are sound.
+        """
+        new = {mark: None for of_exam in marks.values() for mark in of_exam}
+        for exam, of_exam in marks.items():
+            for mark in dict.fromkeys(of_exam):
+                self._sharing[mark].append(exam)
+        return {name: reason for mark in new for name, reason in self._reasons(self._sharing[mark])}
+
+    def _reasons(self, alike: Sequence[Exam]) -> Iterator[tuple[str, str]]:
+        one_visit = len({(exam.patient, exam.visit, exam.side) for exam in alike}) == 1
+        placed = {one.mass for one in alike if one.centre_mm is not None or self._breasts.named(one)}
+        if len(alike) == 1 or (one_visit and len(placed) == len(alike)):
+            return
+        for exam in alike:
+            others = [other for other in alike if other is not exam]
+            named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
+            way_out = "give each exam its own file, or each mass of a breast its centre_x_mm and centre_y_mm"
+            yield exam.name, f"holds the same {self._what} as {named}; {way_out}"

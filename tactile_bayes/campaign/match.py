@@ -1,0 +1,294 @@
+"""Which exams and estimates belong to one mass, and how it grew between visits."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.campaign_names import COMPARED, GROWTH
+from tactile_bayes.files.documents import load_json, load_schema
+from tactile_bayes.files.manifest_csv import Exam, natural, table_text
+from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.records import dataclass
+from tactile_bayes.report.compare import Growth, of_document
+from tactile_bayes.trial.visits import day_of, in_order
+
+if TYPE_CHECKING:
+    from tactile_bayes.api.estimating import Outcome
+    from tactile_bayes.api.settings import Settings
+    from tactile_bayes.campaign.run import Campaign
+    from tactile_bayes.geometry import FloatArray
+    from tactile_bayes.mapping.map import TactileMap
+
+
+# --- Matching of a campaign's exams to masses that the table names by place in another exam of the same breast.
+#
+# A row with a place (`centre_x_mm`, `centre_y_mm`, on its own map) says where a mass lies. Other exams of the
+# breast, at any visit, are matched to it: of the masses that their map lists, the one within a stated distance in
+# patient axes, or in the maps' own axes where a scan has no landmarks.
+
+SAME_MM: Final = 6.0
+"""Centres on one map nearer than this are of one mass: candidates of a search are so far apart."""
+OWN_AXES: Final = Finding(
+    "own_axes", "its mass was matched by place in the maps' own axes, because a scan has no landmarks"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class NamedPlace:
+    """Where an exam of the breast has a mass, as the table says.
+
+    Parameters
+    ----------
+    mass, exam
+        Their codes and names.
+    path
+        Of that exam's map.
+    centre_mm
+        On that map.
+    """
+
+    mass: str
+    exam: str
+    path: Path
+    centre_mm: tuple[float, float]
+
+
+def named_exams(exam: Exam, exams: Sequence[Exam]) -> list[Exam]:
+    """For an exam without a place the exams that name one: for each mass of the breast one, of its visit if possible.
+
+    Empty where the exam has a place, or no exam names one of its mass.
+    """
+    if exam.centre_mm is not None:
+        return []
+    found: dict[str, Exam] = {}
+    breast = [one for one in exams if (one.patient, one.side) == (exam.patient, exam.side)]
+    for one in sorted(breast, key=lambda one: (one.visit != exam.visit, natural(one.visit), one.replicate)):
+        if one.centre_mm is not None:
+            found.setdefault(one.mass, one)
+    return list(found.values()) if exam.mass in found else []
+
+
+class Breasts:
+    """Exams of each breast, so that those of a large table are found without a walk through it."""
+
+    def __init__(self, exams: Sequence[Exam]) -> None:
+        self._exams: dict[tuple[str, str | None], list[Exam]] = defaultdict(list)
+        for exam in exams:
+            self._exams[exam.patient, exam.side].append(exam)
+
+    def named(self, exam: Exam, of: Container[str] | None = None) -> list[Exam]:
+        """As `named_exams`, over the exams of this breast; `of` holds the names of those that count."""
+        breast = self._exams[exam.patient, exam.side]
+        return named_exams(exam, breast if of is None else [one for one in breast if one.name in of])
+
+
+def matched_outcome(
+    path: Path, settings: Settings, *, mass: str, places: Sequence[NamedPlace], most_mm: float
+) -> Outcome:
+    """Estimate the mass of a map that lies nearest to where another exam has it.
+
+    Without a mass there the estimate is of the place, and says why it has no size.
+
+    Raises
+    ------
+    BadDataError
+        When several masses of the map may be the one, or its place lies off the map.
+    """
+    from tactile_bayes.api.estimating import estimate_file
+
+    outcome = estimate_file(path, settings)
+    tactile_map, masses = outcome.tactile_map, outcome.estimate.masses
+    wanted = places_on(tactile_map, places)
+    near = [one for one in masses if nearest(wanted, (one.x_mm, one.y_mm), most_mm) == mass]
+    if len(near) > 1:
+        told = " and ".join(f"({one.x_mm:.1f}, {one.y_mm:.1f}) mm" for one in near)
+        way_out = "give the row its centre_x_mm and centre_y_mm, or a smaller --match-mm"
+        raise BadDataError(f"shows masses at {told} within {most_mm:g} mm of mass {mass}'s place", way_out=way_out)
+    if near and near[0].reported:
+        return outcome
+    if near:
+        return estimate_file(path, replace(settings, centre_mm=(near[0].x_mm, near[0].y_mm)))
+    place = wanted[mass]
+    if not _on_map(tactile_map, place):
+        told = f"mass {mass} would lie at ({place[0]:.1f}, {place[1]:.1f}) mm, off the map"
+        raise BadDataError(told, way_out="check the landmarks, or give the row its centre_x_mm and centre_y_mm")
+    looked = estimate_file(path, replace(settings, centre_mm=place))
+    return looked if _within(looked, place, most_mm) else _not_there(looked, mass, place, most_mm)
+
+
+def _within(outcome: Outcome, place: tuple[float, float], most_mm: float) -> bool:
+    """Whether an estimate is of a lump near a place, or of none."""
+    if outcome.estimate.status != "estimate":
+        return True
+    here = next(one for one in outcome.estimate.masses if one.reported)
+    return bool(np.hypot(here.x_mm - place[0], here.y_mm - place[1]) <= most_mm)
+
+
+def _not_there(outcome: Outcome, mass: str, place: tuple[float, float], most_mm: float) -> Outcome:
+    """The outcome without its estimate, which is of a lump elsewhere."""
+    from tactile_bayes.posterior.result import Estimate
+
+    found = outcome.estimate
+    reason = f"no lump found within {most_mm:g} mm of mass {mass}'s place, ({place[0]:.1f}, {place[1]:.1f}) mm"
+    masses = tuple(replace(one, reported=False) for one in found.masses)
+    none = Estimate(
+        "no_estimate",
+        reason,
+        candidates=found.candidates,
+        code="undetected",
+        masses=masses,
+        findings=outcome.tactile_map.findings,
+    )
+    return replace(outcome, estimate=none)
+
+
+def places_on(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> dict[str, tuple[float, float]]:
+    """Where masses lie on a map, by their code: through the landmarks, or as they are where a scan has none."""
+    from tactile_bayes.files.map_nc import read_map
+
+    found = {}
+    for one in places:
+        there = read_map(one.path).patient_from_plane
+        found[one.mass] = _carried(one.centre_mm, there, tactile_map.patient_from_plane)
+    return found
+
+
+def _carried(place: tuple[float, float], there: FloatArray | None, here: FloatArray | None) -> tuple[float, float]:
+    """A place of one map's plane on another's: x and y in patient axes are kept."""
+    if there is None or here is None:
+        return place
+    x_y = (there @ np.array([*place, 0.0, 1.0]))[:2]
+    x, y = np.linalg.solve(here[:2, :2], x_y - here[:2, 3])
+    return float(x), float(y)
+
+
+def nearest(wanted: Mapping[str, tuple[float, float]], place: tuple[float, float], most_mm: float) -> str:
+    """Code of the mass whose place is nearest, and within the distance; empty where none is."""
+    away = {mass: float(np.hypot(x - place[0], y - place[1])) for mass, (x, y) in wanted.items()}
+    first = min(away, key=lambda mass: away[mass])
+    return first if away[first] <= most_mm else ""
+
+
+def in_own_axes(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> bool:
+    """Whether places are compared in the maps' own axes."""
+    from tactile_bayes.files.map_nc import read_map
+
+    return any(one.patient_from_plane is None for one in (tactile_map, *(read_map(place.path) for place in places)))
+
+
+def _on_map(tactile_map: TactileMap, place: tuple[float, float]) -> bool:
+    axes = (tactile_map.x_mm, tactile_map.y_mm)
+    return all(float(axis[0]) <= at <= float(axis[-1]) for axis, at in zip(axes, place, strict=True))
+
+
+def unnamed(documents: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    """Masses of one scan that no row names.
+
+    Parameters
+    ----------
+    documents
+        The estimates of all rows of the scan.
+    """
+    centres = [one["centre_mm"] for document in documents for one in document["masses"] if one["reported"]]
+    found: list[Mapping[str, float]] = []
+    for mass in documents[0]["masses"]:
+        at = mass["centre_mm"]
+        if all(np.hypot(at["x"] - one["x"], at["y"] - one["y"]) > SAME_MM for one in [*centres, *found]):
+            found.append(at)
+    words = "a mass at ({x:.1f}, {y:.1f}) mm on the map is named by no row"
+    return [Finding("unnamed_mass", words.format(**at)) for at in found]
+
+
+# --- Growth between the visits of a campaign's masses: who is compared, and the table of what came of it.
+
+Visits = dict[str, list[Exam]]
+"""Exams of one mass by the code of the visit, in order of time."""
+
+
+def grown_masses(exams: Sequence[Exam]) -> dict[str, Visits]:
+    """Masses with exams at several visits, by their names; `read_manifest` refuses visits whose order is not known."""
+    found: dict[str, Visits] = defaultdict(lambda: defaultdict(list))
+    for exam in exams:
+        found[exam.of_visits][exam.visit].append(exam)
+    several = {name: visits for name, visits in found.items() if len(visits) > 1}
+    return {
+        name: {visit: visits[visit] for visit in in_order(visit_dates(visits)) or visits}
+        for name, visits in several.items()
+    }
+
+
+def visit_dates(visits: Mapping[str, Sequence[Exam]]) -> dict[str, date | None]:
+    """Latest date of each visit's exams; None where none has one."""
+    return {
+        visit: max((exam.day for exam in exams if exam.day is not None), default=day_of(visit))
+        for visit, exams in visits.items()
+    }
+
+
+def days_of(visits: Mapping[str, Sequence[Exam]]) -> tuple[float, ...] | None:
+    """Days of the visits from the first; None where one of them has no date."""
+    days = list(visit_dates(visits).values())
+    first = days[0]
+    known = [float((day - first).days) for day in days if day is not None and first is not None]
+    return tuple(known) if len(known) == len(days) else None
+
+
+def growth_rows(campaign: Campaign) -> list[Growth]:
+    """What `compare` says of each mass with several visits, in order of the masses."""
+    compared, rows = campaign.found.results["compare"], []
+    for name, visits in grown_masses(campaign.exams).items():
+        codes, exam = [*visits], next(iter(visits.values()))[0]
+        link = f"{GROWTH}/{name}/{COMPARED}"
+        document = load_json(campaign.folder / link) if name in compared else None
+        if isinstance(document, dict):
+            sized = [
+                code for code, exams in visits.items() if any(one.name in compared_names(document) for one in exams)
+            ]
+            rows += of_document(exam.patient, exam.mass, sized, document, link)
+        else:
+            fault = campaign.found.faults.get(name)
+            reason = "exams of fewer than two visits came through" if fault is None else fault.reason
+            rows.append(Growth(exam.patient, exam.mass, codes[0], codes[-1], "failed", campaign.not_compared or reason))
+    return rows
+
+
+def compared_names(document: Mapping[str, object]) -> set[str]:
+    """Names of the exams that a comparison is of."""
+    visits = document["visits"]
+    assert isinstance(visits, list)
+    return {one["map"] for visit in visits for one in visit["maps"]}
+
+
+def growth_text(rows: Sequence[Growth]) -> str:
+    """``growth.csv``: a row for each later visit of a mass."""
+    return table_text([_line(row) for row in rows], [one["name"] for one in load_schema("growth.table.json")["fields"]])
+
+
+def _line(row: Growth) -> dict[str, object]:
+    first, later = (q["median"] for q in row.sizes_mm) if row.sizes_mm else (None, None)
+    ends = {} if row.percent is None else row.percent
+    return {
+        "patient": row.patient,
+        "mass": row.mass,
+        "earlier_visit": row.earlier,
+        "later_visit": row.later,
+        "days": row.days,
+        "status": row.status,
+        "reason": row.reason or None,
+        "earlier_mm": first,
+        "later_mm": later,
+        "change_percent": ends.get("median"),
+        "low_percent": ends.get("low"),
+        "high_percent": ends.get("high"),
+        "probability": ends.get("probability"),
+        "verdict": row.verdict or None,
+        "findings": " ".join(finding_lines(row.findings)) or None,
+    }

@@ -1,0 +1,333 @@
+"""What a campaign writes beside the exams: tables, the contact sheet, and the trial's report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from tactile_bayes import __version__
+from tactile_bayes.campaign.match import growth_rows, growth_text
+from tactile_bayes.campaign.run import Campaign
+from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
+from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.files.campaign_names import (
+    DONE,
+    ESTIMATE,
+    EXAMS,
+    FAILURES,
+    GROWN,
+    JOURNAL,
+    MAP,
+    MAP_FIGURE,
+    REPEATABILITY,
+    SIZE_FIGURE,
+    SIZED,
+    SIZED_FIGURE,
+    THUMBNAIL,
+    TRIAL,
+)
+from tactile_bayes.records import dataclass
+from tactile_bayes.report.compare import Growth, growth_line
+from tactile_bayes.report.quantities import leading
+from tactile_bayes.trial.visits import at_excision
+
+if TYPE_CHECKING:
+    from tactile_bayes.api.trial_report import TrialSettings
+    from tactile_bayes.files.manifest_csv import Exam
+    from tactile_bayes.files.tables import Table
+    from tactile_bayes.report.campaign_html import Card
+
+REPORT, PAGE, INDEX = "report.json", "report.html", "index.html"
+WRITTEN: Final = (DONE, FAILURES, TRIAL, GROWN, REPORT, PAGE, INDEX, REPEATABILITY)
+"""Files beside the exams."""
+_MOST_INLINE: Final = 300
+"""With more exams the contact sheet names its thumbnails' files instead of holding them."""
+_MOST_CARDS: Final = 10_000
+"""More exams than a browser shows at ease."""
+_LINKS: Final = (MAP_FIGURE, SIZE_FIGURE, SIZED_FIGURE, ESTIMATE, SIZED, MAP)
+
+
+@dataclass(frozen=True, slots=True)
+class Excision:
+    """Where the sizes after excision are.
+
+    Parameters
+    ----------
+    path
+        Of the table.
+    columns
+        The mapping of a wide table; None for a tidy one.
+    """
+
+    path: Path
+    columns: Path | None = None
+
+    def table(self) -> Table:
+        """Read and check the table."""
+        from tactile_bayes.api.trials import read_excision
+
+        return read_excision(self.path, self.columns)
+
+    def masses(self) -> set[tuple[str, str]]:
+        """Patient and mass of each row."""
+        columns = self.table().columns
+        return set(zip(columns["patient"], columns["mass"], strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What was written, in numbers and words.
+
+    Parameters
+    ----------
+    sized, unsized, failed
+        Exams by how they ended.
+    pooled
+        Masses at a visit that were pooled.
+    left_out
+        Masses without a size after excision, as ``patient mass``.
+    report
+        The trial report as text; empty where there is none.
+    no_report
+        Why there is none, where excision sizes were given.
+    unnamed
+        Exams whose map shows a mass that no row names.
+    growth
+        What became of masses with several visits, in a sentence; empty where there are none.
+    disagreeing
+        Masses at a visit whose exams are not of one size or place.
+    """
+
+    sized: int
+    unsized: int
+    failed: int
+    pooled: int
+    left_out: tuple[str, ...] = ()
+    report: str = ""
+    no_report: str = field(default="")
+    unnamed: tuple[str, ...] = ()
+    growth: str = ""
+    disagreeing: tuple[str, ...] = ()
+
+
+def write_outputs(campaign: Campaign, excision: Excision | None, protocol: Path | None = None) -> Written:
+    """Write tables, contact sheet and, where excision sizes are given, the trial's report.
+
+    Raises
+    ------
+    UsageError
+        When the disk does not take a file; what is done is kept.
+    BadDataError
+        When the table of excision sizes or the protocol is at fault.
+    """
+    from tactile_bayes.files.atomic import write_text
+
+    rows = exam_rows(campaign)
+    masses = None if excision is None else excision.masses()
+    write_tables(campaign, rows, masses, campaign.folder)
+    counts = _counts(rows)
+    growth = growth_rows(campaign)
+    if growth:
+        write_text(campaign.folder / GROWN, growth_text(growth), force=True)
+    report, fault = "", ""
+    if excision is not None:
+        report, fault = _write_report(campaign.folder, excision, protocol, growth)
+    for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (GROWN,))):
+        (campaign.folder / name).unlink(missing_ok=True)
+    links = {name: name for name in (DONE, FAILURES, TRIAL, *([GROWN] if growth else []))} | (
+        {"trial report": PAGE} if report else {}
+    )
+    links |= {REPEATABILITY: REPEATABILITY} if campaign.repeatability else {}
+    page = _page(campaign, rows, counts, links, growth)
+    write_text(campaign.folder / INDEX, page, force=True)
+    known = {(row.exam.patient, row.exam.mass) for row in rows}
+    left_out = sorted(known - masses) if masses is not None else []
+    names = tuple(f"{patient} {mass}" for patient, mass in left_out)
+    disagreeing = tuple(
+        dict.fromkeys(row.exam.of_mass for row in rows if any(one.kind == "maps_disagree" for one in row.findings))
+    )
+    unnamed = tuple(row.exam.name for row in rows if any(one.kind == "unnamed_mass" for one in row.findings))
+    return Written(
+        *counts,
+        len(campaign.found.results["pool"]),
+        names,
+        report,
+        fault,
+        unnamed,
+        growth_line(growth, GROWN),
+        disagreeing,
+    )
+
+
+def copy_outputs(folder: Path, address: str) -> None:
+    """Copy what lies beside the exams into the object store, and last the journal: with it the copy is whole.
+
+    Raises
+    ------
+    UsageError
+        When the store does not take it; what is done is kept.
+    """
+    from tactile_bayes.files.remote import put
+
+    for name in (*WRITTEN, JOURNAL):
+        if (folder / name).exists():
+            put(folder / name, f"{address}/{name}")
+
+
+def check_inputs(exams: Sequence[Exam], excision: Excision | None, protocol: Path | None) -> None:
+    """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
+
+    Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there.
+
+    Raises
+    ------
+    UsageError
+        When there is a protocol and no table of excision sizes.
+    BadDataError
+        Naming the file, the line or key, and the way out.
+    """
+    if protocol is not None and excision is None:
+        raise UsageError("--protocol is for the trial's report; give --excision too")
+    if excision is not None:
+        _check_spelling(excision, exams)
+        _check_dates(excision, exams)
+    if protocol is not None:
+        _trial_settings(protocol)
+
+
+def _check_spelling(excision: Excision, exams: Iterable[Exam]) -> None:
+    """Refuse a row that is of a mass of the exams but for capitals: the mass would be left out of the trial."""
+    table = excision.table()
+    known = {(exam.patient.casefold(), exam.mass.casefold()): exam for exam in exams}
+    for row, (patient, mass) in enumerate(zip(table.columns["patient"], table.columns["mass"], strict=True)):
+        exam = known.get((patient.casefold(), mass.casefold()))
+        if exam is None:
+            continue
+        for column, code, spelled in (("patient", patient, exam.patient), ("mass", mass, exam.mass)):
+            if code != spelled:
+                what = f"{code!r} is {spelled!r} in the table of exams (line {exam.line})"
+                raise table.error(row, column, what, way_out="write it one way in both tables")
+
+
+def _check_dates(excision: Excision, exams: Sequence[Exam]) -> None:
+    """Refuse a mass that was excised before every exam."""
+    columns = excision.table().columns
+    keys = zip(columns["patient"], columns["mass"], strict=True)
+
+    def fault(row: int, column: str, what: str, /, *, way_out: str) -> BadDataError:
+        return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {what}", way_out=way_out)
+
+    excised_on = dict(zip(keys, columns["date"], strict=True))
+    at_excision([exam.as_reading for exam in exams], excised_on, fault=fault)
+
+
+def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
+    """Settings that a protocol fixes, the others by default, and its title."""
+    from tactile_bayes.api.trial_report import TrialSettings
+    from tactile_bayes.files.documents import read_protocol
+
+    if protocol is None:
+        return TrialSettings(), None
+    read, default = read_protocol(protocol), TrialSettings()
+    # TOML and its schema take 1000.0 for a whole number
+    fixed = {name: type(getattr(default, name))(value) for name, value in read.analysis.items()}
+    return TrialSettings(**fixed), read.title
+
+
+def _counts(rows: Sequence[Row]) -> tuple[int, int, int]:
+    sized = sum(row.size is not None for row in rows)
+    failed = sum(row.document is None for row in rows)
+    return sized, len(rows) - sized - failed, failed
+
+
+def _write_report(folder: Path, excision: Excision, protocol: Path | None, growth: Sequence[Growth]) -> tuple[str, str]:
+    """Write what `validate` writes for the trial table; returns its text, or why there is none."""
+    from tactile_bayes.api.trial_report import analyse
+    from tactile_bayes.api.trials import load_trial
+    from tactile_bayes.files.atomic import write_text
+    from tactile_bayes.files.documents import check_document, dump_json
+    from tactile_bayes.report.trial import trial_text
+    from tactile_bayes.report.trial_html import trial_html
+
+    settings, title = _trial_settings(protocol)
+    try:
+        inputs = load_trial(folder / TRIAL, excision.path, excision.columns, tidy_trial=True)
+        outcome = analyse(inputs, settings, protocol=protocol, title=title)
+    except BadDataError as error:
+        return "", error.what
+    check_document(outcome.document, "validate.schema.json", path=folder / REPORT)
+    more = [] if outcome.next_mass is None else outcome.next_mass.lines()
+    full = trial_text(outcome.report, methods=True, checks=outcome.checks, more=more)
+    write_text(folder / REPORT, dump_json(outcome.document), force=True)
+    write_text(folder / PAGE, trial_html(outcome.report, outcome.document, text=full, growth=growth), force=True)
+    return trial_text(outcome.report, methods=False, checks=outcome.checks, more=more), ""
+
+
+def _page(
+    campaign: Campaign,
+    rows: Sequence[Row],
+    counts: tuple[int, int, int],
+    links: Mapping[str, str],
+    growth: Sequence[Growth],
+) -> str:
+    from tactile_bayes.report.campaign_html import campaign_html, worst
+
+    cards = worst((_card(campaign, row) for row in rows), _MOST_CARDS)
+    if len(cards) <= _MOST_INLINE:
+        cards = [_self_contained(card, campaign.folder) for card in cards]
+    masses = len(campaign.found.results["pool"])
+    lines = [f"{len(rows)} exams: {counts_words(*counts)}."]
+    lines += [f"{masses} masses pooled, each at one visit."] if masses else []
+    if len(cards) < len(rows):
+        lines.append(f"Here are the {len(cards)} to be looked at first; all are in {DONE} and {FAILURES}.")
+    lines += [repeatability_words(campaign)] if campaign.repeatability else []
+    return campaign_html(cards, lines=lines, links=links, version=__version__, growth=growth)
+
+
+def _self_contained(card: Card, folder: Path) -> Card:
+    """The card with its picture instead of the picture's name."""
+    from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
+
+    if not isinstance(card.thumbnail, str):
+        return card
+    return replace(card, thumbnail=read_bytes(folder / card.thumbnail, most=IMAGE_BYTES))
+
+
+def repeatability_words(campaign: Campaign) -> str:
+    """What the repeats say of the site, and that the sizes are by it; why they do not where they might have."""
+    found = campaign.repeatability
+    if found is None:
+        return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
+    words = found.words()
+    return f"{words[0].upper()}{words[1:]}; every size is by this spread, learned from the repeats ({REPEATABILITY})."
+
+
+def counts_words(sized: int, unsized: int, failed: int) -> str:
+    """How the exams ended, in words."""
+    return f"{sized} sized, {unsized} without a size, {failed} failed"
+
+
+def _card(campaign: Campaign, row: Row) -> Card:
+    from tactile_bayes.report.campaign_html import FAILED, SIZED, UNSIZED, Card
+
+    exam = row.exam
+    made = {
+        name
+        for step in ("map", "estimate", "figures", "size")
+        for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
+        if row.document is not None
+    }
+    facts = [f"patient {exam.patient}", f"visit {exam.visit}", f"mass {exam.mass}", f"exam {exam.replicate}"]
+    facts += [fact for fact in (exam.side, exam.reader and f"reader {exam.reader}", exam.file) if fact]
+    return Card(
+        name=exam.name,
+        status=FAILED if row.document is None else UNSIZED if row.size is None else SIZED,
+        facts=tuple(facts),
+        reason=row.reason,
+        size=None if row.document is None else leading(row.document)["max_size_mm"],
+        findings=row.findings,
+        thumbnail=f"{EXAMS}/{exam.name}/{THUMBNAIL}" if THUMBNAIL in made else None,
+        links={name: f"{EXAMS}/{exam.name}/{name}" for name in _LINKS if name in made},
+    )

@@ -1,0 +1,453 @@
+"""A campaign: from a table of exams to maps, estimates, pooled sizes and growth, step by step, resumable.
+
+Layout of the output folder: ``exams/EXAM/`` (map.nc, estimate.json, posterior.nc, shape.npz, thumbnail.png...),
+``masses/MASS/`` (pooled.json, pooled.nc) and ``growth/MASS/`` (compare.json), the tables and pages beside them
+(`campaign_report`), repeatability.json where it was learned (the sizes by it are ``exams/EXAM/sized.json``), and the
+journal, which holds for each step its key, the digests of its files and how long it took. The key is the step, the exam
+or mass, and a digest of the program's version, the settings and the content of the inputs. A step whose
+key is in the journal and whose files are what it made is not run again.
+
+Exams go through the steps in blocks, in the order of the table, and the results stay in the journal: memory holds the
+table of exams, a few hundred bytes for each step, and one block.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from tactile_bayes.api.settings import Settings
+from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.campaign.inputs import READ, Alike, read_sources
+from tactile_bayes.campaign.match import Breasts, NamedPlace, Visits, days_of, grown_masses
+from tactile_bayes.campaign.settings import CampaignSettings, digest_of
+from tactile_bayes.campaign.stages import CampaignState, Fault, Stages, steps_needed
+from tactile_bayes.campaign.steps import FEWEST_MASSES, NOT_LEARNED, Task, copy_tasks, exam_folders, taught_by, too_few
+from tactile_bayes.declarations import replace
+from tactile_bayes.files.campaign_names import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE
+from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.provenance import recordings
+from tactile_bayes.files.repeatability_json import read_repeatability
+from tactile_bayes.progress import Progress, untold
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from tactile_bayes.size.site import Repeatability
+
+Bar = Callable[[str], AbstractContextManager[Progress]]
+_Any = TypeVar("_Any")
+_BLOCK: Final = 64
+"""Exams that go through the steps together at least; workers wait for the slowest of a block."""
+_AHEAD_IN_BLOCK: Final = 8
+"""Blocks hold so many times what an executor takes ahead."""
+
+
+class Campaign:
+    """A run, or the plan of one.
+
+    Parameters
+    ----------
+    exams
+        As `read_manifest` gives them.
+    folder
+        Of the output.
+    settings
+        Of all exams.
+    store
+        From `open_campaign`.
+    executor
+        As `run_batch`'s.
+    dry
+        Plan only: nothing is run and nothing written.
+    bar
+        Gives, for what is counted ("files read", "steps"), a context with a callback for those done and those needed.
+
+    Attributes
+    ----------
+    found
+        Results, faults and counts, filled by `run`.
+    not_pooled, not_compared
+        Why no mass is pooled, or compared between visits; empty where masses are, or none has several visits.
+    repeatability
+        Learned from the repeats; None where it was not.
+    not_learned
+        Why it was not, where masses have repeats; empty otherwise.
+    unread
+        Names of the exams whose file could not be read.
+    """
+
+    def __init__(
+        self,
+        exams: Sequence[Exam],
+        folder: Path,
+        settings: CampaignSettings,
+        *,
+        store: BatchStore | None,
+        executor: Executor | None = None,
+        dry: bool = False,
+        bar: Bar | None = None,
+    ) -> None:
+        self.exams, self.folder, self.settings = exams, folder, settings
+        self._stages = Stages(store=store, executor=executor, dry=dry)
+        self.found: CampaignState = self._stages.found
+        self.not_pooled, self.not_compared = "", ""
+        self.unread: set[str] = set()
+        self.repeatability: Repeatability | None = None
+        self.not_learned = ""
+        self._sizes_unknown = False
+        self._store, self._executor, self._dry = store, executor, dry
+        self._bar: Bar = _no_bar if bar is None else bar
+        self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
+        self._breasts = Breasts(exams)
+        self._recordings = Alike(self._breasts, "recording")
+        self._repeated: set[str] = set()
+        self._digests: dict[Path, str] = {}
+        self._calibrations: dict[str, str] = {}
+
+    def run(self) -> CampaignState:
+        """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pools, growth.
+
+        Raises
+        ------
+        UsageError
+            When the disk does not take a result; all that is done is kept.
+        TactileBayesError
+            When the cluster was lost; all that is done is kept.
+        BatchInterrupted
+            On Ctrl-C; what is done is kept.
+        """
+        self._read_sources()
+        sound = [exam for exam in self.exams if exam.name not in self.found.faults]
+        self.not_pooled = self._why_not_pooled()
+        masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
+        learns = taught_by(sound, self.settings) >= FEWEST_MASSES
+        self.not_compared = self._not_over_bodies()
+        grown = 0 if self.not_compared else len(grown_masses(sound))
+        self._stages.needed.update(
+            steps_needed(len(sound), masses, settings=self.settings, learns=learns, compared=grown)
+        )
+        with self._bar("steps") as self._stages.tell:
+            for block in _blocks_of_patients(sound, self._block):
+                self._size(block)
+            sound = [exam for exam in sound if exam.name not in self._repeated]
+            self._learn_repeatability(sound)
+            if masses:
+                spared = masses - len({exam.of_mass for exam in sound})
+                self._stages.needed.subtract(steps_needed(0, spared, settings=self.settings, learns=False))
+                self._pool(sound)
+            if grown:
+                self._compare(sound)
+        return self.found
+
+    def _read_sources(self) -> None:
+        """Digests of all files: two exams of one file are found before any is mapped."""
+        with self._bar("files read") as tell:
+            sources = read_sources(
+                self.exams, store=self._store, keep=not self._dry, executor=self._executor, progress=tell
+            )
+        self._digests = sources.digests
+        for exam in self.exams:
+            if exam.path in sources.faults:
+                self.found.faults[exam.name] = Fault(READ, sources.faults[exam.path])
+                self.unread.add(exam.name)
+        bytes_of = {exam: [self._digests[exam.path]] for exam in self.exams if exam.path in self._digests}
+        for name, reason in Alike(self._breasts, "bytes").faults(bytes_of).items():
+            self.found.faults[name] = Fault(READ, reason)
+
+    def _size(self, exams: Sequence[Exam]) -> None:
+        """Maps, estimates and figures of some exams."""
+        known = [exam for exam in exams if exam.path in self._digests]  # a plan fetches nothing from a store
+        self._stages.run("map", [self._map_task(exam) for exam in known], without=len(exams) - len(known))
+        exams = self._recorded_once(exams)
+        mapped = [exam for exam in exams if exam.name in self.found.results["map"]]
+        mapped = mapped if self._dry else self._placed(mapped)
+        unmapped = len(exams) - len(mapped)
+        self._stages.run("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
+        if self.settings.figures:
+            estimated = [exam for exam in mapped if exam.name in self.found.results["estimate"]]
+            tasks = [self._estimate_task(exam, "figures") for exam in estimated]
+            self._stages.run("figures", tasks, without=len(exams) - len(estimated))
+        self._copy(EXAMS, [exam.name for exam in exams], steps=("map", "estimate", "figures"))
+
+    def _recorded_once(self, exams: Sequence[Exam]) -> list[Exam]:
+        """The exams without those of a recording that another exam has, in whatever file: they are no repeats."""
+        made = self.found.results["map"]
+        marks = {exam: recordings(made[exam.name].get("scans", ())) for exam in exams if exam.name in made}
+        faults = self._recordings.faults({exam: list(found) for exam, found in marks.items()})
+        for name, reason in faults.items():
+            self.found.faults[name] = Fault("map", reason)
+        self._repeated |= faults.keys()
+        left = [exam for exam in exams if exam.name not in faults]
+        spared = steps_needed(len(exams) - len(left), 0, settings=self.settings, learns=False)
+        self._stages.needed.subtract({step: count for step, count in spared.items() if step != "map"})
+        return left
+
+    def _copy(self, kind: str, names: Sequence[str], *, steps: Sequence[str]) -> None:
+        """Copy what steps made of exams or masses into the object store."""
+        if self.settings.copy_to:
+            results = [self.found.results[step] for step in steps]
+            tasks = copy_tasks(self.folder / kind, names, results, to=f"{self.settings.copy_to}/{kind}")
+            self._stages.run("copy", tasks, without=len(names) - len(tasks))
+
+    def _map_task(self, exam: Exam) -> Task:
+        digest = self._digests[exam.path]
+        columns = ("patient", "side", "reader", "visit", "mass")
+        expected = {name: value for name in columns if (value := getattr(exam, name)) is not None}
+        key = {"scan": digest, "expected": expected, "normalise": self.settings.normalise}
+        return Task(
+            step="map",
+            name=exam.name,
+            folder=self.folder / EXAMS / exam.name,
+            digest=digest_of(key),
+            source=exam.path,
+            source_sha256=digest,
+            address=exam.address,
+            expected=expected,
+            normalise=self.settings.normalise,
+        )
+
+    def _estimate_task(self, exam: Exam, step: str) -> Task:
+        """Task of the estimate, or of its figures."""
+        made = self.found.of("map", exam.name)
+        assert made is not None
+        settings = self.settings.of(exam)
+        key = {"map": made["files"][MAP], **self._settings_key(settings, made["normalise"])}
+        folder = self.folder / EXAMS / exam.name
+        places = self._places(exam)
+        if places:
+            key["match"] = {"mass": exam.mass, "most_mm": self.settings.match_mm, "places": self._places_key(places)}
+        return Task(
+            step=step,
+            name=exam.name,
+            folder=folder,
+            digest=digest_of(key),
+            settings=settings,
+            mass=exam.mass,
+            places=places,
+            match_mm=self.settings.match_mm,
+        )
+
+    def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
+        """The exams without those whose mass is named by a place on a map that could not be made."""
+        lost = [exam for exam in mapped if self._breasts.named(exam) and not self._places(exam)]
+        for exam in lost:
+            named = ", ".join(one.name for one in self._breasts.named(exam) if one.mass == exam.mass)
+            reason = f"the place of its mass is on the map of {named}, which was not made"
+            self.found.faults[exam.name] = Fault("estimate", reason)
+        return [exam for exam in mapped if exam not in lost]
+
+    def _places(self, exam: Exam) -> tuple[NamedPlace, ...]:
+        """Places of the breast's masses that other exams name, where this one names none."""
+        return tuple(
+            NamedPlace(one.mass, one.name, self.folder / EXAMS / one.name / MAP, one.centre_mm)
+            for one in self._breasts.named(exam, of=self.found.results["map"])
+            if one.centre_mm is not None
+        )
+
+    def _places_key(self, places: Sequence[NamedPlace]) -> list[Any]:
+        made = self.found.results["map"]
+        return [[one.mass, one.exam, made[one.exam]["files"][MAP], one.centre_mm] for one in places]
+
+    def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
+        """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
+        from tactile_bayes.files.shipped import default_for
+
+        plain = {one.name: getattr(settings, one.name) for one in fields(settings)}
+        name = str(plain.pop("calibration") or default_for(normalise))
+        file = plain.pop("settings_file")
+        repeatability = plain.pop("repeatability")
+        if repeatability is not None:
+            plain["repeatability"] = repeatability.sha256 or repr(repeatability)
+        used = {"settings_sha256": None if file is None else self._file_digest(file), "calibration": name}
+        return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
+
+    def _calibration_digest(self, name: str) -> str:
+        from tactile_bayes.files.shipped import size_calibration_path
+
+        if name not in self._calibrations:
+            path = size_calibration_path(name)
+            self._calibrations[name] = "" if path is None else self._file_digest(path)
+        return self._calibrations[name]
+
+    def _file_digest(self, path: Path) -> str:
+        """Digest of a file that many exams use."""
+        from tactile_bayes.files.atomic import sha256
+
+        if path not in self._digests:
+            self._digests[path] = sha256(path)
+        return self._digests[path]
+
+    def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
+        """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
+        estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
+        masses = taught_by(sound if self._dry else estimated, self.settings)
+        if masses < FEWEST_MASSES:
+            self.not_learned = too_few(masses) if masses else ""
+            self._stages.needed.update({name: -self._stages.needed[name] for name in ("repeatability", "size")})
+            return
+        complete = not self._dry or len(estimated) == len(sound)
+        tasks = [self._repeatability_task(estimated)] if complete else []
+        self._stages.run("repeatability", tasks, without=int(not complete))
+        result = self.found.of("repeatability", SITE)
+        self._sizes_unknown = result is None and self._dry
+        if result is None:
+            fault = self.found.faults.pop(SITE, None)
+            self.not_learned = "" if fault is None else fault.reason
+        elif NOT_LEARNED in result:
+            self.not_learned = result[NOT_LEARNED]
+        else:
+            self.repeatability = read_repeatability(self.folder / REPEATABILITY)
+        if self._sizes_unknown:
+            self._stages.run("size", [], without=len(sound))
+        else:
+            self._size_again(estimated if self.repeatability else [])
+
+    def _size_again(self, estimated: Sequence[Exam]) -> None:
+        """Size exams by the repeatability."""
+        self._stages.needed["size"] = len(estimated)
+        self._stages.needed["copy"] += len(estimated) * bool(self.settings.copy_to)
+        for block in _blocks(estimated, self._block):
+            tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
+            self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
+            self._copy(EXAMS, [exam.name for exam in block], steps=("size",))
+
+    def _repeatability_task(self, exams: Sequence[Exam]) -> Task:
+        files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
+        repeats = tuple(exam_folders(exams, self.folder / EXAMS))
+        return Task("repeatability", SITE, self.folder, digest_of([FEWEST_MASSES, files]), repeats=repeats)
+
+    def _size_task(self, exam: Exam) -> Task | None:
+        """Task of a size by the repeatability; None where the exam has no draws, or another calibration."""
+        made = self.found.of("map", exam.name)
+        assert made is not None
+        settings = self._by_repeatability(self.settings.of(exam), made["normalise"])
+        shape = self._file("estimate", exam, SHAPE)
+        if settings.repeatability is None or shape is None:
+            return None
+        files = [made["files"][MAP], self._file("estimate", exam, ESTIMATE), shape]
+        key = {"files": files, "figures": self.settings.figures, **self._settings_key(settings, made["normalise"])}
+        folder = self.folder / EXAMS / exam.name
+        figures = self.settings.figures
+        return Task("size", exam.name, folder, digest_of(key), settings=settings, figures=figures)
+
+    def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
+        """Settings with the learned repeatability, where it is for the calibration that they lead to."""
+        from tactile_bayes.files.shipped import default_for
+
+        found = self.repeatability
+        if found is None or self._calibration_digest(settings.calibration_name or default_for(normalise)) != (
+            found.calibration_sha256
+        ):
+            return settings
+        return replace(settings, repeatability=found)
+
+    def _pool(self, sound: Sequence[Exam]) -> None:
+        """Pool every mass at every visit from the exams that were estimated."""
+        groups: dict[str, list[Exam]] = defaultdict(list)
+        for exam in sound:
+            if exam.name in self.found.results["estimate"]:
+                groups[exam.of_mass].append(exam)
+        if self._sizes_unknown:
+            groups.clear()
+        unknown = len({exam.of_mass for exam in sound}) - len(groups)
+        for names in _blocks(list(groups), self._block):
+            self._stages.run("pool", [self._pool_task(name, groups[name]) for name in names])
+            self._copy(MASSES, names, steps=("pool",))
+        self._stages.run("pool", [], without=unknown)
+        if self.settings.copy_to:
+            self._stages.run("copy", [], without=unknown)
+
+    def _why_not_pooled(self) -> str:
+        """Why no mass is pooled; empty where some mass has several exams and the calibration can pool them."""
+        if len({exam.of_mass for exam in self.exams}) == len(self.exams):
+            return "no mass has several exams at one visit"
+        return self._not_over_bodies()
+
+    def _not_over_bodies(self) -> str:
+        """Which calibration cannot size several maps together; empty for none."""
+        from tactile_bayes.files.shipped import size_calibration_path
+        from tactile_bayes.files.size_json import read_size_calibration
+        from tactile_bayes.size.bodies import BodyCalibration
+
+        for name in {self.settings.of(exam).calibration for exam in self.exams} - {None}:
+            path = size_calibration_path(str(name))
+            if path is None or not isinstance(read_size_calibration(path), BodyCalibration):
+                return f"size calibration {name} is not learned over bodies"
+        return ""
+
+    def _pool_task(self, name: str, exams: Sequence[Exam]) -> Task:
+        settings, key = self._of_one_mass(exams)
+        folder, members = self.folder / MASSES / name, self._members(exams)
+        return Task(step="pool", name=name, folder=folder, digest=digest_of(key), settings=settings, members=members)
+
+    def _of_one_mass(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
+        """Settings by which exams are sized together, and all that the result depends on."""
+        first = self.found.of("map", exams[0].name)
+        assert first is not None
+        settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
+        settings = self._by_repeatability(settings, first["normalise"])
+        files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
+        return settings, {"exams": files, **self._settings_key(settings, first["normalise"])}
+
+    def _members(self, exams: Sequence[Exam]) -> tuple[tuple[str, Path], ...]:
+        return tuple((exam.name, self.folder / EXAMS / exam.name) for exam in exams)
+
+    def _compare(self, sound: Sequence[Exam]) -> None:
+        """Compare the visits of every mass that has several with an estimate."""
+        estimated = [exam for exam in sound if exam.name in self.found.results["estimate"]]
+        masses = {} if self._sizes_unknown else grown_masses(estimated)
+        unknown = len(grown_masses(sound)) - len(masses)
+        for names in _blocks(list(masses), self._block):
+            self._stages.run("compare", [self._compare_task(name, masses[name]) for name in names])
+            self._copy(GROWTH, names, steps=("compare",))
+        self._stages.run("compare", [], without=unknown)
+        if self.settings.copy_to:
+            self._stages.run("copy", [], without=unknown)
+
+    def _compare_task(self, name: str, visits: Visits) -> Task:
+        settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
+        days, figures = days_of(visits), self.settings.figures
+        counts = [len(exams) for exams in visits.values()]
+        members = tuple(self._members(exams) for exams in visits.values())
+        return Task(
+            "compare",
+            name,
+            self.folder / GROWTH / name,
+            digest_of({**key, "visits": counts, "days": days, "figures": figures}),
+            settings=settings,
+            visits=members,
+            days=days,
+            figures=figures,
+        )
+
+    def _file(self, step: str, exam: Exam, file: str) -> str | None:
+        result = self.found.of(step, exam.name)
+        return None if result is None else result["files"].get(file)
+
+
+SITE: Final = "site"
+"""Name of the one step that is of no exam or mass."""
+_POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
+
+
+def _blocks(items: Sequence[_Any], size: int) -> Iterator[Sequence[_Any]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
+
+
+def _blocks_of_patients(exams: Sequence[Exam], size: int) -> Iterator[Sequence[Exam]]:
+    """Blocks of at least so many exams; a patient's stay together, for one may name the place of another's mass."""
+    start = 0
+    for end in range(1, len(exams) + 1):
+        if end == len(exams) or (end - start >= size and exams[end].patient != exams[end - 1].patient):
+            yield exams[start:end]
+            start = end
+
+
+def _no_bar(_label: str) -> AbstractContextManager[Progress]:
+    return nullcontext(untold)

@@ -1,0 +1,271 @@
+"""Tables of a campaign: exams done, failures, and the trial table that `validate` takes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_bayes.campaign.match import unnamed
+from tactile_bayes.campaign.run import Campaign
+from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, MASSES, POOLED, SIZED, TRIAL
+from tactile_bayes.files.documents import load_json, load_schema
+from tactile_bayes.files.manifest_csv import Exam, table_text
+from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, findings_in, verdict
+from tactile_bayes.records import dataclass
+
+TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
+_TRIAL_COLUMNS: Final = (
+    "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",
+    "reader", "visit", "date", "reason", "synthetic",
+)  # fmt: skip
+_OF_ESTIMATE: Final = (
+    "status", "reason", "reason_code", "max_size_mm", "min_size_mm", "centre_mm", "detected_probability", "findings",
+)  # fmt: skip
+_OF_POOLED: Final = ("status", "reason", "max_size_mm", "findings")
+"""What tables and pages show of a document: the rest of it is a hundred times as much."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """One exam as the tables and the contact sheet show it.
+
+    Parameters
+    ----------
+    exam
+        Of exams.csv.
+    document
+        The estimate's JSON object, by the campaign's repeatability where it has one; None where a step failed.
+    step, fault
+        Which step failed and why; empty where none did.
+    scans, synthetic
+        Of the file: digests and facts, whether it is simulated (None: unknown).
+    findings
+        What speaks against the exam: of its estimate, of the pooled size of its mass, of the table.
+    """
+
+    exam: Exam
+    document: Mapping[str, Any] | None
+    step: str = ""
+    fault: str = ""
+    scans: tuple[Mapping[str, str], ...] = ()
+    synthetic: bool | None = None
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def size(self) -> Mapping[str, float] | None:
+        """Largest size with its interval; None without one."""
+        return None if self.document is None else self.document["max_size_mm"]
+
+    @property
+    def reason(self) -> str:
+        """Why there is no size; empty where there is one."""
+        if self.document is None:
+            return f"{self.step} failed: {self.fault}"
+        return "" if self.size is not None else str(self.document["reason"])
+
+    @property
+    def status(self) -> str:
+        """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
+        return _status(self.document)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Sound, doubtful or no answer."""
+        return verdict(self.findings, answered=self.size is not None)
+
+
+def _status(document: Mapping[str, Any] | None) -> str:
+    if document is None:
+        return "not_done"
+    if document["max_size_mm"] is not None:
+        return "detected"
+    looked = document["status"] == "no_estimate" and document.get("reason_code") != "coarse"
+    return "not_detected" if looked else "not_done"
+
+
+def exam_rows(campaign: Campaign) -> list[Row]:
+    """Every exam of the table, in its order."""
+    together = _of_pooled(campaign)
+    rows = [_row(campaign, exam, together.get(exam.name, ())) for exam in campaign.exams]
+    of_scan: dict[Path, list[Mapping[str, Any]]] = defaultdict(list)
+    for row in rows:
+        if row.document is not None:
+            of_scan[row.exam.path].append(row.document)
+    return [
+        row
+        if row.document is None
+        else replace(row, findings=by_weight((*row.findings, *unnamed(of_scan[row.exam.path]))))
+        for row in rows
+    ]
+
+
+def _of_pooled(campaign: Campaign) -> dict[str, tuple[Finding, ...]]:
+    """What the pooled size of its mass says against each exam, such as that its lump lies elsewhere."""
+    return {
+        name: tuple(
+            replace(one, about="")
+            for one in findings_in(document["findings"])
+            if (one.about == f"map {number}" and one.kind != "several_masses")  # its row says which mass it is of
+            or one.kind == "maps_disagree"
+        )
+        for document in pooled_documents(campaign).values()
+        for number, name in enumerate(document["maps"], start=1)
+    }
+
+
+def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
+    fault = campaign.found.faults.get(exam.name)
+    mapped = campaign.found.of("map", exam.name) or {}
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
+    if fault is not None and fault.step != "figures":
+        return Row(exam, None, fault.step, fault.reason, **facts)
+    by_site = SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
+    document = estimate_facts(load_json(campaign.folder / EXAMS / exam.name / (SIZED if by_site else ESTIMATE)))
+    return Row(exam, document, findings=(*findings_in(document["findings"]), *together), **facts)
+
+
+def estimate_facts(document: Any) -> dict[str, Any]:
+    """What tables and pages need of an estimate's JSON object."""
+    masses = [{name: one[name] for name in ("centre_mm", "reported")} for one in document.get("masses", [])]
+    return {name: document.get(name) for name in _OF_ESTIMATE} | {"masses": masses}
+
+
+def pooled_documents(campaign: Campaign) -> dict[str, dict[str, Any]]:
+    """What tables need of the JSON object of each pooled mass, by its name."""
+    found = {}
+    for name in campaign.found.results["pool"]:
+        document = load_json(campaign.folder / MASSES / name / POOLED)
+        if isinstance(document, dict):
+            found[name] = {key: document[key] for key in _OF_POOLED}
+            found[name]["maps"] = [one["map"] for one in document["maps"]]
+    return found
+
+
+def done_text(rows: Sequence[Row]) -> str:
+    """``exams_done.csv``: exams with an estimate, or with the reason for none."""
+    return table_text([_done(row) for row in rows if row.document is not None], _columns("exams_done"))
+
+
+def _columns(table: str) -> list[str]:
+    return [one["name"] for one in load_schema(f"{table}.table.json")["fields"]]
+
+
+def _done(row: Row) -> dict[str, object]:
+    document = row.document
+    assert document is not None
+    centre = document["centre_mm"] or {}
+    smallest = document["min_size_mm"]
+    return {
+        **_names(row.exam),
+        "side": row.exam.side,
+        "reader": row.exam.reader,
+        "folder": f"{EXAMS}/{row.exam.name}",
+        "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan) or None,
+        "status": row.status,
+        "reason": row.reason or None,
+        **_sizes(row.size),
+        "smallest_mm": None if smallest is None else smallest["median"],
+        "detected_probability": document["detected_probability"],
+        **{f"centre_{axis}_mm": value["median"] for axis, value in centre.items()},
+        "verdict": row.verdict,
+        "findings": " ".join(finding_lines(row.findings)) or None,
+        "synthetic": row.synthetic,
+    }
+
+
+def _names(exam: Exam) -> dict[str, object]:
+    return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "file")}
+
+
+def _sizes(size: Mapping[str, float] | None) -> dict[str, object]:
+    if size is None:
+        return {}
+    names = {"size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability"}
+    return {column: size[name] for column, name in names.items()}
+
+
+def failures_text(campaign: Campaign, rows: Sequence[Row]) -> str:
+    """``failures.csv``: exams, and masses that could not be pooled or compared, with the step and the reason."""
+    failed = {row.exam.name: _names(row.exam) for row in rows}
+    failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
+    blank = {"visit": None, "replicate": None, "file": None}
+    failed |= {row.exam.of_visits: {**_names(row.exam), **blank} for row in rows}
+    found = campaign.found.faults
+    lines = [
+        failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found
+    ]
+    return table_text(lines, _columns("failures"))
+
+
+def trial_text(campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None) -> str:
+    """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
+
+    Parameters
+    ----------
+    masses
+        Patients and masses with a size after excision: the others are left out. None takes all.
+    """
+    taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
+    count: dict[tuple[str, str], int] = {}
+    readings = [_reading(row.exam, TACTILE, count, row.document, reason=row.reason, of=row) for row in taken]
+    count = {}
+    visits = {row.exam.of_mass: row for row in taken}
+    simulated: dict[str, bool] = {}
+    for row in taken:  # a failed exam does not say
+        if row.synthetic is not None:
+            simulated[row.exam.of_mass] = row.synthetic or simulated.get(row.exam.of_mass, False)
+    pooled = pooled_documents(campaign)
+    for name, row in visits.items() if campaign.found.results["pool"] else ():
+        document = pooled.get(name)
+        reason = _unpooled(campaign, name) if document is None else str(document["reason"])
+        readings.append(_reading(row.exam, POOLED_MODALITY, count, document, reason=reason))
+        readings[-1] |= {"synthetic": simulated.get(name)}
+    return table_text(readings, _TRIAL_COLUMNS)
+
+
+def _unpooled(campaign: Campaign, name: str) -> str:
+    """Why a mass was not pooled."""
+    fault = campaign.found.faults.get(name)
+    return "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
+
+
+def _reading(
+    exam: Exam,
+    modality: str,
+    count: dict[tuple[str, str], int],
+    document: Mapping[str, Any] | None,
+    *,
+    reason: str,
+    of: Row | None = None,
+) -> dict[str, object]:
+    """A reading; its number runs over the visits of the mass."""
+    mass = (exam.patient, exam.mass)
+    count[mass] = count.get(mass, 0) + 1
+    status = _status(document)
+    return {
+        "patient": exam.patient,
+        "mass": exam.mass,
+        "modality": modality,
+        "replicate": count[mass],
+        "status": status,
+        **_sizes(None if document is None else document["max_size_mm"]),
+        "reader": None if of is None else exam.reader,
+        "visit": exam.visit,
+        "date": exam.day,
+        "reason": (reason or None) if status != "detected" else None,
+        "synthetic": None if of is None else of.synthetic,
+    }
+
+
+def write_tables(
+    campaign: Campaign, rows: Sequence[Row], masses: Collection[tuple[str, str]] | None, folder: Path
+) -> None:
+    """Write the three tables."""
+    from tactile_bayes.files.atomic import write_text
+
+    texts = {DONE: done_text(rows), FAILURES: failures_text(campaign, rows), TRIAL: trial_text(campaign, rows, masses)}
+    for name, text in texts.items():
+        write_text(folder / name, text, force=True)

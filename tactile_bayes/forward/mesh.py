@@ -1,0 +1,577 @@
+"""Meshes of a box with a lump: plane and solid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.body import Body
+from tactile_bayes.geometry import FloatArray
+
+# --- Quadrilateral meshes of half the body, graded and with every material boundary on element edges.
+#
+# All meshes are of nine-node quadrilaterals on x >= 0 (the body is symmetric about the lump's axis); z is depth.
+# Around the lump runs a ring of rays from its circle to a box; beyond the box, rows and columns. Where rays meet in
+# a point (the centre of the disc, the point where a resting lump touches the gland) quadrilaterals collapse to
+# triangles. Under a lump that stands clear of the gland the box ends on the boundary of the two.
+
+IndexArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+# Half width of the box about the lump, and how far it reaches above and below the centre, in diameters.
+_BOX = 0.75
+# A box whose top would leave less than this many diameters of rows above it goes to the skin.
+_LEAST_ABOVE = 0.35
+# Beyond the outermost head position (72 mm) the body goes on for this many thicknesses.
+_BEYOND = 3.0
+REACH_MM = 72.0
+# Elements per unit of fineness: along the arc below the skin (where the bump's shape is made), from there down to the
+# fat-gland boundary, on either part below it, and along the rays outside and inside the lump.
+_TOP, _UP, _DOWN, _OUT, _IN = 8, 4, 2, 2, 2
+# Elements beyond the box grow by this factor from one to the next at fineness 1, by its square root at 2.
+_GROWTH = 2.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QuadMesh:
+    """Nine-node quadrilaterals.
+
+    Parameters
+    ----------
+    nodes : (n, 2) array
+        x and depth z in mm.
+    elements : (m, 9) int array
+        Node numbers in tensor order: ``elements[:, 3 * i + j]`` is the node at step i of the first local direction and
+        step j of the second.
+    gland : (m,) bool array
+        Whether the element lies below the fat-gland boundary.
+    """
+
+    nodes: FloatArray
+    elements: IndexArray
+    gland: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+
+
+def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
+    """The body on x >= 0 with a hole where the lump is.
+
+    Parameters
+    ----------
+    fineness
+        Elements along each part of the box; twice the fineness is half the element size everywhere.
+    """
+    box = _Box.around(body, fineness)
+    ring = _rays(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
+    across = _graded(box.half_width_mm, REACH_MM + _BEYOND * body.layers.thickness_mm, box.row_mm, fineness)
+    rows = np.concatenate([box.above_mm[:-1], box.side_mm[:-1], box.below_mm])
+    blocks = [ring, _grid(across, rows), _grid(box.bottom_x_mm, box.below_mm)]
+    if len(box.above_mm) > 1:
+        blocks.append(_grid(box.top_x_mm, box.above_mm))
+    return _join(blocks, boundary_mm=body.layers.fat_mm, scale_mm=body.d_mm)
+
+
+def disc_mesh(body: Body, *, fineness: int, layered: bool) -> QuadMesh:
+    """The lump on x >= 0 with the same nodes on its circle as `body_mesh`.
+
+    Parameters
+    ----------
+    layered
+        Whether the fat-gland boundary runs along element edges through the disc; else the rays meet in its centre.
+    """
+    circle = _circle(body, _Box.around(body, fineness).angles_rad())
+    depth = body.layers.fat_mm if layered else body.centre_mm
+    middle = np.broadcast_to([0.0, depth], circle.shape)
+    block = _rays(middle, circle, np.linspace(0.0, 1.0, 2 * _IN * fineness + 1))
+    return _join([block], boundary_mm=body.layers.fat_mm, scale_mm=body.d_mm)
+
+
+def rectangle_mesh(x_mm: FloatArray, z_mm: FloatArray) -> QuadMesh:
+    """A grid of quadrilaterals with corners at `x_mm` and `z_mm`, all of them fat: for bodies without a lump."""
+    return _join([_grid(_with_middles(x_mm), _with_middles(z_mm))], boundary_mm=np.inf, scale_mm=1.0)
+
+
+def joined(meshes: Sequence[QuadMesh], *, scale_mm: float) -> QuadMesh:
+    """Merge several meshes into one; nodes nearer than 1e-8 of `scale_mm` become one."""
+    offsets = np.cumsum([0] + [len(mesh.nodes) for mesh in meshes])
+    points, number = _merged(np.concatenate([mesh.nodes for mesh in meshes]), scale_mm)
+    elements = [number[mesh.elements + offset] for mesh, offset in zip(meshes, offsets, strict=False)]
+    return QuadMesh(points, np.concatenate(elements), np.concatenate([mesh.gland for mesh in meshes]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Box:
+    """The rectangle about the lump and the rows above and below it; positions include the elements' middles."""
+
+    body: Body
+    half_width_mm: float
+    above_mm: FloatArray
+    side_up_mm: FloatArray
+    side_down_mm: FloatArray
+    below_mm: FloatArray
+    top_x_mm: FloatArray
+    bottom_x_mm: FloatArray
+
+    @classmethod
+    def around(cls, body: Body, fineness: int) -> _Box:
+        h, d, layers = body.centre_mm, body.d_mm, body.layers
+        top = h - _BOX * d if h > (_BOX + _LEAST_ABOVE) * d else 0.0
+        if body.seat > 1.0:
+            return cls._above_gland(body, top, fineness)
+        bottom = h + 0.5 * d + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - h - 0.5 * d))
+        side_up = np.linspace(top, layers.fat_mm, 2 * _UP * fineness + 1)
+        row = 2 * float(side_up[1] - side_up[0])
+        return cls(
+            body,
+            _BOX * d,
+            _rows_above(top, d, fineness),
+            side_up,
+            np.linspace(layers.fat_mm, bottom, 2 * _DOWN * fineness + 1),
+            _graded(bottom, layers.thickness_mm, row, fineness),
+            _projected(_BOX * d, h - top, _TOP * fineness),
+            np.linspace(0.0, _BOX * d, 2 * _DOWN * fineness + 1),
+        )
+
+    @classmethod
+    def _above_gland(cls, body: Body, top: float, fineness: int) -> _Box:
+        """Box of a lump clear of the gland: it ends at the fat-gland boundary, so that its side lies in fat."""
+        h, d, layers = body.centre_mm, body.d_mm, body.layers
+        half = 0.5 * (top + layers.fat_mm)
+        side_up = np.linspace(top, half, 2 * _UP * fineness + 1)
+        return cls(
+            body,
+            _BOX * d,
+            _rows_above(top, d, fineness),
+            side_up,
+            np.linspace(half, layers.fat_mm, 2 * _UP * fineness + 1),
+            _graded(layers.fat_mm, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
+            _projected(_BOX * d, h - top, _TOP * fineness),
+            _projected(_BOX * d, layers.fat_mm - h, _UP * fineness),
+        )
+
+    @property
+    def side_mm(self) -> FloatArray:
+        """Depths along the whole side."""
+        return np.concatenate([self.side_up_mm[:-1], self.side_down_mm])
+
+    @property
+    def row_mm(self) -> float:
+        """Height of an element beside the box."""
+        return 2 * float(self.side_up_mm[1] - self.side_up_mm[0])
+
+    def outline(self) -> FloatArray:
+        """(k, 2) points from above the lump along top, side and bottom to below it."""
+        w = self.half_width_mm
+        top = np.stack([self.top_x_mm, np.full_like(self.top_x_mm, self.above_mm[-1])], axis=1)
+        side = np.stack([np.full_like(self.side_mm, w), self.side_mm], axis=1)
+        bottom = np.stack([self.bottom_x_mm[::-1], np.full_like(self.bottom_x_mm, self.side_mm[-1])], axis=1)
+        return np.concatenate([top[:-1], side[:-1], bottom])
+
+    def angles_rad(self) -> FloatArray:
+        """(k,) angles from the lump's highest point, one for each point of the outline."""
+        if self.body.seat > 1.0:
+            outline = self.outline()
+            return np.asarray(np.arctan2(outline[:, 0], self.body.centre_mm - outline[:, 1]))
+        corner = np.arctan2(self.half_width_mm, self.body.centre_mm - self.above_mm[-1])
+        boundary = 0.5 * np.pi + np.arcsin(self.body.seat)
+        n_top, n_up = len(self.top_x_mm), len(self.side_up_mm)
+        n_down = len(self.side_down_mm) + len(self.bottom_x_mm) - 1
+        parts = [
+            np.linspace(0.0, corner, n_top)[:-1],
+            np.linspace(corner, boundary, n_up)[:-1],
+            np.linspace(boundary, np.pi, n_down),
+        ]
+        return np.concatenate(parts)
+
+
+def _rows_above(top_mm: float, d_mm: float, fineness: int) -> FloatArray:
+    """Rows between the skin and the box; the skin alone where the box reaches it."""
+    if top_mm <= 0:
+        return np.zeros(1)
+    return np.linspace(0.0, top_mm, 2 * fineness * int(np.ceil(min(2 * top_mm / d_mm, 6.0))) + 1)
+
+
+def _projected(half_width_mm: float, distance_mm: float, count: int) -> FloatArray:
+    """Points of the box's lid or floor by central projection of equal angles.
+
+    Rays so leave the circle at right angles where the line is near, and stand close together where it is nearest.
+    """
+    corner = np.arctan2(half_width_mm, distance_mm)
+    return np.asarray(distance_mm * np.tan(np.linspace(0.0, corner, 2 * count + 1)))
+
+
+def _circle(body: Body, angles_rad: FloatArray) -> FloatArray:
+    """(k, 2) points of the lump's boundary."""
+    r = body.radius_mm
+    return np.stack([r * np.sin(angles_rad), body.centre_mm - r * np.cos(angles_rad)], axis=1)
+
+
+def _rays(inner: FloatArray, outer: FloatArray, shares: FloatArray) -> FloatArray:
+    """(k, len(shares), 2) points on the straight lines between two outlines."""
+    return np.asarray(inner[:, None, :] + shares[None, :, None] * (outer - inner)[:, None, :])
+
+
+def _grid(x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
+    """(len(x), len(z), 2) points."""
+    return np.stack(np.meshgrid(x_mm, z_mm, indexing="ij"), axis=-1)
+
+
+def _graded(begin_mm: float, end_mm: float, first_mm: float, fineness: int) -> FloatArray:
+    """Corners and midpoints of elements that grow from `first_mm`, by a factor that shrinks with the fineness."""
+    growth = _GROWTH ** (1.0 / fineness)
+    length = end_mm - begin_mm
+    count = int(np.ceil(np.log1p(length / first_mm * (growth - 1.0)) / np.log(growth)))
+    sizes = growth ** np.arange(max(count, fineness))
+    corners = begin_mm + length * np.concatenate([[0.0], np.cumsum(sizes) / sizes.sum()])
+    return _with_middles(corners)
+
+
+def _with_middles(corners: FloatArray) -> FloatArray:
+    """Corners, with the midpoint of each pair between them."""
+    points = np.empty(2 * len(corners) - 1)
+    points[::2] = corners
+    points[1::2] = 0.5 * (corners[1:] + corners[:-1])
+    return points
+
+
+def _join(blocks: Sequence[FloatArray], *, boundary_mm: float, scale_mm: float) -> QuadMesh:
+    """Merge blocks into one mesh; coinciding points become one node, elements without area are dropped."""
+    nodes, number = _merged(np.concatenate([block.reshape(-1, 2) for block in blocks]), scale_mm)
+    offsets = np.cumsum([0] + [block.shape[0] * block.shape[1] for block in blocks])
+    elements = np.concatenate(
+        [_elements(block.shape[0], block.shape[1]) + offset for block, offset in zip(blocks, offsets, strict=False)]
+    )
+    elements = number[elements]
+    corners = nodes[elements[:, [0, 2, 8, 6]]]
+    x, z = corners[..., 0], corners[..., 1]
+    area = 0.5 * np.abs(np.sum(x * np.roll(z, -1, axis=1) - z * np.roll(x, -1, axis=1), axis=1))
+    kept = area > 1e-10 * scale_mm**2
+    gland = corners[..., 1].mean(axis=1) > boundary_mm
+    return _compact(nodes, elements[kept], gland[kept])
+
+
+def _merged(points: FloatArray, scale_mm: float) -> tuple[FloatArray, IndexArray]:
+    """Distinct points, and the index of each given point among them."""
+    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
+    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return points[first], np.asarray(number.reshape(-1), dtype=np.intp)
+
+
+def _elements(n: int, m: int) -> IndexArray:
+    """(k, 9) point numbers of the elements of an n by m block of points (both odd)."""
+    index = np.arange(n * m).reshape(n, m)
+    parts = [index[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
+    return np.stack(parts, axis=1)
+
+
+def _compact(
+    nodes: FloatArray, elements: IndexArray, gland: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+) -> QuadMesh:
+    """Remove the nodes that belong to no element."""
+    used, numbers = np.unique(elements, return_inverse=True)
+    return QuadMesh(nodes[used], numbers.reshape(elements.shape), gland)
+
+
+# --- Meshes of a layered body with a spheroid on its vertical axis: nine-node quadrilaterals in the (r, z) half-plane.
+#
+# Element edges follow the spheroid, the boundary of the layers and the base. About the lump the mesh is a fan of
+# rays to a box; beyond the box it is a graded lattice. z runs down from the skin.
+
+IntArray = NDArray[np.int64]
+EXTERIOR_FAT, EXTERIOR_GLAND, INTERIOR_FAT, INTERIOR_GLAND = range(4)
+# A layer boundary nearer than this to touching the spheroid (as a share of its vertical half axis) is moved away.
+LEAST_CAP: Final = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class LumpGeometry:
+    """A spheroid on the vertical axis of a body of two layers on a rigid base.
+
+    Parameters
+    ----------
+    radius_mm, half_height_mm
+        Half axes of the spheroid, across and along the vertical.
+    depth_mm
+        Of its centre below the skin.
+    fat_mm
+        Depth of the boundary between fat and gland.
+    thickness_mm
+        Depth of the rigid base.
+    """
+
+    radius_mm: float
+    half_height_mm: float
+    depth_mm: float
+    fat_mm: float
+    thickness_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("radius_mm", "half_height_mm", "depth_mm", "fat_mm"):
+            if not getattr(self, name) > 0:
+                raise BadDataError(f"{name} is {getattr(self, name)}", way_out="it must be above 0")
+        top, bottom = self.depth_mm - self.half_height_mm, self.depth_mm + self.half_height_mm
+        room = 0.02 * self.half_height_mm
+        if top < room:
+            raise BadDataError(
+                f"the lump reaches {-top:.3g} mm above the skin (depth {self.depth_mm:g} mm)",
+                way_out=f"its centre must lie {self.half_height_mm + room:.4g} mm deep or deeper",
+            )
+        if bottom > self.thickness_mm - room:
+            raise BadDataError(
+                f"the lump reaches {bottom:.4g} mm deep, the base lies at {self.thickness_mm:g} mm",
+                way_out="give a thicker body or a shallower lump",
+            )
+        if not self.fat_mm < self.thickness_mm:
+            raise BadDataError(
+                f"fat_mm is {self.fat_mm:g}", way_out=f"it must stay below thickness_mm, {self.thickness_mm:g} mm"
+            )
+
+    def boundary_mm(self) -> float:
+        """Depth of the layer boundary, moved by up to 4 % of the half height where it nearly touches the lump."""
+        offset = (self.fat_mm - self.depth_mm) / self.half_height_mm
+        gap = abs(offset) - 1.0
+        if abs(gap) >= LEAST_CAP:
+            return self.fat_mm
+        moved = np.sign(offset) * (1.0 + (LEAST_CAP if gap >= 0 else -LEAST_CAP))
+        return float(self.depth_mm + moved * self.half_height_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshSize:
+    """How fine a mesh is.
+
+    Parameters
+    ----------
+    arc
+        Elements along the half circle of the lump.
+    rings, core
+        Rings of elements outside and inside it.
+    grade
+        Ratio of neighbouring elements beyond the box.
+    reach_mm
+        Least radius of the mesh.
+    """
+
+    arc: int = 18
+    rings: int = 6
+    core: int = 3
+    grade: float = 1.45
+    reach_mm: float = 300.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LumpMesh:
+    """Nodes and elements of a mesh.
+
+    Parameters
+    ----------
+    node_mm : (n, 2) array
+        (r, z) of each node.
+    element : (e, 9) int array
+        Nodes of each element, row by row of its three by three lattice.
+    region : (e,) int array
+        `EXTERIOR_FAT` and so on.
+    arc : (a,) int array
+        Nodes on the lump's boundary from the top pole to the bottom pole.
+    surface : (s,) int array
+        Nodes on the skin by increasing r.
+    """
+
+    node_mm: FloatArray
+    element: IntArray
+    region: IntArray
+    arc: IntArray
+    surface: IntArray
+
+
+@dataclass(slots=True)
+class _Patches:
+    """Lattices of nodes before equal nodes are merged."""
+
+    lattices: list[tuple[FloatArray, int]] = field(default_factory=list)
+
+    def add(self, lattice: FloatArray, region: int) -> None:
+        self.lattices.append((lattice, region))
+
+
+def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> LumpMesh:
+    """Mesh a lump in its body; the module describes the layout."""
+    size = size or MeshSize()
+    g, boundary = geometry, geometry.boundary_mm()
+    corner_r, top, bottom = _box(g, boundary)
+    lines = _Fan(g, boundary, corner_r, top, bottom, size.arc)
+    patches = _Patches()
+    for arc, rim in lines.sectors():
+        middle = float(rim[len(rim) // 2, 1])
+        patches.add(_blend(arc, rim, _graded_share(size.rings, 1.25)), int(middle > boundary))
+        fat = float(arc[len(arc) // 2, 1]) < boundary
+        centre = np.array([0.0, boundary if lines.cut else g.depth_mm])
+        core = np.linspace(0.0, 1.0, 2 * size.core + 1)
+        patches.add(_blend(np.broadcast_to(centre, arc.shape), arc, core), INTERIOR_FAT if fat else INTERIOR_GLAND)
+    _beyond_box(patches, lines, g, boundary, size)
+    return _merge(patches)
+
+
+def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
+    """Radius, top and bottom of the box that the fan of rays fills."""
+    margin = 1.3 * max(g.radius_mm, g.half_height_mm)
+    high, low = g.depth_mm - g.half_height_mm, g.depth_mm + g.half_height_mm
+    top, bottom = 0.0, low + margin
+    if boundary < high:
+        top = boundary
+    if low < boundary < bottom + 0.5 * margin:
+        bottom = boundary
+    if bottom > g.thickness_mm - 0.5 * margin:
+        bottom = g.thickness_mm
+    return max(g.radius_mm + margin, 0.8 * (g.depth_mm - top)), top, bottom
+
+
+class _Fan:
+    """Intersections of rays from the lump with the box: up to four sectors, split at corners and layer boundary."""
+
+    def __init__(
+        self, g: LumpGeometry, boundary: float, corner_r: float, top: float, bottom: float, elements: int
+    ) -> None:
+        self.g, self.corner_r, self.top, self.bottom = g, corner_r, top, bottom
+        self.cut = abs(boundary - g.depth_mm) < g.half_height_mm
+        upper = float(np.arctan2(corner_r, g.depth_mm - top))
+        lower = float(np.pi - np.arctan2(corner_r, bottom - g.depth_mm))
+        breaks, depths = [0.0, upper, lower, np.pi], [top, bottom]
+        if self.cut:
+            at = float(np.arccos((g.depth_mm - boundary) / g.half_height_mm))
+            breaks = [0.0, min(upper, 0.6 * at), at, max(lower, np.pi - 0.6 * (np.pi - at)), np.pi]
+            depths = [top, boundary, bottom]
+        self.breaks = breaks
+        # the side of the box is shared out between its corners and the layer boundary
+        self.side_depths = depths
+        share = np.diff(breaks) / np.pi * elements
+        self.counts = [max(2 if 0 < i < len(share) - 1 else 1, round(float(s))) for i, s in enumerate(share)]
+        # a thin bridge of tissue above the lump needs elements as short as it is thick
+        bridge = max(g.depth_mm - g.half_height_mm - top, 0.1 * g.half_height_mm)
+        shortest = g.depth_mm * np.tan(breaks[1] / self.counts[0])
+        self.counts[0] = max(self.counts[0], round(self.counts[0] * min(shortest / bridge, 2.0)))
+
+    def side_mm(self) -> FloatArray:
+        """Depths of the nodes on the box's vertical side."""
+        parts = [
+            np.linspace(a, b, 2 * n + 1)
+            for a, b, n in zip(self.side_depths[:-1], self.side_depths[1:], self.counts[1:-1], strict=True)
+        ]
+        return np.concatenate([parts[0], *[part[1:] for part in parts[1:]]])
+
+    def across_mm(self, sector: int) -> FloatArray:
+        """Radii of the nodes on the box's top (sector 0) or bottom (sector -1): closest together over the lump."""
+        angle = self.breaks[1] if sector == 0 else np.pi - self.breaks[-2]
+        share = np.tan(np.linspace(0.0, angle, 2 * self.counts[sector] + 1)) / np.tan(angle)
+        share[-1] = 1.0
+        return np.asarray(self.corner_r * share)
+
+    def sectors(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Nodes on the lump and on the box, sector by sector from the top pole to the bottom pole."""
+        found = []
+        side = self.side_mm()
+        start = 0
+        for i, n in enumerate(self.counts):
+            angle = np.linspace(self.breaks[i], self.breaks[i + 1], 2 * n + 1)
+            sine = np.sin(angle)
+            sine[np.abs(sine) < 1e-14] = 0.0
+            arc = np.stack([self.g.radius_mm * sine, self.g.depth_mm - self.g.half_height_mm * np.cos(angle)], axis=-1)
+            if i == 0:
+                r = self.across_mm(0)
+                rim = np.stack([r, np.full_like(r, self.top)], axis=-1)
+            elif i == len(self.counts) - 1:
+                r = self.across_mm(-1)[::-1]
+                rim = np.stack([r, np.full_like(r, self.bottom)], axis=-1)
+            else:
+                z = side[start : start + 2 * n + 1]
+                rim = np.stack([np.full_like(z, self.corner_r), z], axis=-1)
+                start += 2 * n
+            found.append((arc, rim))
+        return found
+
+
+def _graded_share(count: int, ratio: float) -> FloatArray:
+    """(2 count + 1,) shares 0 to 1 whose elements grow by `ratio`, each with its mid-side node in the middle."""
+    steps = np.repeat(ratio ** np.arange(count), 2)
+    share: FloatArray = np.concatenate([[0.0], np.cumsum(steps)]) / float(steps.sum())
+    share[-1] = 1.0
+    return share
+
+
+def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
+    """(len(share), len(start), 2) lattice between two lines of nodes, exact at both."""
+    s = share[:, None, None]
+    return np.asarray((1.0 - s) * start + s * end)
+
+
+def _graded_line(start: float, stop: float, *, first: float, grade: float) -> FloatArray:
+    """Nodes of elements whose length grows from about `first` by at most `grade` until `stop`."""
+    length = stop - start
+    count = max(1, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
+    line = start + length * _graded_share(count, grade)
+    line[0], line[-1] = start, stop
+    return line
+
+
+def _beyond_box(patches: _Patches, fan: _Fan, g: LumpGeometry, boundary: float, size: MeshSize) -> None:
+    """The lattices outside, below and above the box."""
+    reach = max(size.reach_mm, 2.0 * fan.corner_r, 4.0 * g.depth_mm)
+    side = fan.side_mm()
+    element_r = float(fan.corner_r - fan.across_mm(0)[-3])
+    right = _graded_line(fan.corner_r, reach, first=element_r, grade=size.grade)
+    below = _down_from(fan.bottom, g.thickness_mm, boundary, first=float(side[-1] - side[-3]), grade=size.grade)
+    above = _down_from(0.0, fan.top, boundary, first=float(side[2] - side[0]), grade=1.0 + 1e-9)
+    for z in (above, side, below):
+        _lattice(patches, right, z, boundary)
+    _lattice(patches, fan.across_mm(-1), below, boundary)
+    _lattice(patches, fan.across_mm(0), above, boundary)
+
+
+def _down_from(start: float, stop: float, boundary: float, *, first: float, grade: float) -> FloatArray:
+    """Nodes down a line, one of them at the layer boundary; empty when the line has no length."""
+    if not stop > start:
+        return np.zeros(0)
+    if not start < boundary < stop:
+        return _graded_line(start, stop, first=first, grade=grade)
+    upper = _graded_line(start, boundary, first=first, grade=grade)
+    lower = _graded_line(boundary, stop, first=float(upper[-1] - upper[-3]), grade=grade)
+    return np.concatenate([upper, lower[1:]])
+
+
+def _lattice(patches: _Patches, r: FloatArray, z: FloatArray, boundary: float) -> None:
+    """A rectangle of elements, split at the layer boundary."""
+    cuts = [0, *np.flatnonzero(z == boundary), len(z) - 1]
+    for a, b in pairwise(cuts):
+        if b > a:
+            part = z[a : b + 1]
+            grid = np.stack(np.broadcast_arrays(r[None, :], part[:, None]), axis=-1)
+            patches.add(grid, int(part[len(part) // 2] > boundary))
+
+
+def _merge(patches: _Patches) -> LumpMesh:
+    points = np.concatenate([lattice.reshape(-1, 2) for lattice, _ in patches.lattices])
+    _, first, inverse = np.unique(np.round(points / 1e-7), axis=0, return_index=True, return_inverse=True)
+    node, inverse = points[first], inverse.reshape(-1).astype(np.int64)
+    elements, regions, start = [], [], 0
+    for lattice, region in patches.lattices:
+        rows, columns = lattice.shape[:2]
+        index = inverse[start : start + rows * columns].reshape(rows, columns)
+        start += rows * columns
+        corners = [index[i : rows - 2 + i : 2, j : columns - 2 + j : 2].ravel() for i in range(3) for j in range(3)]
+        elements.append(np.stack(corners, axis=-1))
+        regions.append(np.full(len(corners[0]), region))
+    element, region_of = np.concatenate(elements), np.concatenate(regions)
+    surface = np.flatnonzero(np.abs(node[:, 1]) < 1e-7)
+    inside, outside = (set(element[mask].ravel()) for mask in (region_of >= INTERIOR_FAT, region_of < INTERIOR_FAT))
+    arc = np.array(sorted(inside & outside), dtype=np.int64)
+    return LumpMesh(
+        node_mm=node,
+        element=element,
+        region=region_of,
+        arc=arc[np.argsort(node[arc, 1])],
+        surface=surface[np.argsort(node[surface, 0])],
+    )

@@ -1,0 +1,230 @@
+"""The solid model's frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.forward.axisymmetric import CondensedLump, skin_spline
+from tactile_bayes.forward.body import HeadFace
+from tactile_bayes.forward.contact import ContactStiffness, press
+from tactile_bayes.forward.contact import SolidContact as Contact
+from tactile_bayes.forward.layers import LayeredBody, taxel_compliance
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import HEAD_PITCH_MM
+
+# --- Frames of the head on a layered body with lumps, in three dimensions.
+#
+# The skin's compliance under the head is the exact one of the layers without a lump, plus what each lump changes,
+# condensed to a few functions about the lump's vertical axis. Several lumps are summed as if each were alone.
+
+# Functions that carry less than this share of the largest are left out.
+RANK_TOLERANCE: Final = 1e-5
+# Step of the tables in r: linear interpolation between entries is then off by less than 1e-4 of a function.
+STEP_MM: Final = 0.05
+# Largest r in the tables.
+REACH_MM: Final = 75.0
+# Functions with a sum of squares under the face below this share of a square's own compliance are left out of a frame.
+_LEAST_WEIGHT: Final = 1e-6
+# Directions of the ring that stands for a square when a function is averaged over it.
+_DIRECTIONS: Final = 24
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinPerturbation:
+    r"""Low-rank change of the skin's compliance by one lump.
+
+    Parameters
+    ----------
+    table : (t, k) array
+        Functions of the distance from the lump's axis, every 0.05 mm, in mm (kPa mm^2)^(-1/2).
+    order : (k,) int array
+        Angular order of each.
+    sign : (k,) array
+        -1 where the lump stiffens.
+
+    Notes
+    -----
+    :math:`\Delta C(x, y) = \sum_k s_k f_k(r_x) f_k(r_y) \cos m_k(\theta_x - \theta_y)`.
+    """
+
+    table: FloatArray
+    order: NDArray[np.int64]
+    sign: FloatArray
+
+    @property
+    def reach_mm(self) -> float:
+        """Distance beyond which the change is neglected."""
+        return (len(self.table) - 1) * STEP_MM
+
+    def vectors(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, c) values at points relative to the axis, and (c,) signs: the change is ``values diag(signs) values^T``.
+
+        Orders above 0 give two columns, for the cosine and the sine of the angle.
+        """
+        distance = np.hypot(x_mm, y_mm) / STEP_MM
+        below = np.minimum(distance.astype(np.int64), len(self.table) - 2)
+        share = np.clip(distance - below, 0.0, 1.0)[:, None]
+        value = (1.0 - share) * self.table[below] + share * self.table[below + 1]
+        angle = np.arctan2(y_mm, x_mm)
+        turns = np.arange(int(self.order.max(initial=0)) + 1)
+        phase = np.multiply.outer(angle, turns)
+        twice = self.order > 0
+        cosine = value * np.cos(phase)[:, self.order]
+        sine = value[:, twice] * np.sin(phase)[:, self.order[twice]]
+        return np.concatenate([cosine, sine], axis=1), np.concatenate([self.sign, self.sign[twice]])
+
+
+def skin_perturbation(
+    condensed: CondensedLump,
+    lump_kpa: float,
+    *,
+    square_mm: float = HEAD_PITCH_MM,
+    tolerance: float = RANK_TOLERANCE,
+) -> SkinPerturbation:
+    """Condense a lump's perturbation to its leading functions.
+
+    Parameters
+    ----------
+    condensed, lump_kpa
+        The lump's surroundings, and its modulus.
+    square_mm
+        Side of the squares over which load and displacement are averaged; 0 for points.
+    tolerance
+        Share of the largest eigenvalue below which a function is left out.
+    """
+    parts = [(mode.order, *np.linalg.eigh(mode.matrix)) for mode in condensed.perturbation(lump_kpa)]
+    largest = max(float(np.abs(value).max()) for _, value, _ in parts)
+    r: FloatArray = (
+        np.arange(int(np.ceil(min(REACH_MM, condensed.radius_mm[-1]) / STEP_MM)) + 1, dtype=np.float64) * STEP_MM
+    )
+    tables, orders, signs = [np.zeros((len(r), 0))], [], []
+    for order, value, vector in parts:
+        kept = np.abs(value) > tolerance * largest
+        spline = skin_spline(condensed.radius_mm, vector[:, kept] * np.sqrt(np.abs(value[kept])), order=order)
+        tables.append(square_mean(spline, r, order=order, square_mm=square_mm, last_mm=float(condensed.radius_mm[-1])))
+        orders += [order] * int(kept.sum())
+        signs += list(np.sign(value[kept]))
+    return SkinPerturbation(np.concatenate(tables, axis=1), np.array(orders, dtype=np.int64), np.array(signs))
+
+
+def square_mean(
+    function: Callable[[FloatArray], FloatArray], r_mm: FloatArray, *, order: int, square_mm: float, last_mm: float
+) -> FloatArray:
+    """(t, k) means of ``function(r) cos(m theta)`` over a square about a point at angle 0, at distances `r_mm`.
+
+    The centre with weight 2/7 and a ring of radius side sqrt(7/30) with 5/7 have the square's second and fourth radial
+    moments, so only the fourth power that depends on how the square is turned is lost.
+    """
+    angle = (np.arange(_DIRECTIONS) + 0.5) * (2 * np.pi / _DIRECTIONS)
+    x = r_mm[:, None] + square_mm * np.sqrt(7.0 / 30.0) * np.cos(angle)
+    y = np.broadcast_to(square_mm * np.sqrt(7.0 / 30.0) * np.sin(angle), x.shape)
+    value = function(np.minimum(np.hypot(x, y), last_mm))
+    ring = np.einsum("rdk,rd->rk", value, np.cos(order * np.arctan2(y, x))) / _DIRECTIONS
+    mean: FloatArray = (2.0 * function(np.minimum(r_mm, last_mm)) + 5.0 * ring) / 7.0
+    return mean
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedLump:
+    """A perturbation and the place of its axis in the scene's `plane`, mm."""
+
+    perturbation: SkinPerturbation
+    x_mm: float
+    y_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolidFrame:
+    """The solved frame of a head at one pose.
+
+    Parameters
+    ----------
+    pressure_kpa : (rows, columns) array
+        Mean pressure on each taxel.
+    depth_mm
+        z of the head's origin in the scene's `plane`, whose z = 0 is the undisturbed skin.
+    contact
+        Of the whole face, rim included.
+    """
+
+    pressure_kpa: FloatArray
+    depth_mm: float
+    contact: Contact
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolidHead:
+    """A rigid head on a layered body; made by `solid_head`.
+
+    Parameters
+    ----------
+    face
+        What can touch.
+    plain
+        Stiffness of the skin under the face, without lumps.
+    """
+
+    face: HeadFace
+    plain: ContactStiffness
+
+    def frame(
+        self,
+        lumps: Sequence[PlacedLump],
+        *,
+        rotation: FloatArray,
+        x_mm: float,
+        y_mm: float,
+        mean_kpa: float,
+        touching: NDArray[np.bool_] | None = None,
+    ) -> SolidFrame:
+        """Pressures of the head at a pose and a force.
+
+        Parameters
+        ----------
+        lumps
+            What is below the skin.
+        rotation : (3, 3) array
+            ``p_plane = rotation @ p_scanhead + (x, y, depth)``. The head keeps it; only the depth adapts.
+        x_mm, y_mm
+            Origin of the head's face in the scene's `plane`.
+        mean_kpa
+            Mean over the taxels: what the examiner's tone holds, and what the gate of the map looks at.
+        touching
+            Where to start: `contact.touching` of a neighbouring frame.
+        """
+        place = self.face.surface_mm.reshape(-1, 3) @ rotation.T
+        stiffness = self.plain
+        parts = [self._vectors(lump, place[:, 0] + x_mm, place[:, 1] + y_mm) for lump in lumps]
+        vectors = np.concatenate([np.zeros((len(place), 0)), *[vector for vector, _ in parts]], axis=1)
+        if vectors.shape[1]:
+            stiffness = stiffness.changed(vectors, np.concatenate([sign for _, sign in parts]))
+        contact = press(
+            stiffness, -place[:, 2], mean_kpa=mean_kpa, counted=self.face.sensing.ravel(), touching=touching
+        )
+        return SolidFrame(self.face.taxel_frame(contact.pressure_kpa), contact.depth_mm, contact)
+
+    def _vectors(self, lump: PlacedLump, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Change by one lump under the face, per unit pressure on a square; negligible parts are dropped."""
+        values, signs = lump.perturbation.vectors(x_mm - lump.x_mm, y_mm - lump.y_mm)
+        values = values * self.face.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
+        weight = np.einsum("nk,nk->k", values, values)
+        kept = weight > _LEAST_WEIGHT * float(np.diag(self.plain.plain).mean()) ** -1
+        return values[:, kept], signs[kept]
+
+
+def solid_head(face: HeadFace, body: LayeredBody) -> SolidHead:
+    """Prepare a head on a body without lumps.
+
+    Notes
+    -----
+    The compliance is that of the squares on the flat skin: the head's curvature and tilt enter as heights, as the
+    linear theory has it (Johnson 1985, ch. 4).
+    """
+    rows, columns = face.sensing.shape
+    compliance = taxel_compliance(body, rows=rows, columns=columns, pitch_mm=face.pitch_mm)
+    return SolidHead(face, ContactStiffness.of(compliance))

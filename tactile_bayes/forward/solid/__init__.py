@@ -1,1 +1,0 @@
-"""The layered body in three dimensions: axisymmetric elements about each lump under the whole head."""

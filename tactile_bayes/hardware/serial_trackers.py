@@ -1,0 +1,254 @@
+"""Trackers on a serial line: Ascension's Flock of Birds, Polhemus."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from tactile_bayes.hardware.readings import MM_PER_INCH, PoseReading, Reading, RecordParser, plausible
+
+# --- Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
+#
+# A record is seven words of 14 bits, each sent as two bytes of seven; bit 7 marks the first byte of a record and no
+# other, so that a lost byte costs one record.
+
+SCALE_INCH: Final = 36.0
+_WORDS: Final = 7
+
+
+class BirdParser(RecordParser):
+    """Parser of Flock of Birds records.
+
+    Parameters
+    ----------
+    scale_inch
+        Full scale of a position: 36, or 72 with the long scaling, 144 with the extended range transmitter.
+    group
+        Group mode: the bird's address follows each record.
+    """
+
+    def __init__(self, *, scale_inch: float = SCALE_INCH, group: bool = False) -> None:
+        super().__init__()
+        self.record_bytes = 2 * _WORDS + group
+        self._scale = scale_inch
+        self._group = group
+
+    def _record(self, record: bytes) -> PoseReading | None:
+        if not record[0] & 0x80 or any(byte & 0x80 for byte in record[1:]):
+            return None
+        x, y, z, *turn = (word(record[i], record[i + 1]) for i in range(0, 2 * _WORDS, 2))
+        w, i, j, k = (number / 32768 for number in turn)
+        step = self._scale / 32768 * MM_PER_INCH
+        if not plausible((x * step, y * step, z * step), (w, i, j, k)):
+            return None
+        return PoseReading((x * step, y * step, z * step), (w, i, j, k), station=record[-1] if self._group else 1)
+
+
+def word(low: int, high: int) -> int:
+    """Decode a signed word from its two bytes of seven bits; the two lowest bits are not sent."""
+    number = (low & 0x7F) << 2 | (high & 0x7F) << 9
+    return number - 65536 if number & 0x8000 else number
+
+
+def record_bytes(
+    position_inch: Sequence[float], quaternion_wxyz: Sequence[float], *, scale_inch: float = SCALE_INCH
+) -> bytes:
+    """Encode a pose as the device would: truncated to 14 bits."""
+    scaled = [value / scale_inch * 32768 for value in position_inch] + [value * 32768 for value in quaternion_wxyz]
+    out = bytearray()
+    for value in scaled:
+        number = max(-32768, min(32767, math.floor(value))) & 0xFFFF
+        out += bytes([number >> 2 & 0x7F, number >> 9 & 0x7F])
+    out[0] |= 0x80
+    return bytes(out)
+
+
+# --- Parsers for Polhemus FASTRAK, LIBERTY and PATRIOT trackers.
+#
+# FASTRAK numbers its output items otherwise than LIBERTY and PATRIOT: 11 is a quaternion there, the distortion
+# here. Positions are asked for in inches, because that is what both give after a reset; quaternions are scalar
+# first.
+#
+# References
+# ----------
+# Polhemus, 3SPACE FASTRAK User's Manual, revision G (2012); PATRIOT and LIBERTY user manuals.
+
+FASTRAK_BINARY: Final = (2, 11, 0)
+FASTRAK_ASCII: Final = (2, 11, 1)
+LIBERTY_BINARY: Final = (2, 7, 8, 11, 0)
+LIBERTY_ASCII: Final = (2, 7, 8, 11, 1)
+
+_FASTRAK_KIND: Final = {2: "position", 4: "euler", 11: "quaternion"}
+_LIBERTY_KIND: Final = {
+    2: "position",
+    3: "position",
+    4: "euler",
+    5: "euler",
+    7: "quaternion",
+    8: "time_ms",
+    9: "count",
+    10: "stylus",
+    11: "distortion",
+}
+_NUMBERS: Final = {"position": 3, "euler": 3, "quaternion": 4}  # others: 1
+_TAGS: Final = (b"LY", b"PA", b"LU")
+_LIBERTY_HEADER: Final = struct.Struct("<2sBBBBH")
+_LONGEST_LINE: Final = 512
+
+
+class FastrakParser(RecordParser):
+    """Parser of FASTRAK records, ASCII or binary; their fixed layout finds the next record after garbage.
+
+    Binary records carry no checksum: the station, the error byte, the closing space and the length of the quaternion
+    tell a record from noise.
+    """
+
+    def __init__(self, items: Sequence[int] = FASTRAK_BINARY, *, binary: bool = True) -> None:
+        super().__init__()
+        self._items = tuple(items)
+        self._binary = binary
+        numbers = sum(_NUMBERS[_FASTRAK_KIND[item]] for item in items if item in _FASTRAK_KIND)
+        ends = {0: 1, 1: 2}
+        self.record_bytes = 3 + numbers * (4 if binary else 7) + sum(ends.get(item, 0) for item in items)
+
+    def _record(self, record: bytes) -> PoseReading | None:
+        station, error = record[1] - 48, record[2:3]
+        if record[:1] != b"0" or not 1 <= station <= 4 or not (error.isalpha() or error == b" "):
+            return None
+        values = self._values(record)
+        if values is None:
+            return None
+        flags = () if error == b" " else (f"error {error.decode()}",)
+        return pose_from_items(values, flags=flags, station=station)
+
+    def _values(self, record: bytes) -> dict[str, tuple[float, ...]] | None:
+        values, place = {}, 3
+        for item in self._items:
+            kind = _FASTRAK_KIND.get(item)
+            if kind is None:
+                end = b" " if item == 0 else b"\r\n"
+                if record[place : place + len(end)] != end:
+                    return None
+                place += len(end)
+                continue
+            numbers, width = _NUMBERS[kind], 4 if self._binary else 7
+            part = record[place : place + numbers * width]
+            parsed = struct.unpack(f"<{numbers}f", part) if self._binary else _columns(part, decimals=_DECIMALS[kind])
+            if parsed is None:
+                return None
+            values[kind] = parsed
+            place += numbers * width
+        return values
+
+
+_DECIMALS: Final = {"position": 2, "euler": 2, "quaternion": 4}
+
+
+def _columns(text: bytes, *, decimals: int) -> tuple[float, ...] | None:
+    """Parse numbers in columns of seven characters, which may touch."""
+    pattern = rb" *[+-]? *\d*\.\d{%d}" % decimals
+    cells = [text[i : i + 7] for i in range(0, len(text), 7)]
+    if not all(re.fullmatch(pattern, cell) for cell in cells):
+        return None
+    try:
+        return tuple(float(cell.replace(b" ", b"")) for cell in cells)
+    except ValueError:
+        return None
+
+
+class LibertyParser(RecordParser):
+    """Parser of LIBERTY, PATRIOT and Latus binary records, by their list of items.
+
+    The header's size is a check with a tolerance of the closing space, which firmware may or may not count.
+    """
+
+    def __init__(self, items: Sequence[int] = LIBERTY_BINARY) -> None:
+        super().__init__()
+        self._kinds = [_LIBERTY_KIND[item] for item in items if item in _LIBERTY_KIND]
+        letters = {"time_ms": "I", "count": "I", "stylus": "I", "distortion": "i"}
+        self._body = struct.Struct("<" + "".join(letters.get(k, f"{_NUMBERS.get(k, 1)}f") for k in self._kinds))
+        self._tail = b"".join({0: b" ", 1: b"\r\n"}.get(item, b"") for item in items)
+        self.record_bytes = _LIBERTY_HEADER.size + self._body.size + len(self._tail)
+
+    def _record(self, record: bytes) -> PoseReading | None:
+        tag, station, command, error, _, size = _LIBERTY_HEADER.unpack_from(record)
+        fits = abs(size - self._body.size) <= max(2, len(self._tail))
+        if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits:
+            return None
+        if not record.endswith(self._tail):
+            return None
+        raw, values = iter(self._body.unpack_from(record, _LIBERTY_HEADER.size)), {}
+        for kind in self._kinds:
+            values[kind] = tuple(next(raw) for _ in range(_NUMBERS.get(kind, 1)))
+        flags = () if error == 0x20 else (f"error {chr(error) if 0x20 < error < 0x7F else error}",)
+        return pose_from_items(values, flags=flags, station=station)
+
+
+class LibertyAsciiParser:
+    """Parser of LIBERTY and PATRIOT text records: station, error, then numbers between spaces."""
+
+    def __init__(self, items: Sequence[int] = LIBERTY_ASCII) -> None:
+        self.garbage_bytes = 0
+        self._kinds = [_LIBERTY_KIND[item] for item in items if item in _LIBERTY_KIND]
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Parse `data`; return the completed poses."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > _LONGEST_LINE:
+            self.garbage_bytes += len(self._rest)
+            self._rest = b""
+        found: list[Reading] = []
+        for line in lines:
+            pose = self._line(line.rstrip(b"\r"))
+            if pose is None:
+                self.garbage_bytes += len(line) + 1
+            else:
+                found.append(pose)
+        return found
+
+    def _line(self, line: bytes) -> PoseReading | None:
+        station, error, words = line[:2], line[2:3], line[3:].split()
+        if not re.fullmatch(rb"[ 0]\d|1[0-6]", station) or not (error.isalpha() or error == b" "):
+            return None
+        if len(words) != sum(_NUMBERS.get(kind, 1) for kind in self._kinds):
+            return None
+        if not all(re.fullmatch(rb"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?", word) for word in words):
+            return None
+        numbers = iter(float(word) for word in words)
+        values = {kind: tuple(next(numbers) for _ in range(_NUMBERS.get(kind, 1))) for kind in self._kinds}
+        flags = () if error == b" " else (f"error {error.decode()}",)
+        return pose_from_items(values, flags=flags, station=int(station))
+
+
+def pose_from_items(
+    values: Mapping[str, tuple[float, ...]], *, flags: tuple[str, ...], station: int
+) -> PoseReading | None:
+    """Pose from a record's items in inches; None for items that cannot be a pose."""
+    position = [number * MM_PER_INCH for number in values["position"]]
+    quaternion = values.get("quaternion") or quaternion_from_euler(*values["euler"])
+    if not plausible(position, quaternion):
+        return None
+    distortion = int(values.get("distortion", (0,))[0])
+    flags += (f"distortion {distortion}",) if distortion else ()
+    x, y, z = position
+    w, i, j, k = quaternion
+    time_ms = values.get("time_ms")
+    return PoseReading(
+        (x, y, z), (w, i, j, k), None if time_ms is None else int(time_ms[0]) * 1_000_000, flags, station
+    )
+
+
+def quaternion_from_euler(azimuth_deg: float, elevation_deg: float, roll_deg: float) -> tuple[float, ...]:
+    """Scalar-first quaternion of azimuth about z, then elevation about the new y, then roll about the new x."""
+    half = [math.radians(angle) / 2 for angle in (azimuth_deg, elevation_deg, roll_deg)]
+    (ca, ce, cr), (sa, se, sr) = map(math.cos, half), map(math.sin, half)
+    return (
+        ca * ce * cr + sa * se * sr,
+        ca * ce * sr - sa * se * cr,
+        ca * se * cr + sa * ce * sr,
+        sa * ce * cr - ca * se * sr,
+    )

@@ -1,0 +1,320 @@
+"""Modes of a density: optimisation, least squares, Laplace's approximation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
+from tactile_bayes.records import dataclass
+
+# --- Gradient and Hessian of a scalar function by central differences, evaluated in one call.
+
+
+def stencil(theta: FloatArray, *, step: FloatArray) -> FloatArray:
+    """(1 + 2 p^2, p) points for central first and second differences, `theta` first."""
+    shifts = np.diag(step)
+    points = [theta[None], theta + shifts, theta - shifts]
+    for i, j in _pairs(len(theta)):
+        corners = [shifts[i] + shifts[j], shifts[i] - shifts[j], shifts[j] - shifts[i], -shifts[i] - shifts[j]]
+        points.append(theta + np.array(corners))
+    return np.concatenate(points)
+
+
+def finite_differences(values: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(p,) gradient and (p, p) Hessian from a function's values at the points of `stencil`."""
+    p = len(step)
+    here, up, down = values[0], values[1 : p + 1], values[p + 1 : 2 * p + 1]
+    hessian = np.diag((up - 2 * here + down) / step**2)
+    for (i, j), quad in zip(_pairs(p), values[2 * p + 1 :].reshape(-1, 4), strict=True):
+        hessian[i, j] = hessian[j, i] = (quad[0] - quad[1] - quad[2] + quad[3]) / (4 * step[i] * step[j])
+    return (up - down) / (2 * step), hessian
+
+
+def _pairs(p: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(p) for j in range(i)]
+
+
+# --- The paper's method: least squares (Eq 7) with its covariance and no prior.
+
+
+def optimise(
+    theta: FloatArray,
+    covariance: FloatArray,
+    *,
+    dof: float,
+    rng: np.random.Generator,
+) -> ParameterDraws:
+    """Draw about the least-squares estimate, with its covariance and t tails for the estimated noise.
+
+    Parameters
+    ----------
+    theta, covariance : (p,), (p, p) arrays
+        The estimate and its covariance, correlated errors included.
+    dof
+        Effective degrees of freedom of the noise estimate.
+
+    Notes
+    -----
+    Wellman & Howe (1999), section 2.4, minimise the squared error between map and Eq 7; the covariance of that
+    estimate is this program's addition.
+    """
+    flat = student_draws(theta, covariance, dof=dof, number=INDEPENDENT_DRAWS, rng=rng)
+    return ParameterDraws(flat[None], "optimise", {"draws": float(INDEPENDENT_DRAWS)})
+
+
+# --- Nonlinear least squares for small models: Levenberg-Marquardt in numpy, which starts fast.
+
+ModelFunction = Callable[[FloatArray], FloatArray]
+"""Maps (m, p) parameter vectors to (m, k) predictions, all m at once."""
+
+MOST_ITERATIONS = 200
+SETTLED = 0.01
+"""Of the residual variance: a step that lowers the sum of squares by less moves nothing that the data could tell."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeastSquaresFit:
+    """The minimum of a weighted sum of squares.
+
+    Parameters
+    ----------
+    theta : (p,) array
+        Parameters at the minimum.
+    jacobian : (k, p) array
+        Derivatives of the predictions there.
+    residual : (k,) array
+        Data minus prediction.
+    sse
+        Weighted sum of squared residuals.
+    converged
+        Whether the relative step fell below the tolerance.
+    """
+
+    theta: FloatArray
+    jacobian: FloatArray
+    residual: FloatArray
+    sse: float
+    converged: bool
+    iterations: int
+
+    def covariance(self, weight: FloatArray) -> FloatArray:
+        """(p, p) least-squares covariance, residual variance SSE / (k - p) included; inf where undetermined."""
+        k, p = self.jacobian.shape
+        inverse = inverse_information(self.jacobian, weight)
+        return self.sse / max(k - p, 1) * inverse if np.isfinite(inverse).all() else inverse
+
+
+def inverse_information(jacobian: FloatArray, weight: FloatArray) -> FloatArray:
+    """``(J' W J)^-1``, scaled to unit columns first; a (p, p) matrix of inf when it is singular."""
+    p = jacobian.shape[1]
+    scale = np.sqrt(np.einsum("kp,k,kp->p", jacobian, weight, jacobian))
+    if not np.isfinite(scale).all() or (scale <= 0).any():
+        return np.full((p, p), np.inf)
+    unit = jacobian / scale
+    values, vectors = np.linalg.eigh(unit.T @ (weight[:, None] * unit))
+    if values[0] <= 1e-13 * values[-1]:
+        return np.full((p, p), np.inf)
+    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
+
+
+def numerical_jacobian(model: ModelFunction, theta: FloatArray, *, scale: FloatArray) -> FloatArray:
+    """(k, p) Jacobian by central differences; `scale` (p,) is the model's typical length in each parameter."""
+    step = 1e-5 * scale
+    shifts = np.diag(step)
+    values = model(np.concatenate([theta + shifts, theta - shifts]))
+    p = len(theta)
+    return np.asarray((values[:p] - values[p:]).T / (2.0 * step))
+
+
+def fit_least_squares(
+    model: ModelFunction,
+    start: FloatArray,
+    *,
+    data: FloatArray,
+    weight: FloatArray,
+    scale: FloatArray,
+    tolerance: float = 1e-10,
+    abandon: Callable[[FloatArray], bool] | None = None,
+    patience: int | None = None,
+) -> LeastSquaresFit:
+    """Minimise ``sum(weight * (data - model(theta))**2)`` by Levenberg-Marquardt.
+
+    Parameters
+    ----------
+    model
+        Vectorised over parameter vectors, see `ModelFunction`.
+    start, scale : (p,) arrays
+        Where to begin, and the typical size of a change of each parameter (steps are damped in these units).
+    data, weight : (k,) arrays
+        Weights are inverse variances up to one common factor.
+    tolerance
+        Stop when the Gauss-Newton step is this small in units of `scale`.
+    abandon
+        Stop, not converged, at parameters from which no useful minimum can follow.
+    patience
+        After so many iterations a minimum is good enough once a step lowers the sum of squares by less than
+        `SETTLED` of the residual variance. Beside large residuals steps shrink by a few per cent each.
+
+    Notes
+    -----
+    Marquardt (1963); the gain ratio controls the damping as in Madsen, Nielsen & Tingleff (2004), section 3.2.
+    """
+    theta = np.array(start, dtype=np.float64)
+    residual = data - model(theta[None])[0]
+    sse = float(weight @ residual**2)
+    damping, grow = 1e-3, 2.0
+    jacobian = numerical_jacobian(model, theta, scale=scale)
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        step = _damped_step(jacobian, residual, weight=weight, scale=scale, damping=damping)
+        if not np.isfinite(step).all():
+            break
+        trial = theta + step * scale
+        trial_residual = data - model(trial[None])[0]
+        trial_sse = float(weight @ trial_residual**2)
+        if trial_sse <= sse and np.isfinite(trial_sse):
+            small = float(np.abs(step).max()) < tolerance or sse - trial_sse <= 1e-15 * sse
+            small |= patience is not None and iteration > patience and sse - trial_sse <= SETTLED * sse / len(data)
+            theta, residual, sse = trial, trial_residual, trial_sse
+            jacobian = numerical_jacobian(model, theta, scale=scale)
+            damping, grow = max(damping / 5.0, 1e-14), 2.0
+            if small:
+                return LeastSquaresFit(theta, jacobian, residual, sse, True, iteration)
+            if abandon is not None and abandon(theta):
+                return LeastSquaresFit(theta, jacobian, residual, sse, False, iteration)
+        else:
+            if float(np.abs(step).max()) < tolerance:
+                return LeastSquaresFit(theta, jacobian, residual, sse, True, iteration)
+            damping, grow = damping * grow, grow * 2.0
+    return LeastSquaresFit(theta, jacobian, residual, sse, False, MOST_ITERATIONS)
+
+
+def _damped_step(
+    jacobian: FloatArray, residual: FloatArray, *, weight: FloatArray, scale: FloatArray, damping: float
+) -> FloatArray:
+    """Step in units of `scale`; each column is damped by its own curvature and by a floor."""
+    scaled = jacobian * scale
+    information = scaled.T @ (weight[:, None] * scaled)
+    gradient = scaled.T @ (weight * residual)
+    diagonal = np.diag(information)
+    floor = 1e-12 * max(float(diagonal.max()), np.finfo(float).tiny)
+    try:
+        step = np.linalg.solve(information + damping * np.diag(np.maximum(diagonal, floor)), gradient)
+    except np.linalg.LinAlgError:
+        return np.full(len(gradient), np.nan)
+    return np.clip(step, -3.0, 3.0)
+
+
+# --- Laplace approximation, from mode and curvature: normal given the noise scale.
+
+LogDensity = Callable[[FloatArray], FloatArray]
+MOST_STEPS = 100
+
+
+def laplace(
+    log_density: LogDensity,
+    start: FloatArray,
+    *,
+    scale: FloatArray,
+    dof: float,
+    rng: np.random.Generator,
+) -> ParameterDraws:
+    """Draw from the t density with the mode and curvature of a log density.
+
+    Given the noise scale the approximation is normal; that scale has `dof` degrees of freedom, so the draws are those
+    of a multivariate t. For a linear model this is exact. `log_density`, `start` and `scale` as in
+    `mode_and_covariance`.
+    """
+    mode, covariance, steps = mode_and_covariance(log_density, start, scale=scale)
+    widened = covariance if np.isinf(dof) else covariance * (dof + len(mode)) / dof
+    flat = student_draws(mode, widened, dof=dof, number=INDEPENDENT_DRAWS, rng=rng)
+    return ParameterDraws(flat[None], "laplace", {"draws": float(INDEPENDENT_DRAWS), "newton_steps": float(steps)})
+
+
+def mode_and_covariance(
+    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
+) -> tuple[FloatArray, FloatArray, int]:
+    """Find the mode of a log density by damped Newton steps, and the inverse of its negative Hessian there.
+
+    Parameters
+    ----------
+    log_density
+        Vectorised: (m, p) to (m,).
+    start, scale : (p,) arrays
+        Where to begin, and about one posterior standard deviation of each parameter.
+    tolerance
+        See `find_mode`.
+
+    Returns
+    -------
+    mode : (p,) array
+    covariance : (p, p) array
+    steps
+        Newton steps taken.
+
+    Raises
+    ------
+    NotConvergedError
+        When no mode is found or the curvature there is not that of a maximum.
+    """
+    mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance)
+    return mode, _covariance(log_density, mode, scale=scale), taken
+
+
+def find_mode(
+    log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
+) -> tuple[FloatArray, int]:
+    """As `mode_and_covariance`, without the curvature.
+
+    Parameters
+    ----------
+    tolerance
+        Of the last step taken, in units of `scale`. A mode is nearer than that: steps shrink as their squares, down to
+        the error of differences.
+    """
+    theta = np.array(start, dtype=np.float64)
+    value = float(log_density(theta[None])[0])
+    damping = 1e-8
+    for taken in range(1, MOST_STEPS + 1):
+        gradient, hessian = _slopes(log_density, theta, step=1e-2 * scale)
+        step = scale * _newton_step(gradient * scale, -hessian * np.outer(scale, scale), damping)
+        trial = theta + step
+        trial_value = float(log_density(trial[None])[0])
+        small = np.abs(step / scale).max() < tolerance
+        if trial_value >= value:
+            gained, theta, value, damping = trial_value - value, trial, trial_value, max(damping / 10, 1e-8)
+            if small and gained < tolerance**2:
+                return theta, taken
+        elif small:
+            return theta, taken
+        else:
+            damping = max(damping * 10, 1e-4)
+    raise NotConvergedError(f"no posterior mode found in {MOST_STEPS} Newton steps; try --method ensemble")
+
+
+def _slopes(log_density: LogDensity, theta: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradient and Hessian; an error where a neighbouring point has no density."""
+    values = log_density(stencil(theta, step=step))
+    if not np.isfinite(values).all():
+        raise NotConvergedError(
+            "the posterior's mode lies at the edge of what the window allows; try --method ensemble"
+        )
+    return finite_differences(values, step=step)
+
+
+def _newton_step(gradient: FloatArray, curvature: FloatArray, damping: float) -> FloatArray:
+    """Uphill step in standardised units; directions of negative curvature are flipped."""
+    values, vectors = np.linalg.eigh(curvature)
+    safe = np.maximum(np.abs(values), 1e-3) + damping * max(1.0, float(np.abs(values).max()))
+    return np.asarray(np.clip(vectors @ ((vectors.T @ gradient) / safe), -2.0, 2.0))
+
+
+def _covariance(log_density: LogDensity, theta: FloatArray, *, scale: FloatArray) -> FloatArray:
+    _, hessian = _slopes(log_density, theta, step=5e-2 * scale)
+    values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
+    if not values[0] > 1e-9 * values[-1]:
+        raise NotConvergedError("the posterior has no maximum in every direction; try --method ensemble")
+    return np.asarray((vectors / values) @ vectors.T * np.outer(scale, scale))

@@ -1,0 +1,465 @@
+"""The map itself: its cells, its recipe, what it assumes, and advice on it."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.records import dataclass
+from tactile_bayes.scan import HeadShape
+
+# --- Binomial smoothing of sums in cells.
+
+
+def smooth(values: NDArray[np.generic], *, passes: int = 4) -> FloatArray:
+    """Binomial smoothing along both axes; four passes are two cells (SD 1.4) wide."""
+    smooth = np.asarray(values, dtype=np.float64)
+    for axis in (0, 1):
+        for _ in range(passes):
+            padded = np.pad(smooth, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
+            low, middle, high = (np.take(padded, range(k, k + smooth.shape[axis]), axis=axis) for k in range(3))
+            smooth = 0.25 * low + 0.5 * middle + 0.25 * high
+    return smooth
+
+
+# --- The tactile map, with the recipe by which it was built.
+
+# A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
+FEW_READINGS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class MapRecipe:
+    """How a map was built; a size calibration fits only maps of its own recipe.
+
+    Parameters
+    ----------
+    source
+        ``"scan"`` or ``"grid"`` (a map imported as it is).
+    normalise
+        ``"mean"``, ``"gain"`` or ``"none"``.
+    cell_mm
+        Side of the square cells.
+    pressure_window_kpa
+        The gate on the frame's mean; None for an imported grid.
+    latency_ms
+        By how much a pose's stamp is late against the frames.
+    flat_field
+        Whether the head's own response was taken off.
+    registered
+        Whether the strokes were shifted onto each other.
+    units
+        Of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa.
+    """
+
+    source: str
+    normalise: str
+    cell_mm: float
+    pressure_window_kpa: tuple[float, float] | None = None
+    latency_ms: float = 0.0
+    flat_field: bool = False
+    registered: bool = False
+    units: str = ""
+
+    @property
+    def value_unit(self) -> str:
+        """Unit of the map's values: ``"1"`` where they were divided by a level, empty where it is unknown."""
+        if self.normalise != "none":
+            return "1"
+        return "kPa" if self.source == "scan" else self.units
+
+    @property
+    def value_words(self) -> str:
+        """The map's values in a few words, for the label of a colour bar."""
+        if self.normalise == "none":
+            name = "mean pressure" if self.source == "scan" else "value"
+            return f"{name} ({self.value_unit or 'unit unknown'})"
+        name = "pressure" if self.source == "scan" else "value"
+        return f"{name} / {'mean of its frame' if self.normalise == 'mean' else 'level beside a lump'}"
+
+    @property
+    def flat_field_known(self) -> bool | None:
+        """`flat_field` of a scan's map; None for an imported grid, where it is unknown."""
+        return self.flat_field if self.source == "scan" else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TactileMap:
+    """Mean normalised pressure on the best-fit plane.
+
+    Parameters
+    ----------
+    mean, variance : (ny, nx) arrays
+        Mean and within-cell variance of the readings; NaN where `count` is 0. Without unit after normalising,
+        kPa with ``normalise="none"``.
+    count : (ny, nx) int64 array
+        Readings per cell.
+    x_mm, y_mm : (nx,), (ny,) arrays
+        Cell centres in `plane`; x runs across the head, y along it.
+    recipe
+        How the map was built.
+    plane_from_base : (4, 4) array or None
+        None for an imported grid.
+    patient_from_plane : (4, 4) array or None
+        None without landmarks.
+    background
+        Level far from the lump that normalising defines (1 in the paper's Eqs 5 and 7); None when it is not known.
+    frame_count
+        Frames that went in. Cells share frames, so a map has fewer independent errors than readings.
+    quality
+        Counts and figures for the report (frames dropped low/high, tilt, rms...).
+    masked_taxels
+        Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
+    head
+        Shape of the head that made the scan; None for an imported grid.
+    nipple_mm : (3,) array or None
+        The nipple in `plane`; None where it was not touched.
+    findings
+        What speaks against sizes from it.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    x_mm: FloatArray
+    y_mm: FloatArray
+    recipe: MapRecipe
+    plane_from_base: FloatArray | None = None
+    patient_from_plane: FloatArray | None = None
+    background: float | None = 1.0
+    frame_count: int = 0
+    quality: Mapping[str, float] = field(default_factory=dict)
+    masked_taxels: tuple[str, ...] = ()
+    head: HeadShape | None = None
+    nipple_mm: FloatArray | None = None
+    findings: tuple[Finding, ...] = ()
+
+    def __post_init__(self) -> None:
+        shape = (len(self.y_mm), len(self.x_mm))
+        for name in ("mean", "variance", "count"):
+            if getattr(self, name).shape != shape:
+                raise BadDataError(
+                    f"{name} has shape {getattr(self, name).shape}", way_out=f"it must be {shape} (ny, nx)"
+                )
+        if self.count.size and self.count.min() < 0:
+            raise BadDataError(f"count holds {self.count.min()}", way_out="counts must not be negative")
+        if not self.recipe.cell_mm > 0:
+            raise BadDataError(f"cell_mm is {self.recipe.cell_mm}", way_out="it must be positive, in mm")
+        for name in ("mean", "variance", "count", "x_mm", "y_mm"):
+            view = getattr(self, name).view()
+            view.flags.writeable = False
+            object.__setattr__(self, name, view)
+        infinite = np.isinf(self.mean)
+        if infinite.any() and (infinite & (self.count > 0)).any():
+            raise BadDataError("mean holds infinite values", way_out="mark cells without data by count 0")
+
+    @property
+    def fingerprint(self) -> int:
+        """First 64 bits of a hash of the cells and their values, which seed random numbers whatever file the map is in.
+
+        Where the map came from, where it lies in the patient and what the file says of it are no part of it.
+        """
+        digest = hashlib.sha256(np.array(self.mean.shape, dtype="<i8").tobytes())
+        covered = self.covered
+        for values in (self.mean, self.variance, self.count):
+            # NaN has many bit patterns: cells without data count as one value
+            held = np.where(covered & np.isfinite(values), values, 0.0)
+            digest.update(np.ascontiguousarray(held, dtype="<f8").tobytes())
+        for axis in (self.x_mm, self.y_mm):
+            digest.update(np.ascontiguousarray(axis, dtype="<f8").tobytes())
+        return int.from_bytes(digest.digest()[:8], "big")
+
+    @property
+    def covered(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """(ny, nx) True where the map has data."""
+        covered: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & np.isfinite(self.mean)
+        return covered
+
+    @property
+    def counts_known(self) -> bool:
+        """Whether `count` is the number of readings per cell: an imported grid without counts has 1 everywhere."""
+        return self.recipe.source == "scan" or bool((self.count > 1).any())
+
+    @property
+    def few(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """(ny, nx) True for cells with data from fewer than `FEW_READINGS` readings; none where counts are unknown."""
+        few: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (self.count > 0) & (self.count < FEW_READINGS)
+        if not self.counts_known:
+            few = np.zeros_like(few)
+        return few
+
+
+# --- Notice for maps with many more cells than a fit needs.
+
+MANY_CELLS: Final = 20_000
+"""In a window: 0.25 mm in the default one, up to five times the time of 1 mm (record 0074)."""
+
+
+def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
+    """Notice for a window of `MANY_CELLS` or more: what it costs, and which cells would do; else None.
+
+    Parameters
+    ----------
+    tactile_map
+        What is to be fitted.
+    radius_mm
+        Of the window. The cells are those of a covered disc, or all that the map has where these are fewer.
+
+    Returns
+    -------
+    str or None
+        None where a window holds fewer.
+    """
+    cell = tactile_map.recipe.cell_mm
+    cells = min(int(tactile_map.covered.sum()), int(math.pi * radius_mm**2 / cell**2))
+    if cells < MANY_CELLS:
+        return None
+    # only here: an ordinary estimate needs none of its imports
+
+    advice = advise_cell(tactile_map)
+    enough = "cells of half a bump's sigma measure it as well"
+    if advice is not None and advice.coarsest_mm > cell:
+        enough = f"cells of up to {math.floor(10 * advice.coarsest_mm) / 10:g} mm measure the highest bump as well"
+    return (
+        f"about {round(cells, -2):,} cells of {cell:g} mm are fitted, which takes a while (measured: 126,000 cells "
+        f"20 s of CPU, 1,260 cells 1.4 s); {enough}: give `map` a larger --cell-mm, or reduce the image before `import`"
+    )
+
+
+# --- What a map's figures say against the assumptions of a size: even layers, flat skin, a lump that stays where it is.
+#
+# Bodies simulated with one of these broken decide the limits (docs/decisions/0103): a flag is silent on bodies
+# without stress, and a caution stands where sizes lay outside their intervals more often than they say.
+
+MOST_PROFILE_CHANGE = 0.01
+"""Of the head profile's second order across, over 30 mm: fat that deepens by 1 mm in 20 changes it by 0.01 to 0.06."""
+BROKEN_PROFILE_CHANGE = 0.07
+"""From here on sizes of simulated bodies lay outside their intervals: 1 mm in 5, or a step of 6 mm in thin fat."""
+MOST_SKEW = 0.01
+"""First order of the head profile, to one side along strokes: a friction coefficient of 0.1 gives 0.011 to 0.035."""
+MOST_CURVATURE_PER_M = 4.0
+"""Curvature of the head's path, a radius of 250 mm: rocking by 4 deg imitates up to 1.5 per m."""
+MOST_LAG_MM = 1.2
+"""A latency of 12 ms left in the poses makes up to 0.75 mm at a hand's 60 mm/s."""
+LEAST_STROKES = 4
+"""Of the exams that sizes were learned from: 3 strokes, 8 mm apart, made sizes 6 % larger (record 0123)."""
+LEAST_COVERAGE = 0.5
+"""A strip of the plane narrower than the head itself shows no lump's flanks."""
+MOST_TILT_DEG = 10.0
+MOST_YAW_DEG = 15.0
+_ERRORS = 2.5
+"""Standard errors by which a figure must exceed 0, besides its limit."""
+
+
+def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
+    """What a map's figures say against the assumptions of a size.
+
+    Parameters
+    ----------
+    quality
+        A map's figures, see `evenness.evenness_figures` and `stroke_lag.stroke_lag_figures`; missing ones say nothing.
+    """
+    found = (_lag(quality), _uneven(quality), _curved(quality), _few_strokes(quality))
+    return tuple(one for one in found if one is not None)
+
+
+def handling_findings(quality: Mapping[str, float]) -> tuple[Finding, ...]:
+    """What a map's figures say against how the head was held and the array read; parameters as above."""
+    return tuple(_handling(quality))
+
+
+def _handling(quality: Mapping[str, float]) -> Iterator[Finding]:
+    if quality.get("saturated_readings"):
+        text = f"{quality['saturated_readings']:.0f} readings at full scale were left out: the map is too low there"
+        yield Finding("saturated_readings", text)
+    if quality.get("clipped_values"):
+        yield Finding("clipped_values", f"{quality['clipped_values']:.0f} values beyond the map's range were clipped")
+    if quality.get("gain_unsettled"):
+        text = "the frames' gains had not settled when the solver stopped"
+        remedy = "use --normalise mean, or scan with overlapping strokes"
+        yield Finding("unsettled_gains", text, remedy, "scan with overlapping strokes")
+    if quality.get("coverage", 1.0) < LEAST_COVERAGE:
+        text = f"only {100 * quality['coverage']:.0f} % of the map's rectangle is covered"
+        add = "add strokes side by side"
+        yield Finding("low_coverage", text, f"{add}, or use larger cells", add)
+    if quality.get("tilt_deg", 0.0) > MOST_TILT_DEG:
+        text = f"the head's face was tilted by {quality['tilt_deg']:.0f} degrees against its motion"
+        check = "check the tracker's lever arm and quaternion order"
+        yield Finding("tilted_head", text, check, check)
+    if quality.get("yaw_sd_deg", 0.0) > MOST_YAW_DEG:
+        text = f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD): widths across and along it are mixed"
+        yield Finding("turned_head", text)
+
+
+def _few_strokes(quality: Mapping[str, float]) -> Finding | None:
+    strokes = quality.get("stroke_count", LEAST_STROKES)
+    if strokes >= LEAST_STROKES:
+        return None
+    text = (
+        f"the scan has {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
+        "(simulated ones from 3 came out 6 % large)"
+    )
+    return Finding("few_strokes", text)
+
+
+def _lag(quality: Mapping[str, float]) -> Finding | None:
+    lag = _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM)
+    if lag is None:
+        return None
+    ahead = lag > 0
+    cause = "each dragged it along" if ahead else "poses came late against the frames"
+    text = (
+        f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size may be "
+        "off by more than its interval"
+    )
+    if ahead:
+        return Finding(
+            "lump_dragged",
+            text,
+            "map again with --register-strokes",
+            "map the scan again with its strokes aligned to each other",
+        )
+    return Finding(
+        "late_poses", text, "map again with --latency-ms auto", "map the scan again with the tracker's delay estimated"
+    )
+
+
+def _curved(quality: Mapping[str, float]) -> Finding | None:
+    curvature = quality.get("skin_curvature_per_m", 0.0)
+    if not abs(curvature) > MOST_CURVATURE_PER_M:
+        return None
+    shape = "convex" if curvature > 0 else "hollow"
+    text = (
+        f"the head turned as on {shape} skin of radius {1000 / abs(curvature):.0f} mm, and sizes are for flat skin "
+        "(on radii of 75 and 150 mm simulated ones moved by 7 %)"
+    )
+    return Finding("curved_skin", text)
+
+
+def _uneven(quality: Mapping[str, float]) -> Finding | None:
+    """Of a profile that changes so far that sizes fail, or of one that changes less."""
+    change = _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE)
+    if change is None:
+        return None
+    far = change > BROKEN_PROFILE_CHANGE
+    end = "the size may be off by more than its interval" if far else "the size is for even fat"
+    text = (
+        f"the head's pressure profile changes over the map (by {change:.3f} in 30 mm): the fat is of uneven depth, or "
+        f"a rib or another lump lies near; {end}"
+    )
+    return Finding("uneven_fat" if far else "slightly_uneven_fat", text)
+
+
+def skewed(quality: Mapping[str, float]) -> str:
+    """A sentence on skin that the head drags along; no size moved by it, so it is a matter of technique."""
+    skew = _beyond(quality, "stroke_skew", "stroke_skew_sd", MOST_SKEW)
+    if skew is None:
+        return ""
+    return f"pressure is skewed along the strokes (by {abs(skew):.3f}): the skin is dragged along, use more lubricant"
+
+
+def _beyond(quality: Mapping[str, float], name: str, sd_name: str, limit: float) -> float | None:
+    """The figure, where it exceeds its limit and its standard error by enough."""
+    value, sd = quality.get(name, 0.0), quality.get(sd_name, 0.0)
+    return value if abs(value) > max(limit, _ERRORS * sd) else None
+
+
+# --- Largest cell that measures the map's highest bump well, and what finer cells would cost.
+
+_FWHM = 2.3548  # of a Gaussian, in sigmas
+# Cells of up to this many sigmas moved no width by more than one posterior SD (record 0074).
+_CELL_PER_SIGMA = 0.5
+_SMOOTHED_CELLS = 2.0  # variance that `smooth` adds, in cells squared
+# A peak lower than this many times the spread of the smoothed map (by its quartiles) is no bump to take a width from.
+_LEAST_RISE = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class CellAdvice:
+    """Advice on the size of the cells.
+
+    Parameters
+    ----------
+    sigma_mm
+        Width of the narrower side of the map's highest bump, from its half height.
+    coarsest_mm
+        Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm.
+    cell_mm
+        The map's own.
+    readings
+        Median readings a cell.
+    """
+
+    sigma_mm: float
+    coarsest_mm: float
+    cell_mm: float
+    readings: float
+
+    def text(self) -> str:
+        """One line: which cells measure the bump, and what cells of half the present size would cost."""
+        half = self.cell_mm / 2
+        head = f"bump of sigma {self.sigma_mm:.1f} mm: measured well by cells of up to {self.coarsest_mm:.1f} mm"
+        if self.cell_mm > self.coarsest_mm:
+            return f"{head}, these are too coarse; use --cell-mm {math.floor(10 * self.coarsest_mm) / 10:g}"
+        return f"{head}; {half:g} mm would take 4 times the cells with {self.readings / 4:.0f} readings each"
+
+
+def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
+    """Advise on the cell from a map's highest bump; None where nothing stands out.
+
+    Notes
+    -----
+    The rule is h <= 0.5 sigma_min, by what the widths of simulated bodies change with the cell (record 0074). For a
+    Gaussian bump the fit, which integrates its model over the cells, is exact to 0.1 % at 0.75 sigma; but lumps are not
+    quite Gaussian, and errors of the map change with the cell as well.
+    """
+    mean = _smoothed(tactile_map)
+    known = np.isfinite(mean)
+    if np.count_nonzero(known) < 25:
+        return None
+    low, level, high = np.quantile(mean[known], [0.25, 0.5, 0.75])
+    row, column = np.unravel_index(int(np.nanargmax(mean)), mean.shape)
+    rise = float(mean[row, column] - level)
+    if not rise > _LEAST_RISE * float(high - low) / 2:
+        return None
+    extents = [_extent(line - level, at) for line, at in ((mean[row], int(column)), (mean[:, column], int(row)))]
+    if not all(np.isfinite(extents)):
+        return None
+    cell = tactile_map.recipe.cell_mm
+    variances = [(extent * cell / _FWHM) ** 2 - _SMOOTHED_CELLS * cell**2 - cell**2 / 12 for extent in extents]
+    sigma = float(np.sqrt(max(min(variances), (cell / 2) ** 2)))
+    count = tactile_map.count[tactile_map.covered]
+    return CellAdvice(sigma, _CELL_PER_SIGMA * sigma, cell, float(np.median(count)))
+
+
+def _smoothed(tactile_map: TactileMap) -> FloatArray:
+    """The map, smoothed with its counts as weights; NaN where readings are few."""
+    count = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
+    weight = smooth(count)
+    total = smooth(np.where(tactile_map.covered, tactile_map.mean, 0.0) * count)
+    enough = tactile_map.covered & ~tactile_map.few
+    mean: FloatArray = np.divide(total, weight, out=np.full(weight.shape, np.nan), where=enough & (weight > 0))
+    return mean
+
+
+def _extent(excess: FloatArray, at: int) -> float:
+    """Full width at half height about an index, in cells, by linear interpolation; NaN where it reaches the rim."""
+    half = excess[at] / 2
+    width = 0.0
+    for way in (1, -1):
+        i = at
+        while 0 <= i + way < len(excess) and excess[i + way] > half:
+            i += way
+        if not 0 <= i + way < len(excess) or not np.isfinite(excess[i + way]):
+            return float("nan")
+        width += abs(i - at) + float((excess[i] - half) / (excess[i] - excess[i + way]))
+    return width

@@ -1,0 +1,294 @@
+"""Places on a map in the patient: orientation and the clock face."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.map import TactileMap
+
+# --- Orientation of a map on the screen: one rule for every picture.
+
+PATIENT_WORDS: Final = "seen facing the patient: head up, patient's left on the right"
+PLANE_WORDS: Final = "no landmarks: seen from outside, y (along the head) up, x to the left"
+GRID_WORDS: Final = "as the imported file reads: first row on top, x to the right, y down"
+_PATIENT_SIDES: Final = {
+    "R": "the patient's right",
+    "L": "the patient's left",
+    "H": "the patient's head",
+    "F": "the patient's feet",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """Which axes of the plane point right and up on the screen.
+
+    Parameters
+    ----------
+    right, up
+        ``"+x"``, ``"-x"``, ``"+y"`` or ``"-y"``. Of the eight pairs only four are used: z, into the tissue, always
+        points away from the viewer.
+    words
+        The orientation in a phrase, for captions.
+    notch : (2,) tuple or None
+        Unit vector to the sternal notch on the screen (to the right, upwards); None without landmarks.
+    """
+
+    right: str
+    up: str
+    words: str
+    notch: tuple[float, float] | None = None
+
+    @property
+    def swapped(self) -> bool:
+        """Whether y, not x, runs across the screen."""
+        return self.right[1] == "y"
+
+    @property
+    def edges(self) -> Mapping[str, str]:
+        """Labels of the picture's edges: the patient's R, L, H (head), F (feet), or else an axis."""
+        if self.notch is not None:
+            return {"left": "R", "right": "L", "top": "H", "bottom": "F"}
+        return {"left": _opposite(self.right), "right": self.right, "top": self.up, "bottom": _opposite(self.up)}
+
+    def side_words(self, axis: str) -> str:
+        """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""
+        screen = {self.right: "right", _opposite(self.right): "left", self.up: "top", _opposite(self.up): "bottom"}
+        side = screen[axis]
+        words = f"the picture's {side}" if self.notch is None else _PATIENT_SIDES[self.edges[side]]
+        return f"{words} ({axis})"
+
+    def screen(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The (ny, nx) values of a map as the rows of a picture: row 0 on top, column 0 on the left."""
+        across = values if not self.swapped else values.T
+        columns = across if self.right[0] == "+" else across[:, ::-1]
+        return columns[::-1] if self.up[0] == "+" else columns
+
+    def place(self, tactile_map: TactileMap, centre_mm: tuple[float, float]) -> tuple[float, float]:
+        """Position of a point of the plane in the picture, in cells from its left and top edges."""
+        axes = {"x": tactile_map.x_mm, "y": tactile_map.y_mm}
+        point = dict(zip("xy", centre_mm, strict=True))
+        half, cell = tactile_map.recipe.cell_mm / 2, tactile_map.recipe.cell_mm
+
+        def along(axis: str) -> float:
+            if axis[0] == "+":
+                return float(point[axis[1]] - axes[axis[1]][0] + half) / cell
+            return float(axes[axis[1]][-1] + half - point[axis[1]]) / cell
+
+        return along(self.right), along(_opposite(self.up))
+
+
+def orientation_of(tactile_map: TactileMap) -> Orientation:
+    """Orientation in which a map is shown.
+
+    The viewer looks along z, into the tissue, as an examiner does who faces the patient. With landmarks the plane is
+    shown by the quarter turn that brings the sternal notch nearest to straight up; the patient's left is then on the
+    viewer's right. Without landmarks y, along the scan head, is up, and x runs to the left. A grid that was imported
+    has no outside and is shown as its file reads: first row on top, first column on the left.
+    """
+    if tactile_map.patient_from_plane is not None:
+        return _towards(tactile_map.patient_from_plane[1, :2])
+    if tactile_map.plane_from_base is not None:
+        return Orientation("-x", "+y", PLANE_WORDS)
+    return Orientation("+x", "-y", GRID_WORDS)
+
+
+# What runs to the right when an axis is up and z points away from the viewer.
+_RIGHT_OF_UP: Final = {"+y": "-x", "-y": "+x", "+x": "+y", "-x": "-y"}
+
+
+def _towards(notch: FloatArray) -> Orientation:
+    """Quarter turn that brings a direction of the plane nearest to straight up; y up where it has none."""
+    length = float(np.hypot(*notch))
+    x, y = (float(value) / length for value in notch) if length > 0 else (0.0, 1.0)
+    along = {"+y": y, "-y": -y, "+x": x, "-x": -x}
+    up = max(along, key=lambda axis: along[axis])
+    return Orientation(_RIGHT_OF_UP[up], up, PATIENT_WORDS, (along[_RIGHT_OF_UP[up]], along[up]))
+
+
+def _opposite(axis: str) -> str:
+    return ("-" if axis[0] == "+" else "+") + axis[1]
+
+
+# --- Place of a lump as clinicians tell it: by the clock about the nipple, and by its distance from the nipple.
+
+SIDES: Final = ("left", "right")
+NIPPLE_SD_MM: Final = 3.0
+"""SD of a touched nipple along each axis where repeats lie no further apart: assumed, not measured (record 0117)."""
+LEAST_KNOWN_HOURS: Final = 1.5
+"""A direction whose interval of 95 % reaches so far either way (45 degrees) is none: behind the nipple."""
+_KNOWN: Final = 0.95
+_ON_AXIS_DEG: Final = 15.0
+_DEGREES_PER_HOUR: Final = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class ClockPosition:
+    """Place of a point about the nipple, as the examiner sees it who faces the patient: 12 is towards the head.
+
+    Parameters
+    ----------
+    side
+        ``"left"`` or ``"right"``: which breast.
+    distance_mm
+        From the nipple, along the map's plane.
+    distance_sd_mm
+        Its SD, from the lump's centre and the touch of the nipple.
+    angle_deg
+        From the head's direction, clockwise as the examiner sees it, 0 to 360.
+    angle_sd_deg
+        Its SD.
+    """
+
+    side: str
+    distance_mm: float
+    distance_sd_mm: float
+    angle_deg: float
+    angle_sd_deg: float
+
+    @classmethod
+    def of_dict(cls, document: Mapping[str, Any] | None) -> ClockPosition | None:
+        """The position that `as_dict` wrote; None for none, and behind the nipple, where no direction is kept."""
+        if document is None or document["clock_hours"]["median"] is None:
+            return None
+        hours, distance = document["clock_hours"], document["distance_mm"]
+        reach, wide = _deviations(hours["probability"]), _deviations(distance["probability"])
+        across = (hours["high"] - hours["median"]) % 12.0
+        return cls(
+            side=document["side"],
+            distance_mm=distance["median"],
+            distance_sd_mm=(distance["high"] - distance["median"]) / wide,
+            angle_deg=hours["median"] * _DEGREES_PER_HOUR % 360.0,
+            angle_sd_deg=across * _DEGREES_PER_HOUR / reach,
+        )
+
+    @property
+    def hours(self) -> float:
+        """Position on the clock face, above 0 and up to 12."""
+        return _on_clock(self.angle_deg / _DEGREES_PER_HOUR)
+
+    @property
+    def quadrant(self) -> str:
+        """Such as ``"upper outer"``; one word within 15 degrees of upwards, outwards, downwards or inwards."""
+        angle = math.radians(self.angle_deg)
+        up, across = math.cos(angle), math.sin(angle) * (1.0 if self.side == "left" else -1.0)
+        least = math.sin(math.radians(_ON_AXIS_DEG))
+        words = ["upper" if up > 0 else "lower"] if abs(up) > least else []
+        words += ["outer" if across > 0 else "inner"] if abs(across) > least else []
+        return " ".join(words)
+
+    @property
+    def direction_known(self) -> bool:
+        """Whether the clock says more than that the lump lies behind the nipple."""
+        return _deviations(_KNOWN) * self.angle_sd_deg < LEAST_KNOWN_HOURS * _DEGREES_PER_HOUR
+
+    def hours_between(self, probability: float) -> tuple[float, float] | None:
+        """Ends of the interval of the hours, clockwise; None where the direction is not known."""
+        if not self.direction_known:
+            return None
+        reach = _deviations(probability) * self.angle_sd_deg / _DEGREES_PER_HOUR
+        return _on_clock(self.hours - reach), _on_clock(self.hours + reach)
+
+    def distance_between(self, probability: float) -> tuple[float, float]:
+        """Ends of the interval of the distance, mm; not below 0."""
+        reach = _deviations(probability) * self.distance_sd_mm
+        return max(0.0, self.distance_mm - reach), self.distance_mm + reach
+
+    def text(self) -> str:
+        """Such as ``"left breast, 1:30 o'clock, 43 mm from the nipple (upper outer)"``."""
+        if not self.direction_known:
+            return f"{self.side} breast, behind the nipple ({self.distance_mm:.0f} mm from its middle)"
+        return (
+            f"{self.side} breast, {clock_text(self.hours)} o'clock, {self.distance_mm:.0f} mm from the nipple "
+            f"({self.quadrant})"
+        )
+
+    def as_dict(self, probability: float) -> dict[str, Any]:
+        """Plain data, as in the JSON."""
+        hours, distance = self.hours_between(probability), self.distance_between(probability)
+        named = (None, None) if hours is None else hours
+        return {
+            "side": self.side,
+            "clock_hours": {
+                "median": None if hours is None else _rounded(self.hours),
+                "low": None if named[0] is None else _rounded(named[0]),
+                "high": None if named[1] is None else _rounded(named[1]),
+                "probability": probability,
+            },
+            "distance_mm": {
+                "median": _rounded(self.distance_mm),
+                "low": _rounded(distance[0]),
+                "high": _rounded(distance[1]),
+                "probability": probability,
+            },
+            "quadrant": self.quadrant if hours is not None else "behind the nipple",
+            "text": self.text(),
+        }
+
+
+def clock_position(
+    tactile_map: TactileMap, centre_mm: tuple[float, float], *, side: str, covariance_mm2: FloatArray | None = None
+) -> ClockPosition | None:
+    """Place of a point of the plane about the nipple; None without landmarks, a nipple, or a side that is a breast's.
+
+    Parameters
+    ----------
+    centre_mm
+        x and y in `plane`.
+    side
+        As a scan's session has it.
+    covariance_mm2 : (2, 2) array
+        Of the centre; none is taken for exact.
+
+    Notes
+    -----
+    The patient's head is where the line from xiphoid to sternal notch points on the plane, which z leaves away from the
+    viewer, so the patient's left is z cross up.
+    """
+    nipple, patient = tactile_map.nipple_mm, tactile_map.patient_from_plane
+    if nipple is None or patient is None or side not in SIDES:
+        return None
+    up = patient[1, :2] / np.hypot(*patient[1, :2])
+    axes = np.stack([[-up[1], up[0]], up])  # to the viewer's right, upwards
+    right, above = (float(value) for value in axes @ (np.array(centre_mm) - nipple[:2]))
+    distance = math.hypot(right, above)
+    along = np.array([right, above]) / distance if distance > 0 else np.array([0.0, 1.0])
+    touch_mm = max(NIPPLE_SD_MM, tactile_map.quality.get("landmark_spread_mm", 0.0))
+    spread = axes @ (np.zeros((2, 2)) if covariance_mm2 is None else covariance_mm2) @ axes.T + touch_mm**2 * np.eye(2)
+    across = np.array([along[1], -along[0]])
+    across_sd = math.sqrt(float(across @ spread @ across))
+    return ClockPosition(
+        side=side,
+        distance_mm=distance,
+        distance_sd_mm=math.sqrt(float(along @ spread @ along)),
+        angle_deg=math.degrees(math.atan2(right, above)) % 360.0,
+        angle_sd_deg=math.degrees(math.atan2(across_sd, distance)),
+    )
+
+
+def clock_text(hours: float) -> str:
+    """Hours to the nearest half: ``"2"``, ``"1:30"``."""
+    halves = round(2.0 * hours)
+    whole = (halves // 2 - 1) % 12 + 1
+    return f"{whole}:30" if halves % 2 else f"{whole}"
+
+
+def _on_clock(hours: float) -> float:
+    """Hours above 0 and up to 12."""
+    return 12.0 - (-hours) % 12.0
+
+
+def _deviations(probability: float) -> float:
+    return NormalDist().inv_cdf(0.5 + probability / 2.0)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")

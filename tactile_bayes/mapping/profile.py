@@ -1,0 +1,461 @@
+"""The head's own profile, and how evenly it presses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from tactile_bayes.geometry import FloatArray, Plane, apply, inverse
+from tactile_bayes.mapping.cells import Readout
+from tactile_bayes.mapping.convention import stroke_starts
+from tactile_bayes.mapping.select import BoolArray, SelectedFrames, chunks
+from tactile_bayes.presets import HEAD_PROFILE
+from tactile_bayes.scan import CountArray
+
+# --- Reproducible random choice of frames by a hash of their levels, independent of order and portions.
+#
+# A statistic that needs no more than some thousand frames is taken from those with the smallest marks. The choice
+# depends on the set of frames alone, and shards agree on it without knowing each other.
+
+NO_LIMIT = np.uint64(2**64 - 1)
+_ROUNDS = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
+_LAST_SHIFT = np.uint64(31)
+
+
+def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
+    """Hash of each frame's level.
+
+    Parameters
+    ----------
+    level_kpa : (f,) array
+        Exact means, the same to the bit whatever computes them (see `tactile_bayes.mapping.cells`).
+
+    Returns
+    -------
+    (f,) uint64 array; equal levels have equal marks.
+
+    Notes
+    -----
+    The mixing function of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number generators).
+    """
+    mark = np.ascontiguousarray(level_kpa).view(np.uint64)
+    for shift, factor in _ROUNDS:
+        mark = (mark ^ (mark >> shift)) * factor
+    return mark ^ (mark >> _LAST_SHIFT)
+
+
+def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
+    """Limit that at most `most` marks lie below; equal marks are chosen together or not at all.
+
+    The limit of a set can be found from the marks under the limits of its parts and those limits, of which the least
+    counts.
+    """
+    if len(marks) <= most:
+        return NO_LIMIT
+    return np.uint64(np.partition(marks, most)[most])
+
+
+# --- Pressure profile of the head away from lumps, which depends on the depth of the soft layer below it.
+#
+# A curved head on a thin soft layer presses hardest in its middle, on a deep one at its rim (Wellman & Howe 1999,
+# Eq 1: the width of the homogeneous profile goes with the thickness of the tissue).
+
+# Frames that are read, chosen by their marks; those of a scan of 10 s at 200 Hz are read all.
+MOST_FRAMES = 2048
+# Chosen frames that wait to be read: many at once cost less each, and most are overtaken by others before.
+_MOST_WAITING = 4096
+# Frames that came a few at a time wait until there are so many before their marks are compared.
+_FEW = 64
+_CHUNK = 128
+# The figures are means of whole multiples of this.
+_STEP = 2.0**-32
+# A frame is called lump-free when what is left of it beside a smooth profile is within this factor of the smoothest
+# tenth's, and there must be this many of them.
+SMOOTH_FACTOR = 1.1
+LEAST_FRAMES = 50
+# Orders across and along the head, those of `HEAD_PROFILE` first. Odd and mixed ones take up how the head was tilted.
+# The fourth across hangs on the head's very rim: two simulations with one body differ in it by half its range.
+_ORDERS = ((2, 0), (0, 2), (0, 4), (0, 0), (4, 0), (1, 0), (0, 1), (1, 1), (2, 2))
+SKEW = _ORDERS.index((1, 0))
+"""Which of `ProfileReader.whole` is the first order across the head."""
+_HIGHEST = 4
+_COLUMNS = len(HEAD_PROFILE) + 1
+
+
+def head_profile_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
+    """The map's figures `HEAD_PROFILE`, and ``head_profile_frames``; none where too few frames are free of a lump."""
+    frames = [
+        np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels)) for part in selections
+    ]
+    marks = [frame_marks(part.level_kpa[chosen]) for part, chosen in zip(selections, frames, strict=True)]
+    limit = marks_limit(np.concatenate(marks), MOST_FRAMES)
+    read = [_read(part, each[mark < limit]) for part, each, mark in zip(selections, frames, marks, strict=True)]
+    return profile_figures(np.concatenate(read))
+
+
+def _whole(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> BoolArray:
+    """Which frames can be read: those with all good taxels valid and a mean above 0."""
+    whole: BoolArray = (valid_share == np.count_nonzero(good) / good.size) & (level_kpa > 0)
+    return whole
+
+
+def profile_figures(rows: FloatArray) -> dict[str, float]:
+    """Figures from the (f, 4) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
+
+    A lump, or the edge of a rib, is no smooth profile: the residual of a frame shows it, also where most frames feel
+    one. Rows of NaN, from an array without a profile, give no figures.
+    """
+    if len(rows) < LEAST_FRAMES:
+        return {}
+    smooth = rows[lump_free(rows[:, -1]), :-1]
+    if len(smooth) < LEAST_FRAMES:
+        return {}
+    # Sums of whole steps have no rounding: neither the order of the frames nor a matrix product leaves a trace.
+    mean = np.ones(len(smooth)) @ np.rint(smooth / _STEP) * (_STEP / len(smooth))
+    return {
+        **{name: float(value) for name, value in zip(HEAD_PROFILE, mean, strict=True)},
+        "head_profile_frames": float(len(smooth)),
+    }
+
+
+def lump_free(left: FloatArray) -> BoolArray:
+    """(f,) which of at least two frames feel no lump, by the (f,) residuals of their smooth profiles."""
+    free: BoolArray = left <= SMOOTH_FACTOR * _tenth(left)
+    return free
+
+
+def profile_frames(part: SelectedFrames) -> NDArray[np.intp]:
+    """Frames of one scan that are read: those that are whole, at most `MOST_FRAMES` of them, in the order of time."""
+    frames = np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels))
+    marks = frame_marks(part.level_kpa[frames])
+    return frames[marks < marks_limit(marks, MOST_FRAMES)]
+
+
+def _tenth(values: FloatArray) -> float:
+    """Quantile 0.1 of two values or more, linear between neighbours."""
+    below, share = divmod(0.1 * (len(values) - 1), 1.0)
+    parted = np.partition(values, int(below) + 1)
+    low, high = parted[: int(below) + 1].max(), parted[int(below) + 1]
+    return float(low + share * (high - low))
+
+
+def _read(part: SelectedFrames, frames: NDArray[np.intp]) -> FloatArray:
+    if not len(frames):
+        return np.zeros((0, _COLUMNS))
+    readout = Readout.of(part.scan.element_calibration, part.good_taxels)
+    counts = readout.counts(part.scan.frames.counts[frames])
+    return _rows(ProfileReader.of(part.good_taxels), readout, counts, part.level_kpa[frames])
+
+
+def _rows(reader: ProfileReader, readout: Readout, counts: CountArray, level_kpa: FloatArray) -> FloatArray:
+    """(f, 4) rows from (f, k) counts, in portions that fit the processor's cache."""
+    rows = np.empty((len(counts), _COLUMNS))
+    for part in chunks(len(counts), _CHUNK):
+        rows[part] = reader.read(readout.pressure_kpa(counts[part])[0], level_kpa[part])
+    return rows
+
+
+class GrowingProfile:
+    """Profiles of at most `MOST_FRAMES` frames of a growing scan, the same in any portions and order.
+
+    Parameters
+    ----------
+    good : (rows, columns) bool array
+        Taxels that are used.
+    readout
+        How their counts become pressures.
+    """
+
+    def __init__(self, good: BoolArray, readout: Readout) -> None:
+        self._good, self._readout, self._reader = good, readout, ProfileReader.of(good)
+        self._limit = NO_LIMIT
+        self._marks, self._rows = np.zeros(0, dtype=np.uint64), np.zeros((0, _COLUMNS))
+        self._waiting: list[tuple[NDArray[np.uint64], CountArray, FloatArray]] = []
+        self._number_waiting = 0
+        self._new: list[tuple[CountArray, FloatArray, FloatArray]] = []
+        self._number_new = 0
+
+    def add(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
+        """Add frames.
+
+        Parameters
+        ----------
+        counts : (f, k) uint16 array
+            Of the used taxels.
+        level_kpa, valid_share : (f,) arrays
+            The frames' means, and the share of all taxels that is valid.
+        """
+        if not self._reader.solve.size:
+            return
+        if len(counts) >= _FEW:
+            self._choose(counts, level_kpa, valid_share)
+            return
+        self._new.append((counts.copy(), level_kpa, valid_share))
+        self._number_new += len(counts)
+        if self._number_new >= _FEW:
+            self._choose_new()
+
+    def _choose_new(self) -> None:
+        """Choose among frames that came a few at a time."""
+        if self._new:
+            counts, level, share = (np.concatenate(part) for part in zip(*self._new, strict=True))
+            self._new, self._number_new = [], 0
+            self._choose(counts, level, share)
+
+    def _choose(self, counts: CountArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
+        """Queue the frames that are among the chosen ones so far."""
+        marks = frame_marks(level_kpa)
+        if len(marks) >= MOST_FRAMES:  # so many that not all of them need be copied
+            whole = marks[_whole(level_kpa, valid_share, self._good)]
+            others = [waiting for waiting, _, _ in self._waiting]
+            limit = marks_limit(np.concatenate([self._marks, *others, whole]), MOST_FRAMES)
+            self._limit = min(self._limit, limit)
+        chosen = marks < self._limit
+        if chosen.any():
+            chosen &= _whole(level_kpa, valid_share, self._good)
+        number = int(np.count_nonzero(chosen))
+        if not number:
+            return
+        self._waiting.append((marks[chosen], counts[chosen], level_kpa[chosen]))
+        self._number_waiting += number
+        if self._number_waiting > _MOST_WAITING:
+            self._read_waiting()
+
+    def merge(self, other: GrowingProfile) -> None:
+        """Add the frames that another profile was given."""
+        self._read_waiting()
+        other._read_waiting()
+        limit = marks_limit(np.concatenate([self._marks, other._marks]), MOST_FRAMES)
+        self._limit = min(self._limit, other._limit, limit)
+        chosen = other._marks < self._limit
+        self._keep(other._marks[chosen], other._rows[chosen])
+
+    def figures(self) -> dict[str, float]:
+        """As `profile_figures`."""
+        self._read_waiting()
+        return profile_figures(self._rows)
+
+    def _read_waiting(self) -> None:
+        """Read the queued frames that are still among the chosen ones."""
+        self._choose_new()
+        if not self._waiting:
+            return
+        marks, counts, level = (np.concatenate(part) for part in zip(*self._waiting, strict=True))
+        self._waiting, self._number_waiting = [], 0
+        self._limit = min(self._limit, marks_limit(np.concatenate([self._marks, marks]), MOST_FRAMES))
+        chosen = marks < self._limit
+        self._keep(marks[chosen], _rows(self._reader, self._readout, counts[chosen], level[chosen]))
+
+    def _keep(self, marks: NDArray[np.uint64], rows: FloatArray) -> None:
+        """Keep these rows, and the earlier ones still below the limit."""
+        kept = self._marks < self._limit
+        before = (self._marks, self._rows) if kept.all() else (self._marks[kept], self._rows[kept])
+        self._marks, self._rows = np.concatenate([before[0], marks]), np.concatenate([before[1], rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProfileReader:
+    """Fits smooth pressure profiles to frames.
+
+    Parameters
+    ----------
+    solve : (9, taxels) array
+        Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares; no taxel where too
+        few rows or columns have one to tell the polynomials apart.
+    gram : (9, 9) array
+        Inner products of the polynomials.
+    """
+
+    solve: FloatArray
+    gram: FloatArray
+
+    @classmethod
+    def of(cls, good: BoolArray) -> ProfileReader:
+        """Prepare for the good taxels of an array, True in (rows, columns)."""
+        across, along = (_legendre(n) for n in good.shape)
+        terms = np.stack([np.outer(across[:, i], along[:, j])[good] for i, j in _ORDERS], axis=1)
+        if min(np.count_nonzero(good.any(axis=1)), np.count_nonzero(good.any(axis=0))) <= _HIGHEST:
+            terms = terms[:0]
+        return cls(np.ascontiguousarray(np.linalg.pinv(terms)), terms.T @ terms)
+
+    def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
+        """Coefficients and residuals of frames; a frame's bits do not depend on the frames read with it.
+
+        Parameters
+        ----------
+        pressure_kpa : (f, taxels) array
+            Of the good taxels, all valid.
+        level_kpa : (f,) array
+            The frames' means, above 0.
+
+        Returns
+        -------
+        (f, 4) array
+            `HEAD_PROFILE`, and the root mean square of the residual of the nine terms. NaN where the array has too few
+            rows or columns.
+        """
+        whole = self.whole(pressure_kpa, level_kpa)
+        return np.ascontiguousarray(np.delete(whole, np.s_[len(HEAD_PROFILE) : -1], axis=1))
+
+    def whole(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
+        """(f, 10) coefficients of all nine terms over the frames' means, and residuals; otherwise as `read`."""
+        terms = len(_ORDERS)
+        if not self.solve.size:
+            return np.full((len(pressure_kpa), terms + 1), np.nan)
+        # One matrix times vector per frame: a product of all frames would be rounded by how many there are.
+        found = np.matmul(self.solve, pressure_kpa[:, :, None])[:, :, 0]
+        # The residual's square by Pythagoras: the residual itself would cost as much as the map.
+        fitted = np.matmul(self.gram, found[:, :, None])[:, :, 0]
+        square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,fi->f", found, fitted)
+        left = np.sqrt(np.maximum(square, 0.0) / self.solve.shape[1])
+        rows = np.empty((len(found), terms + 1))
+        rows[:, :-1], rows[:, -1] = found, left
+        rows /= level_kpa[:, None]
+        return rows
+
+
+def _legendre(taxels: int) -> FloatArray:
+    """(taxels, 5) Legendre polynomials at the taxels' centres, the array's ends at -1 and 1."""
+    return np.asarray(legendre.legvander((2.0 * np.arange(taxels) + 1.0) / taxels - 1.0, _HIGHEST))
+
+
+# --- Figures of how even a scan's surroundings were: the head's profile from place to place and stroke to stroke.
+#
+# Where no lump is felt, the profile of the head depends on the layers below it
+# (`tactile_bayes.mapping.head_profile`). A profile that changes with the head's place means layers whose depth
+# changes; one that is skewed along the stroke, to the other side in strokes the other way, means that the skin is
+# dragged along. How the head's normal turns as it moves is the curvature of the skin, to which an examiner keeps
+# the head square.
+
+SPAN_MM = 30.0
+"""Distance over which a change of the profile is stated."""
+# Neighbouring frames share errors: standard errors come from leaving out every tenth stretch of this many seconds.
+_STRETCH_S = 0.5
+_GROUPS = 10
+# A direction that the head moved in by less than this (SD, mm) tells no change.
+_LEAST_SPREAD_MM = 3.0
+# Columns of the regression.
+_X, _Y, _WAY = 1, 2, 3
+
+
+def evenness_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[str, float]:
+    """Figures of the map's evenness, with standard errors where they come from a regression.
+
+    Returns
+    -------
+    dict
+        ``skin_curvature_per_m``: by how much the head's normal turned outwards as it moved outwards, rad per m; above 0
+        on convex skin. ``profile_change``, ``profile_change_sd``: change of `head_profile_x2` over `SPAN_MM` in the
+        direction in which it changes most. ``stroke_skew``, ``stroke_skew_sd``: first-order coefficient of the
+        profile along the strokes, half the difference between strokes towards +x and towards -x; not given where all
+        strokes went one way. The last four are missing where too few frames are free of a lump or the head hardly
+        moved.
+    """
+    parts = [_Frames.of(part, plane) for part in selections if part.used.any()]
+    figures = _curvature(parts)
+    rows, designs, groups = [], [], []
+    for part in parts:
+        some_rows, some_designs, some_groups = part.profiles()
+        rows.append(some_rows)
+        designs.append(some_designs)
+        groups.append(some_groups)
+    return figures | _profile_changes(np.concatenate(rows), np.concatenate(designs), np.concatenate(groups))
+
+
+class _Frames:
+    """Where the head was in the used frames of a scan: places and normals on the plane, and the strokes' directions."""
+
+    def __init__(self, part: SelectedFrames, place_mm: FloatArray, axes: FloatArray) -> None:
+        self.part, self.place_mm, self.axes = part, place_mm, axes
+        self.way = _ways(place_mm[:, 0])
+
+    @classmethod
+    def of(cls, part: SelectedFrames, plane: Plane) -> _Frames:
+        rotation, tracker_from_head = part.poses.rotation[part.used], inverse(part.scan.head.scanhead_from_tracker)
+        apex = part.poses.position_mm[part.used] + (rotation * tracker_from_head[:3, 3]).sum(axis=2)
+        axes = np.einsum("ij,njk,kl->nil", plane.plane_from_base[:3, :3], rotation, tracker_from_head[:3, :3])
+        return cls(part, apply(plane.plane_from_base, apex), axes)
+
+    def profiles(self) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+        """(f, 10) profiles of the readable frames, the (f, 7) terms of their regression, and (f,) stretches of time."""
+        part = self.part
+        chosen = profile_frames(part)
+        reader = ProfileReader.of(part.good_taxels)
+        among = np.searchsorted(np.flatnonzero(part.used), chosen)
+        level = part.level_kpa[chosen]
+        readout = Readout.of(part.scan.element_calibration, part.good_taxels)
+        pressure = readout.pressure_kpa(readout.counts(part.scan.frames.counts[chosen]))[0]
+        place = self.place_mm[among, :2] / SPAN_MM
+        tilt = self.axes[among, 2, :2]
+        one = np.ones((len(chosen), 1))
+        design = np.hstack([one, place, self.way[among, None], np.log(level)[:, None], tilt])
+        stretch = np.floor(part.scan.frames.time_s[chosen] / _STRETCH_S).astype(np.int64) % _GROUPS
+        return reader.whole(pressure, level), design, stretch
+
+
+def _ways(x_mm: FloatArray) -> FloatArray:
+    """(n,) 1 in strokes towards +x, -1 in others."""
+    way, starts = np.ones(len(x_mm)), stroke_starts(x_mm)
+    for start, stop in pairwise(starts):
+        way[start:stop] = 1.0 if x_mm[min(stop, len(x_mm) - 1)] >= x_mm[start] else -1.0
+    return way
+
+
+def _curvature(parts: Sequence[_Frames]) -> dict[str, float]:
+    """Mean over the directions in which the head moved, weighted by how far."""
+    place = np.concatenate([part.place_mm[:, :2] - part.place_mm[:, :2].mean(axis=0) for part in parts])
+    normal = np.concatenate([part.axes[:, :2, 2] - part.axes[:, :2, 2].mean(axis=0) for part in parts])
+    moved = float(np.sum(place**2))
+    if not moved > len(place) * _LEAST_SPREAD_MM**2:
+        return {}
+    return {"skin_curvature_per_m": -1000.0 * float(np.sum(place * normal)) / moved}
+
+
+def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int64]) -> dict[str, float]:
+    """Changes of the profile with place and stroke, by least squares over the lump-free frames."""
+    if len(rows) < LEAST_FRAMES:
+        return {}
+    free = lump_free(rows[:, -1])
+    if np.count_nonzero(free) < LEAST_FRAMES:
+        return {}
+    rows, design, group = (
+        rows[free],
+        design[free] - design[free].mean(axis=0) * (np.arange(design.shape[1]) > 0),
+        group[free],
+    )
+    if min(np.std(design[:, _X]), np.std(design[:, _Y])) * SPAN_MM < _LEAST_SPREAD_MM:
+        return {}
+    both_ways = np.std(design[:, _WAY]) > 0
+    kept = np.flatnonzero(np.std(design, axis=0) > 0)
+    columns = np.concatenate([[0], kept])
+    found, errors = _regression(design[:, columns], rows[:, :-1], group)
+    at = {int(column): i for i, column in enumerate(columns)}
+    slope, slope_error = (values[[at[_X], at[_Y]], 0] for values in (found, errors))
+    change = float(np.hypot(*slope))
+    figures = {
+        "profile_change": change,
+        "profile_change_sd": float(np.sqrt(np.sum((slope * slope_error) ** 2)) / change) if change > 0 else 0.0,
+    }
+    if both_ways:
+        figures |= {"stroke_skew": float(found[at[_WAY], SKEW]), "stroke_skew_sd": float(errors[at[_WAY], SKEW])}
+    return figures
+
+
+def _regression(design: FloatArray, rows: FloatArray, group: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """(c, k) coefficients of (n, k) rows on an (n, c) design, and their standard errors by a grouped jackknife."""
+    normal = np.stack([design[group == g].T @ design[group == g] for g in range(_GROUPS)])
+    right = np.stack([design[group == g].T @ rows[group == g] for g in range(_GROUPS)])
+    used = np.flatnonzero(normal[:, 0, 0] > 0)
+    whole = _solved(normal.sum(axis=0), right.sum(axis=0))
+    without = np.stack([_solved(normal.sum(axis=0) - normal[g], right.sum(axis=0) - right[g]) for g in used])
+    error = np.sqrt((len(used) - 1) / len(used) * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
+    return whole, np.asarray(error)
+
+
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-10)[0])

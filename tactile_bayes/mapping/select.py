@@ -1,0 +1,486 @@
+"""Which frames take part: the pressure gate, timing, overlap, thinning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.cells import Readout
+from tactile_bayes.mapping.plane import MAX_POSE_GAP_MS, FramePoses, distinct_poses, poses_at
+from tactile_bayes.mapping.scatter import chunk_frames
+from tactile_bayes.scan import PressureFrames, Scan
+
+# --- Detection of faulty taxels over a whole scan.
+
+# A taxel that reads this share of its row's and column's level, or less, is dead (its cable picks up noise only).
+DEAD_SHARE = 0.1
+# One that reads this many times its row's and column's level is hot; so is one that flickers this much more than most.
+HOT_RATIO = 2.0
+FLICKER_RATIO = 10.0
+FLICKER_KPA = 1.0
+# One that is saturated in a larger share of the frames is left out of all of them.
+SATURATED_SHARE = 0.1
+# Fewer frames than this say nothing about what never changes.
+MIN_FRAMES = 10
+# One that repeats its last count in a larger share of the frames, where most do so in less than half of that, is stuck.
+STILL_SHARE = 0.5
+# Below this level (kPa) the head is in the air, and a low reading is no fault.
+CONTACT_KPA = 1.0
+_CHUNK = 512
+
+
+class TaxelFault(NamedTuple):
+    """One taxel that is left out, and why: ``"dead"``, ``"stuck"``, ``"hot"`` or ``"saturated"``."""
+
+    row: int
+    column: int
+    fault: str
+
+    def __str__(self) -> str:
+        return f"row {self.row} column {self.column} {self.fault}"
+
+
+class _Levels(NamedTuple):
+    """Statistics of each taxel's counts over a scan; (rows, columns) arrays."""
+
+    lowest: NDArray[np.uint16]
+    highest: NDArray[np.uint16]
+    mean_kpa: FloatArray
+    flicker_kpa: FloatArray
+    still_share: FloatArray
+    saturated_share: FloatArray
+
+
+def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
+    """Find the taxels to leave out of every frame of `scan`, in row order.
+
+    - dead: gain 0, or never anything but one count while the level is next to nothing, or a level below a tenth of
+      both its row's and its column's median;
+    - stuck: one count throughout, while most taxels change; or one that repeats its last count in over half of the
+      frames, while most hardly ever do (it sticks for a time and comes back);
+    - hot: over twice the level of its row and column, or flickering over ten times as much as most;
+    - saturated: full scale in over a tenth of the frames.
+
+    A level is compared along the row *and* the column, so that an edge that bears less is no fault.
+    """
+    if not len(scan.frames):
+        return ()
+    levels = _element_levels(scan)
+    faults = _classify(scan, levels)
+    return tuple(
+        TaxelFault(int(row), int(column), str(faults[row, column])) for row, column in np.argwhere(faults != "")
+    )
+
+
+def _classify(scan: Scan, levels: _Levels) -> NDArray[np.str_]:
+    """(rows, columns) fault of each taxel, "" for a good one."""
+    mean = levels.mean_kpa
+    usual = float(np.median(mean))
+    low, high = _neighbour_levels(mean)
+    constant = (levels.highest == levels.lowest) & (len(scan.frames) >= MIN_FRAMES)
+    moving = bool(np.median(levels.highest - levels.lowest) > 0)
+    empty = constant & ((levels.highest == 0) | (mean <= DEAD_SHARE * usual))
+    weak = (mean < DEAD_SHARE * low) & (low > CONTACT_KPA)
+    flicker = (levels.flicker_kpa > FLICKER_RATIO * np.median(levels.flicker_kpa)) & (levels.flicker_kpa > FLICKER_KPA)
+    faults = np.full(mean.shape, "", dtype="<U9")
+    faults[((mean > HOT_RATIO * high) & (mean > usual + CONTACT_KPA)) | flicker] = "hot"
+    sticks = (levels.still_share > STILL_SHARE) & bool(np.median(levels.still_share) < STILL_SHARE / 2)
+    faults[(constant & moving) | (sticks & (len(scan.frames) >= MIN_FRAMES))] = "stuck"
+    faults[levels.saturated_share > SATURATED_SHARE] = "saturated"
+    faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
+    return faults
+
+
+def _neighbour_levels(mean_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The lower and the higher of each taxel's row median and column median."""
+    rows = np.median(mean_kpa, axis=1)[:, None]
+    columns = np.median(mean_kpa, axis=0)[None, :]
+    return np.minimum(rows, columns), np.maximum(rows, columns)
+
+
+def _element_levels(scan: Scan) -> _Levels:
+    """Compute the statistics in one pass over the counts."""
+    counts, calibration = scan.frames.counts, scan.element_calibration
+    total = np.zeros(counts.shape[1:])
+    steps, still = np.zeros(counts.shape[1:]), np.zeros(counts.shape[1:])
+    saturated = np.zeros(counts.shape[1:], dtype=np.int64)
+    last = counts[:1].astype(np.float64)
+    for start in range(0, len(counts), _CHUNK):
+        chunk = counts[start : start + _CHUNK].astype(np.float64)
+        total += chunk.sum(axis=0)
+        change = np.abs(np.diff(chunk, axis=0, prepend=last))
+        steps += change.sum(axis=0)  # not squared: one spike is no flicker
+        still += (change == 0).sum(axis=0)
+        saturated += (chunk >= calibration.saturation_count).sum(axis=0)
+        last = chunk[-1:]
+    n = len(counts)
+    return _Levels(
+        counts.min(axis=0),
+        counts.max(axis=0),
+        calibration.gain_kpa_per_count * (total / n) + calibration.offset_kpa,
+        calibration.gain_kpa_per_count * (steps / max(n - 1, 1)),
+        (still - 1) / max(n - 1, 1),  # the first frame was compared with itself
+        saturated / n,
+    )
+
+
+# --- Regularity of frames and poses: rates, jitter, repeats, gaps and missing records.
+
+# An interval longer than this many usual ones holds frames that never came.
+_GAP_INTERVALS = 1.5
+
+
+def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
+    """Figures for a map's report, over all scans.
+
+    Returns
+    -------
+    dict
+        ``frame_rate_hz``, ``frame_jitter_ms`` (spread of the intervals without gaps), ``frames_missing``,
+        ``frames_repeated`` (two of one time), ``pose_rate_hz`` and ``pose_jitter_ms`` of distinct poses,
+        ``pose_repeats`` (samples told again) and ``pose_gap_ms`` (the longest between distinct poses). Rates of scans
+        with less than two records are left out.
+    """
+    frames = [scan.frames.time_s for scan in scans]
+    fresh = [distinct_poses(scan.poses) for scan in scans]
+    poses = [one.time_s for one in fresh]
+    gaps = [np.diff(time).max(initial=0.0) for time in poses]
+    return {
+        **_regularity("frame", frames),
+        **_regularity("pose", poses),
+        "frames_missing": float(sum(_missing(time) for time in frames)),
+        "frames_repeated": float(sum(int((np.diff(time) == 0).sum()) for time in frames)),
+        "pose_repeats": float(sum(len(scan.poses) - len(one) for scan, one in zip(scans, fresh, strict=True))),
+        "pose_gap_ms": 1000.0 * float(max(gaps, default=0.0)),
+    }
+
+
+def _regularity(name: str, times: list[FloatArray]) -> dict[str, float]:
+    """Rate, and standard deviation of the intervals that contain no gap."""
+    steps = np.concatenate([np.diff(time) for time in times])
+    steps = steps[steps > 0]
+    if not len(steps):
+        return {}
+    usual = float(np.median(steps))
+    regular = steps[steps < _GAP_INTERVALS * usual]
+    return {f"{name}_rate_hz": 1.0 / usual, f"{name}_jitter_ms": 1000.0 * float(regular.std())}
+
+
+def _missing(time_s: FloatArray) -> int:
+    """Number of frames missing in the gaps."""
+    steps = np.diff(time_s)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return 0
+    usual = float(np.median(steps))
+    return int(np.rint(steps[steps >= _GAP_INTERVALS * usual] / usual - 1).sum())
+
+
+# --- A scan with part of its frames: every so many-th, or those of its first seconds.
+
+
+def every_nth(scan: Scan, every: int) -> Scan:
+    """The scan with one frame of every `every`, the first one included; all poses stay.
+
+    Raises
+    ------
+    BadDataError
+        When `every` is no whole number from 1 on.
+    """
+    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
+        raise BadDataError(f"every is {every}", way_out="give a whole number from 1 on: 4 uses every fourth frame")
+    if every == 1:
+        return scan
+    return _with_frames(scan, slice(None, None, every))
+
+
+def first_seconds(scan: Scan, duration_s: float) -> Scan:
+    """The scan with the frames of its first `duration_s` seconds; all poses stay.
+
+    Raises
+    ------
+    BadDataError
+        When the duration is not above 0.
+    """
+    if not duration_s > 0:
+        raise BadDataError(f"duration_s is {duration_s}", way_out="give a time above 0 s")
+    time_s = scan.frames.time_s
+    if not len(time_s):
+        return scan
+    return _with_frames(scan, slice(0, int(np.searchsorted(time_s, time_s[0] + duration_s, side="right"))))
+
+
+def _with_frames(scan: Scan, kept: slice) -> Scan:
+    frames = PressureFrames(scan.frames.time_s[kept], np.ascontiguousarray(scan.frames.counts[kept]))
+    return replace(scan, frames=frames)
+
+
+# --- Overlap in time of a scan's poses and frames, and cautions where it is poor.
+
+# Shorter mismatches and gaps cost a few frames at most.
+TOLERATED_S: Final = 0.1
+# Frames are missing where an interval is this many times the mean.
+_LONG_INTERVALS: Final = 5.0
+
+
+@dataclass(slots=True)
+class Span:
+    """Range of the times at which a device's records were measured.
+
+    Parameters
+    ----------
+    number
+        Records so far.
+    first_s, last_s
+        Times of the first and the last.
+    gap_s, gap_at_s
+        Longest interval between two records, and when it began.
+    """
+
+    number: int = 0
+    first_s: float = 0.0
+    last_s: float = 0.0
+    gap_s: float = 0.0
+    gap_at_s: float = 0.0
+
+    def add(self, time_s: float) -> None:
+        """Add the next record's time, which must not be below the one before."""
+        if not self.number:
+            self.first_s = time_s
+        elif time_s - self.last_s > self.gap_s:
+            self.gap_s, self.gap_at_s = time_s - self.last_s, self.last_s
+        self.number, self.last_s = self.number + 1, time_s
+
+    @classmethod
+    def of(cls, time_s: FloatArray) -> Span:
+        """Span of (n,) times that never fall."""
+        if not len(time_s):
+            return cls()
+        steps = np.diff(time_s)
+        longest = int(steps.argmax()) if len(steps) else 0
+        gap_s = float(steps[longest]) if len(steps) else 0.0
+        return cls(len(time_s), float(time_s[0]), float(time_s[-1]), gap_s, float(time_s[longest]))
+
+
+def apart(frames: Span, poses: Span) -> bool:
+    """Whether no frame was measured between the first pose and the last."""
+    if not frames.number or not poses.number:
+        return True
+    return poses.last_s < frames.first_s or poses.first_s > frames.last_s
+
+
+def overlap_cautions(frames: Span, poses: Span) -> list[str]:
+    """Cautions about the times, one line each; empty when every frame has poses around it.
+
+    A scan without frames, or without poses, has no times to compare.
+    """
+    found = _frame_gaps(frames)
+    if not frames.number or not poses.number:
+        return found
+    if apart(frames, poses):
+        when = f"{poses.first_s:.2f} to {poses.last_s:.2f} s, frames {frames.first_s:.2f} to {frames.last_s:.2f} s"
+        return [*found, f"no frame has a pose: poses cover {when}"]
+    late_s, early_s = poses.first_s - frames.first_s, frames.last_s - poses.last_s
+    if late_s > TOLERATED_S:
+        found.append(f"poses start {late_s:.1f} s after the frames")
+    if early_s > TOLERATED_S:
+        found.append(f"poses end {early_s:.1f} s before the frames")
+    if poses.gap_s > TOLERATED_S:
+        found.append(f"no pose for {poses.gap_s:.2f} s from {poses.gap_at_s:.2f} s on (longest gap)")
+    return found
+
+
+def scan_findings(scan: Scan) -> tuple[Finding, ...]:
+    """What its file and recorder say against a scan, and its times."""
+    return with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
+
+
+def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[Finding, ...]:
+    """Findings of a scan's file, and of its times where its recorder did not note them."""
+    found = overlap_cautions(frames, poses)
+    told = [one for one in findings if one.text not in found]
+    return (*told, *(Finding("times_apart", text) for text in found))
+
+
+def _frame_gaps(frames: Span) -> list[str]:
+    usual_s = (frames.last_s - frames.first_s) / max(1, frames.number - 1)
+    if frames.gap_s <= max(TOLERATED_S, _LONG_INTERVALS * usual_s):
+        return []
+    return [f"no frame for {frames.gap_s:.2f} s from {frames.gap_at_s:.2f} s on (longest gap)"]
+
+
+# --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).
+
+BoolArray = NDArray[np.bool_]
+
+# A frame with a smaller share of valid taxels than this is dropped.
+VALID_SHARE = 0.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SelectedFrames:
+    """A scan with the selection of its frames.
+
+    Parameters
+    ----------
+    scan
+        As recorded.
+    faults
+        Taxels left out of every frame.
+    poses
+        Pose of the tracker at each frame.
+    level_kpa : (n,) array
+        Mean over the valid taxels; NaN where there is none.
+    valid_share : (n,) array
+        Share of the taxels of the array that are good and not saturated.
+    low, high : (n,) bool arrays
+        Frames whose level is below or above the window, among those with a pose and enough valid taxels.
+    used : (n,) bool array
+        Frames that go into the map.
+    """
+
+    scan: Scan
+    faults: tuple[TaxelFault, ...]
+    poses: FramePoses
+    level_kpa: FloatArray
+    valid_share: FloatArray
+    low: BoolArray
+    high: BoolArray
+    used: BoolArray
+
+    @property
+    def dropped_no_pose(self) -> int:
+        """Frames without a pose from the tracker."""
+        return int((~self.poses.known).sum())
+
+    @property
+    def dropped_elements(self) -> int:
+        """Frames with a pose and too few valid taxels."""
+        return int((self.poses.known & ~(self.valid_share >= VALID_SHARE)).sum())
+
+    @property
+    def good_taxels(self) -> BoolArray:
+        """(rows, columns) True for taxels that are not left out."""
+        return good_taxels(self.scan, self.faults)
+
+    @property
+    def used_poses(self) -> FramePoses:
+        """Poses of the frames that go into the map."""
+        return FramePoses(self.poses.position_mm, self.poses.rotation, self.used)
+
+
+def good_taxels(scan: Scan, faults: tuple[TaxelFault, ...]) -> BoolArray:
+    """(rows, columns) True for taxels without a fault."""
+    good = np.ones(scan.head.shape, dtype=bool)
+    for fault in faults:
+        good[fault.row, fault.column] = False
+    return good
+
+
+def chunks(frames: int, size: int) -> Iterator[slice]:
+    """Split into stretches of `size` frames."""
+    for start in range(0, frames, size):
+        yield slice(start, min(start + size, frames))
+
+
+def select_frames(
+    scan: Scan,
+    *,
+    pressure_window_kpa: tuple[float, float],
+    latency_ms: float = 0.0,
+    max_pose_gap_ms: float = MAX_POSE_GAP_MS,
+) -> SelectedFrames:
+    """Decide for every frame of a scan whether it is used.
+
+    A frame is used when the tracker knew where it was, nine taxels in ten are valid, and the mean over the valid ones
+    lies in the window, its ends included.
+
+    Raises
+    ------
+    BadDataError
+        When no taxel works.
+    """
+    faults = find_faults(scan)
+    _refuse_dead(scan, faults)
+    poses = poses_at(scan.poses, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
+    level, share = _levels(scan, good_taxels(scan, faults))
+    low, high, used = gate(poses.known, level, share, pressure_window_kpa=pressure_window_kpa)
+    return SelectedFrames(scan, faults, poses, level, share, low, high, used)
+
+
+def gate(
+    known: BoolArray, level_kpa: FloatArray, valid_share: FloatArray, *, pressure_window_kpa: tuple[float, float]
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Frames below the window, above it and within, ends of the window included."""
+    candidate = known & (valid_share >= VALID_SHARE)
+    low, high = candidate & (level_kpa < pressure_window_kpa[0]), candidate & (level_kpa > pressure_window_kpa[1])
+    return low, high, candidate ^ (low | high)
+
+
+def _levels(scan: Scan, good: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Mean over the valid taxels and share of valid taxels of each frame."""
+    readout = Readout.of(scan.element_calibration, good)
+    level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
+    for part in chunks(len(scan.frames), chunk_frames(good.size)):
+        counts = readout.counts(scan.frames.counts[part])
+        level[part], share[part] = readout.levels(*readout.pressure_kpa(counts))
+    return level, share
+
+
+def _refuse_dead(scan: Scan, faults: tuple[TaxelFault, ...]) -> None:
+    taxels = scan.head.shape[0] * scan.head.shape[1]
+    if len(faults) < taxels or not taxels:
+        return
+    kinds = {fault.fault for fault in faults}
+    raise BadDataError(
+        f"none of the {taxels} taxels works ({', '.join(sorted(kinds))})",
+        way_out="check the array's cable and its calibration",
+    )
+
+
+def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_kpa: tuple[float, float]) -> None:
+    """Raise `BadDataError` when no scan has a frame left, naming the step that took them and a remedy."""
+    if any(selection.used.any() for selection in selections):
+        return
+    total = sum(len(selection.scan.frames) for selection in selections)
+    if not total:
+        raise BadDataError("the scan holds no frame", way_out="record it again")
+    known = sum(int(selection.poses.known.sum()) for selection in selections)
+    if not known:
+        raise _without_poses(selections)
+    gated = sum(int((selection.low | selection.high).sum()) for selection in selections)
+    if not gated:
+        share = max(float(selection.valid_share.max()) for selection in selections)
+        raise BadDataError(
+            f"no frame has {100 * VALID_SHARE:g} % of its taxels valid (the best has {100 * share:.1f} %)",
+            way_out="repair the array, or press less hard if taxels are saturated",
+        )
+    raise _outside_window(selections, pressure_window_kpa)
+
+
+def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
+    frames, poses = selections[0].scan.frames.time_s, selections[0].scan.poses.time_s
+    if not len(poses):
+        return BadDataError("the scan holds no tracker pose", way_out="check that the tracker was recorded")
+    return BadDataError(
+        f"no frame has a tracker pose (frames {frames[0]:.3f} to {frames[-1]:.3f} s, {len(poses)} poses "
+        f"{poses[0]:.3f} to {poses[-1]:.3f} s)",
+        way_out="check that both run on one clock and that the tracker did not freeze",
+    )
+
+
+def _outside_window(selections: list[SelectedFrames], window: tuple[float, float]) -> BadDataError:
+    levels = np.concatenate([part.level_kpa[part.low | part.high] for part in selections])
+    low, middle, high = np.quantile(levels, [0.05, 0.5, 0.95])
+    return BadDataError(
+        f"no frame's mean lies within {window[0]:g} to {window[1]:g} kPa ({len(levels)} frames, means "
+        f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f})",
+        way_out=f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten",
+    )

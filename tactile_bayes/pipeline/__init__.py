@@ -1,1 +1,0 @@
-"""Estimation from map files: choice of calibration and options, estimate and report, shared by all callers."""

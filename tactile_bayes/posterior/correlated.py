@@ -1,0 +1,351 @@
+"""The estimate under correlated noise, from a first fit to draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.forward.gaussian import covariance_from_log_widths
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import ParameterDraws, Solved
+from tactile_bayes.inference.points import MOST_PAIRED, normal_quantile, paired_points
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.posterior.detection import Detection, detection_from_odds
+from tactile_bayes.posterior.draw import draw_scene
+from tactile_bayes.posterior.draws import MapPosterior, NoiseFigures
+from tactile_bayes.posterior.field import Window, cosines_for
+from tactile_bayes.posterior.fit import FieldFit, field_window, modal_widths, shape_draws, start_vector, tangent_columns
+from tactile_bayes.posterior.fit_window import PoseNoise, overlap, trusted
+from tactile_bayes.posterior.linear import FLOOR
+from tactile_bayes.posterior.neighbours import WANTED, Surroundings, add_beside, ridge_instead, ridge_text, rising_ribs
+from tactile_bayes.posterior.options import EstimateOptions, scene_asked
+from tactile_bayes.posterior.scene import Problem, Scene
+from tactile_bayes.posterior.selection import (
+    ASKING,
+    SceneChoice,
+    ask_departure,
+    choose_shape,
+    exponent_covariance,
+    near,
+)
+from tactile_bayes.posterior.white import BumpFit
+from tactile_bayes.presets import FIELD_COSINES, SceneAsked
+from tactile_bayes.records import dataclass
+
+# --- Outline of a lump: whether its bump is skewed, or rounder inside than outside, more than a ball's is.
+#
+# With :math:`z` the place in widths along the ellipse's axes and :math:`G = e^{-|z|^2/2}`, the columns are
+# :math:`G\,|z|^2 (z_1, z_2)` for skewness and :math:`G\,|z|^2 (z_1^2 - z_2^2, 2 z_1 z_2)` for an axis ratio that
+# changes outwards. What they have in common with the bump, its derivatives and its exponent is taken off under the
+# noise field.
+
+BALLS_SD = (0.008, 0.01)
+"""Of skewness and change of balls' maps beyond their noise, over the amplitude (record 0107)."""
+NOISE_FACTOR = 2.5
+"""Variance of both over that by the residuals: deep and faint lumps are off by more than they say."""
+MOST_SDS = 2.5
+"""Length of either beyond which a ball is unlikely: of two components, in the SD of one."""
+
+
+def irregular(fit: FieldFit) -> bool:
+    """Whether the bump is more skewed, or its axis ratio changes more outwards, than a ball's.
+
+    Judged where the lump stands alone: what is left of a neighbour would answer.
+    """
+    if fit.scene.extra or fit.scene.shape == "ridge":
+        return False
+    found, covariance = outline(fit)
+    pairs = ((slice(0, 2), BALLS_SD[0]), (slice(2, 4), BALLS_SD[1]))
+    return any(
+        float(found[at] @ np.linalg.solve(NOISE_FACTOR * covariance[at, at] + sd**2 * np.eye(2), found[at]))
+        > MOST_SDS**2
+        for at, sd in pairs
+    )
+
+
+def outline(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
+    """(4,) skewness and change of the axis ratio, over the amplitude, and their (4, 4) covariance."""
+    cells = fit.target.window.cells
+    asked, further = _columns(fit)
+    known = np.concatenate([tangent_columns(fit), further])
+    value = cells.value - cells.value.mean()
+    columns = np.concatenate([known, asked, value[None]])
+    products = fit.target.products(columns, columns, fit.mode)
+    v = len(known)
+    shared = np.linalg.lstsq(products[:v, :v], products[:v, v:], rcond=None)[0]
+    left = products[v:, v:] - products[v:, :v] @ shared
+    found = np.linalg.solve(left[:4, :4], left[:4, 4])
+    squares = max(float(left[4, 4] - found @ left[:4, 4]), FLOOR * float(products[-1, -1]))
+    variance = squares / max(len(cells) - v - 4, 1)
+    amplitude = fit.target.amplitude_at(fit.mode)
+    return np.asarray(found / amplitude), np.asarray(np.linalg.inv(left[:4, :4]) * variance / amplitude**2)
+
+
+def _columns(fit: FieldFit) -> tuple[FloatArray, FloatArray]:
+    """(4, n) columns of the outline, and (2, n) of the oblique axis ratio and the exponent."""
+    scene, mode, cells = fit.scene, fit.mode, fit.target.window.cells
+    away = np.stack([cells.x_mm - scene.column(mode, "x"), cells.y_mm - scene.column(mode, "y")])
+    x, y = np.linalg.solve(np.linalg.cholesky(covariance_from_log_widths(*scene.widths(mode))), away)
+    square = x**2 + y**2
+    bump = np.exp(-0.5 * square)
+    outer = bump * square
+    return np.stack([outer * x, outer * y, outer * (x**2 - y**2), outer * 2 * x * y]), np.stack(
+        [bump * x * y, outer * square]
+    )
+
+
+# --- Contribution of tracker position error to the posterior of a bump's shape.
+#
+# A frame that is off by :math:`\delta` maps the bump shifted by it, so a cell's error is :math:`-\nabla g \cdot
+# \bar\delta`, the mean over the frames that felt the cell. Cells less than the array's side apart share frames:
+# :math:`\bar\delta` is a smooth field of variance :math:`s^2 / n` with the overlap of two arrays, a triangle along
+# each axis, as its correlation. Such errors look like another shape of the bump, so no noise found beside it tells
+# of them; what they do to the estimate is added to its draws.
+
+LEAST_EIGENVALUE = 3e-3
+"""Of the overlap of two arrays, over its largest: less is left out."""
+
+
+def pose_covariance(fit: FieldFit) -> FloatArray:
+    """(p, p) covariance of the scene's parameters from tracker position error; zeros where it is not known.
+
+    What lies beside the bump is taken as it is.
+    """
+    noise = fit.target.window.cells.pose_noise
+    p = len(fit.scene.alone().names)
+    found = np.zeros((len(fit.mode), len(fit.mode)))
+    if noise is None or fit.scene.shape == "ridge":
+        return found
+    known = tangent_columns(fit)
+    slopes = [known[1 + fit.scene.names.index(name)] for name in ("x", "y")]
+    errors = _error_columns(fit.target.window, noise, slopes)
+    products = fit.target.products(known, np.concatenate([known, errors]), fit.mode)
+    v = len(known)
+    moved = np.linalg.solve(products[:, :v], products[:, v:])[1 : p + 1]
+    found[:p, :p] = moved @ moved.T
+    return found
+
+
+def _error_columns(window: Window, noise: PoseNoise, slopes: list[FloatArray]) -> FloatArray:
+    """(k, n) independent parts of the cells' errors, from slopes of a unit bump along x and y."""
+    frames = np.maximum(window.cells.count * noise.frames_per_reading, 1.0)
+    shared = _shared_frames(window, noise) / np.sqrt(frames)
+    return np.concatenate([sd * slope * shared for sd, slope in zip(noise.sd_mm, slopes, strict=True)])
+
+
+def _shared_frames(window: Window, noise: PoseNoise) -> FloatArray:
+    """(k, n) columns whose products sum to the share of frames that two cells share."""
+    across, along = (_roots(axis, side) for axis, side in zip((window.x_mm, window.y_mm), noise.side_mm, strict=True))
+    power = np.outer(np.sum(along**2, axis=1), np.sum(across**2, axis=1))
+    i, j = np.nonzero(power > LEAST_EIGENVALUE * power.max())
+    return window.of_cells(along[i][:, :, None] * across[j][:, None, :])
+
+
+def _roots(axis_mm: FloatArray, side_mm: float) -> FloatArray:
+    """(n, n) rows whose products sum to the overlap of two equal intervals about points of an axis."""
+    values, vectors = np.linalg.eigh(overlap(axis_mm, side_mm))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T)
+
+
+# --- Estimation under correlated errors: detection, scene and draws from a least-squares fit.
+
+Progress = Callable[[int, int], None]
+LEAST_VARIANCE = 1e-12
+"""Directions in which errors of the frames' places spread less, as a share of the largest, are left out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldAnswer:
+    """Detection and scene of a map under correlated errors.
+
+    Parameters
+    ----------
+    detection
+        Whether there is a lump.
+    choice
+        The scene.
+    """
+
+    detection: Detection
+    choice: SceneChoice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldDraws:
+    """Draws under correlated errors: of the scene's parameters, by name, and figures of fit and noise."""
+
+    detection: Detection
+    draws: ParameterDraws
+    posterior: MapPosterior
+    figures: NoiseFigures
+
+
+def look(tactile_map: TactileMap, fit: BumpFit, options: EstimateOptions) -> FieldAnswer:
+    """Fit the bump under correlated errors, and compare it with no bump.
+
+    Where the options give no `field_cosines`, a narrow bump that may be a lump is fitted once more, with a finer field.
+
+    Raises
+    ------
+    NotConvergedError
+        When the density has no mode.
+    """
+
+    def under(number: int, start: FloatArray) -> FieldAnswer:
+        problem = Problem(field_window(fit, cosines=number), options.prior, options.fit.radius_mm, fit.bump.scale)
+        choice = choose_shape(problem, start, scene=scene_asked(options))
+        return FieldAnswer(field_detection(choice.plain, tactile_map, choice.plain.log_evidence), choice)
+
+    full, cosines = Scene("rotated"), options.fit.field_cosines
+    answer = under(cosines or FIELD_COSINES, start_vector(fit, full))
+    if cosines is not None or not answer.detection.log_bayes_factor > 0:
+        return answer
+    wanted = _called_for(answer.choice.plain)
+    if wanted <= FIELD_COSINES:
+        return answer
+    return under(wanted, answer.choice.plain.scene.carried(answer.choice.plain.mode, full))
+
+
+def _called_for(plain: FieldFit) -> int:
+    """Number of cosines for the narrower width of the fitted bump."""
+    narrower, window = min(modal_widths(plain)), plain.target.window
+    return max(cosines_for(narrower, axis) for axis in (window.x_mm, window.y_mm))
+
+
+def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: float) -> Detection:
+    """Odds of a bump somewhere on the map against level, tilt and the same noise fields alone.
+
+    The window's evidence has the centre anywhere in the window; the search over the rest of the map is paid for.
+    """
+    return detection_from_odds(log_evidence - plain.target.null_log_evidence() - _searched(plain, tactile_map))
+
+
+def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
+    """Log number of windows in the map's area."""
+    area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2
+    return float(np.log(max(area / (np.pi * plain.target.problem.radius_mm**2), 1.0)))
+
+
+def with_neighbours(answer: FieldAnswer, tactile_map: TactileMap, *, scene: SceneAsked = "auto") -> FieldAnswer:
+    """Add a second structure where the evidence supports it, and compare the lump with a ridge where one rises.
+
+    A bump alone is tested for a departure from a Gaussian. Only scenes in `ASKING` are compared with a ridge:
+    without a rib in the model a lump beside one would lose to it.
+    """
+    if scene not in ASKING:
+        return replace(answer, choice=ask_departure(answer.choice))
+    surroundings = Surroundings.of(tactile_map)
+    ridges = rising_ribs(answer.choice.plain, surroundings)
+    choice = add_beside(answer.choice, surroundings, ridges=ridges, scene=scene)
+    ridge = ridge_instead(choice, ridges)
+    found = replace(answer, choice=ask_departure(choice))
+    if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
+        return found
+    log_factor = choice.fit.log_evidence - ridge.log_evidence - _searched(choice.plain, tactile_map)
+    return replace(found, detection=detection_from_odds(log_factor, ridge=ridge_text(ridge)))
+
+
+def draw(
+    answer: FieldAnswer,
+    tactile_map: TactileMap,
+    options: EstimateOptions,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+) -> FieldDraws:
+    """Draw from the posterior of an answer.
+
+    Raises
+    ------
+    NotConvergedError
+        When no method converges, or the scene's neighbour was not found.
+    """
+    scene = scene_asked(options)
+    choice, wanted = answer.choice, WANTED.get(scene, "")
+    if wanted and choice.fit.scene.extra != wanted:
+        raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {scene}")
+    solved = Solved(choice.fit.target.conditional)
+    draws, passed_over = draw_scene(choice.fit, options, rng=rng, progress=progress, solved=solved)
+    detection = answer.detection
+    if choice.fit is choice.plain and not detection.ridge and "log_evidence" in draws.diagnostics:
+        detection = field_detection(choice.plain, tactile_map, draws.diagnostics["log_evidence"])
+    places = pose_covariance(choice.fit)
+    figures = _figures(choice, _places_share(choice.fit, places), passed_over)
+    return FieldDraws(detection, draws, _posterior(choice.fit, draws, rng, solved, places), figures)
+
+
+def _posterior(
+    fit: FieldFit, draws: ParameterDraws, rng: np.random.Generator, solved: Solved, places: FloatArray
+) -> MapPosterior:
+    """Draws by name, with tracker position error and what the noise field leaves open of a non-Gaussian bump added."""
+    shape = draws.theta.shape[:2]
+    theta = draws.theta + _displaced(fit, draws, places + exponent_covariance(fit), rng).reshape(draws.theta.shape)
+    sigma_x, sigma_y, angle = shape_draws(fit, theta)
+    amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=solved)
+    return MapPosterior(
+        amplitude=amplitude[:, 0].reshape(shape),
+        sigma_x_mm=sigma_x,
+        sigma_y_mm=sigma_y,
+        x_mm=fit.scene.column(theta, "x"),
+        y_mm=fit.scene.column(theta, "y"),
+        angle_rad=angle,
+        background=level.reshape(shape),
+        noise_sd=noise_sd.reshape(shape),
+        oblique=_oblique(fit, places),
+        irregular=irregular(fit),
+    )
+
+
+def _oblique(fit: FieldFit, places: FloatArray) -> tuple[float, float] | None:
+    """Mean and SD of the half log axis ratio 45 degrees from the map's x axis, where the scene has none.
+
+    By one Newton step from the mode, to that of the scene with it; None where that does not lead to one. Errors of the
+    frames' places are taken to spread it as they spread the ratio along the axes.
+    """
+    if fit.scene.shape != "ellipse":
+        return None
+    scene = replace(fit.scene, shape="rotated")
+    mixture = near(fit, scene)
+    if mixture is None:
+        return None
+    mean, covariance = mixture.moments()
+    r = scene.names.index("r")
+    along = np.array([0.5 * ((name == "u") - (name == "v")) for name in fit.scene.names])
+    return float(mean[r]), float(np.sqrt(covariance[r, r] + along @ places @ along))
+
+
+def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(chain * draw, p) normal draws with a covariance, spread evenly over the draws in order of mean width."""
+    values, vectors = np.linalg.eigh(places)
+    kept = np.flatnonzero(values > LEAST_VARIANCE * values[-1])[-MOST_PAIRED:]
+    if not values[-1] > 0:
+        return np.zeros_like(draws.flat)
+    width = fit.scene.column(draws.flat, "u") + fit.scene.column(draws.flat, "v")
+    points = paired_points(width, draws.replicates, len(kept), rng)
+    return np.asarray(normal_quantile(points) @ (vectors[:, kept] * np.sqrt(values[kept])).T)
+
+
+def _places_share(fit: FieldFit, places: FloatArray) -> float | None:
+    """Share of the log widths' variance from tracker position error; None where that is not known."""
+    if fit.target.window.cells.pose_noise is None:
+        return None
+    widths = [fit.scene.names.index(name) for name in ("u", "v") if name in fit.scene.names]
+    added = float(np.diag(places)[widths].sum())
+    return added / (added + float(np.diag(fit.covariance)[widths].sum()))
+
+
+def _figures(choice: SceneChoice, places_share: float | None, passed_over: tuple[str, ...]) -> NoiseFigures:
+    odds = {one.name: one.odds for one in choice.structures}
+    target = choice.fit.target
+    figures = {"field_cosines": target.window.cosines, **target.field_summary(choice.fit.mode)}
+    return NoiseFigures(
+        "field",
+        choice.fit.rotated,
+        odds.get("rotated"),
+        figures,
+        places_share=places_share,
+        passed_over=passed_over,
+    )

@@ -1,1 +1,0 @@
-"""Posterior of a bump, and of neighbouring structures, under spatially correlated errors."""

@@ -1,0 +1,237 @@
+"""The bump's fit under correlated noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.forward.gaussian import principal_widths
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, student_draws
+from tactile_bayes.inference.importance import Gaussians
+from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
+from tactile_bayes.posterior.field import Window
+from tactile_bayes.posterior.marginal import CollapsedTarget, independent_variance, linear_columns
+from tactile_bayes.posterior.scene import Problem, Scene
+from tactile_bayes.posterior.white import BumpFit
+from tactile_bayes.presets import FIELD_COSINES
+from tactile_bayes.records import dataclass
+
+# --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.
+
+MOST_SETTLINGS = 6
+ROUGH, FINE = 0.3, 1e-3
+"""Of the last Newton step, in `Scene.steps`: under the start's fields, which are not the mode's; then under those."""
+LEAST_SHARE = 1e-2
+"""Fields with a smaller share of the density at the mode have no Gaussian of their own in what `laplace` draws."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixture(Gaussians):
+    """One Gaussian for each noise field that matters: what `laplace` draws from.
+
+    Parameters
+    ----------
+    weight, mean, covariance
+        As in `Gaussians`.
+    log_evidence
+        Log of the integral of the density that the mixture stands for.
+    """
+
+    log_evidence: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldFit:
+    """A scene fitted at the mode of its marginal posterior.
+
+    Parameters
+    ----------
+    target
+        Its density, with the noise fields that matter there.
+    mode, covariance : (p,), (p, p) arrays
+        Of the scene's parameters; the covariance is the mixture's, not the curvature at the mode.
+    mixture
+        One Gaussian per noise field.
+    """
+
+    target: CollapsedTarget
+    mode: FloatArray
+    covariance: FloatArray
+    mixture: Mixture
+
+    @property
+    def scene(self) -> Scene:
+        """Structures in the model."""
+        return self.target.scene
+
+    @property
+    def rotated(self) -> bool:
+        """Whether the ellipse may be rotated."""
+        return self.target.rotated
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of the noise scale."""
+        return float(self.target.dof)
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence of the scene, from the Gaussians' volumes."""
+        return self.mixture.log_evidence
+
+    def sd(self, name: str) -> float:
+        """Posterior standard deviation of one parameter."""
+        i = self.scene.names.index(name)
+        return float(np.sqrt(self.covariance[i, i]))
+
+
+def field_window(least_squares: BumpFit, *, cosines: int = FIELD_COSINES) -> Window:
+    """Window of a least-squares bump, with its noise basis."""
+    return Window(least_squares.cells, independent_variance(least_squares.cells), cosines=cosines)
+
+
+def start_vector(least_squares: BumpFit, scene: Scene) -> FloatArray:
+    """Start of the search for a scene's mode, from the least-squares bump."""
+    p, q, r = (float(v) for v in least_squares.bump.shape_parameters(least_squares.theta))
+    turned = np.array([p + q, p - q, least_squares.theta[1], least_squares.theta[2], r])
+    return Scene("rotated").carried(turned, scene)
+
+
+def fit_scene(
+    problem: Problem,
+    scene: Scene,
+    start: FloatArray,
+) -> FieldFit:
+    """Find the mode, alternating with the choice of noise fields that matter there.
+
+    Parameters
+    ----------
+    start : (p,) array
+        The scene's parameters, for example from least squares.
+
+    Raises
+    ------
+    NotConvergedError
+        When there is no mode.
+    """
+    target = CollapsedTarget(problem, scene)
+    target.settle_fields(start)
+    mode, _ = find_mode(target, start, scale=scene.steps, tolerance=ROUGH)
+    target.settle_fields(mode)
+    for _ in range(MOST_SETTLINGS):
+        mode, covariance, _ = mode_and_covariance(target, mode, scale=scene.steps, tolerance=FINE)
+        if not target.settle_fields(mode):
+            break
+    if not np.isfinite(target(mode[None])[0]):
+        raise NotConvergedError("no posterior mode: the fitted bump does not rise above the correlated noise")
+    mixture = gaussian_mixture(target, mode, covariance)
+    return FieldFit(target, mode, mixture.moments()[1], mixture)
+
+
+def gaussian_mixture(target: CollapsedTarget, mode: FloatArray, covariance: FloatArray) -> Mixture:
+    """One Gaussian per field about a common mode; a single one where a field has no Gaussian of its own.
+
+    The common curvature is sharper than the mixture is wide where fields with modes of their own share the evidence.
+    """
+    found = newton_mixture(target, mode, covariance)
+    if found is not None:
+        return found
+    volume = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+    return Mixture(np.ones(1), mode[None], covariance[None], float(target(mode[None])[0]) + volume)
+
+
+def newton_mixture(
+    target: CollapsedTarget, start: FloatArray, covariance: FloatArray, *, least_share: float = LEAST_SHARE
+) -> Mixture | None:
+    """One Gaussian per field, each by one Newton step from a common start; None where one of them is no maximum.
+
+    Parameters
+    ----------
+    start : (p,) array
+        Near the mode of all of them.
+    covariance : (p, p) array
+        About theirs: it scales the finite differences and limits the step.
+    least_share
+        Of the density at the start, for a field to have a Gaussian.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    points = stencil(start, step=0.3 * scale)
+    by_field = target.by_field(points) + target.log_prior(points)[:, None]
+    whole = float(np.logaddexp.reduce(by_field[0]))
+    share = np.exp(by_field[0] - whole) if np.isfinite(whole) else np.zeros(by_field.shape[1])
+    means, covariances, masses = [], [], []
+    for h in np.flatnonzero(share > least_share):
+        if not np.isfinite(by_field[:, h]).all():
+            return None
+        gradient, hessian = finite_differences(by_field[:, h], step=0.3 * scale)
+        found = _newton_gaussian(gradient, hessian, scale, limit=covariance)
+        if found is None:
+            return None
+        step, one, gained = found
+        means.append(start + step)
+        covariances.append(one)
+        masses.append(by_field[0, h] + gained + 0.5 * float(np.linalg.slogdet(2.0 * np.pi * one)[1]))
+    if not masses:
+        return None
+    mass = np.array(masses)
+    total = float(np.logaddexp.reduce(mass))
+    left_out = float(np.log(share[share > least_share].sum()))
+    return Mixture(np.exp(mass - total), np.array(means), np.array(covariances), total - left_out)
+
+
+def _newton_gaussian(
+    gradient: FloatArray, hessian: FloatArray, scale: FloatArray, *, limit: FloatArray
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Newton step to a field's mode, its covariance and the gain; None without a maximum nearby."""
+    values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
+    if not values[0] > 0.05:
+        return None
+    covariance = (vectors / values) @ vectors.T * np.outer(scale, scale)
+    step = covariance @ gradient
+    if np.sqrt(step @ np.linalg.solve(limit, step)) > 3.0:
+        return None
+    return step, covariance, 0.5 * float(gradient @ step)
+
+
+def laplace_mixture(fit: FieldFit, *, rng: np.random.Generator, draws: int = INDEPENDENT_DRAWS) -> ParameterDraws:
+    """Draw from the fields' Gaussians, with t tails for the estimated noise scale.
+
+    Where several fields share the evidence one Gaussian was up to 25 % too narrow; a Gaussian for each is within a
+    few per cent.
+    """
+    number = rng.multinomial(draws, fit.mixture.weight)
+    widen = (fit.dof + len(fit.mode)) / fit.dof
+    parts = [
+        student_draws(mean, widen * covariance, dof=fit.dof, number=int(n), rng=rng)
+        for mean, covariance, n in zip(fit.mixture.mean, fit.mixture.covariance, number, strict=True)
+    ]
+    flat = rng.permutation(np.concatenate(parts))
+    return ParameterDraws(flat[None], "laplace", {"draws": float(draws), "fields": float(len(number))})
+
+
+def shape_draws(fit: FieldFit, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """sigma_x_mm, sigma_y_mm and angle_rad of (..., p) draws."""
+    return principal_widths(*fit.scene.widths(theta))
+
+
+def modal_widths(fit: FieldFit) -> tuple[float, float]:
+    """sigma_x_mm and sigma_y_mm at the mode."""
+    sigma_x, sigma_y, _ = shape_draws(fit, fit.mode[None])
+    return float(sigma_x[0]), float(sigma_y[0])
+
+
+# --- Derivatives of a window's cells by all free parameters of a fitted scene.
+
+_STEP = 1e-4
+
+
+def tangent_columns(fit: FieldFit) -> FloatArray:
+    """(v, n) the unit bump, its derivatives by its own parameters first, then level and tilt."""
+    window, scene, mode = fit.target.window, fit.scene, fit.mode
+    p = len(scene.alone().names)
+    steps = _STEP * np.eye(p, len(mode))
+    bump = scene.templates(np.concatenate([mode[None], mode + steps, mode - steps]), window)[0]
+    values = window.of_cells(bump.full())
+    slopes = (values[1 : p + 1] - values[p + 1 :]) / (2 * _STEP)
+    return np.concatenate([values[:1], slopes, linear_columns(window.cells, tilt=scene.tilt)])

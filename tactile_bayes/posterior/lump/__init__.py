@@ -1,1 +1,0 @@
-"""The Gaussian bump and the cells that it is fitted to, for every noise model."""

@@ -1,0 +1,389 @@
+r"""Marginal posterior of a scene's centre and shape, with amplitudes, level, tilt and noise integrated out.
+
+For one noise field h (length and share) the map is linear in level, tilt and amplitudes given the places and widths.
+With flat priors on level and tilt, a normal one of variance s^2 on each of v amplitudes and the Jeffreys prior on the
+noise scale,
+
+.. math::
+    p(y \mid \theta, h) \propto |C_h|^{-1/2}\, |X^T C_h^{-1} X|^{-1/2}\, |P|^{-1/2}\,
+        \Gamma(\nu/2)\,(\pi S)^{-\nu/2}\; N(\hat a;\, 0,\, s^2 + P^{-1} S / \nu), \qquad \nu = n - c - v,
+
+X the c columns of level and tilt, P the amplitudes' precision and S the generalised least-squares sum of squares. Only
+the last factor is approximate: the prior is taken at the mean noise scale. Fields are mixed with their evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from copy import copy
+
+import numpy as np
+
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
+from tactile_bayes.posterior.field import LENGTHS_MM, SHARES, Profiles, Projected, Whitening, no_field
+from tactile_bayes.posterior.fit_window import FitCells
+from tactile_bayes.posterior.linear import LEAST_BUMPS, FieldColumns, Inner, LinearSolution, Spanned, joined, solve
+from tactile_bayes.posterior.scene import Problem, Scene
+
+BLOCK = 128
+"""Shapes solved at a time: fewer spend their time on calls, more leave the processor's cache."""
+NEGLIGIBLE = 1e-3
+"""Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
+Once a length has as little, and less than the one before it, shorter ones are not looked at."""
+SPANNED = 2048
+"""As many share a basis where they can, see `posterior.spanned`."""
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+WithEvidence = tuple[FloatArray, LinearSolution]
+"""Log of the fields' prior times the evidence (m, h), and what is linear."""
+
+
+class CollapsedTarget:
+    """Log density of a scene's shape parameters (see `Scene`) for one window, mixed over noise fields.
+
+    Parameters
+    ----------
+    problem
+        The window, the priors and the bounds.
+    scene
+        What is in the window.
+    """
+
+    def __init__(self, problem: Problem, scene: Scene) -> None:
+        self.problem, self.scene = problem, scene
+        self.window = window = problem.window
+        self.amplitude_sd = problem.prior.amplitude_sd * problem.amplitude_scale
+        # without its mean, a large level does not cost the digits that the bump is in
+        self._mean = float(np.mean(window.cells.value))
+        centred = window.cells.value - self._mean
+        fixed = [linear_columns(window.cells, tilt=scene.tilt)]
+        fixed += [] if problem.departure is None else [problem.departure]
+        self._plain = np.concatenate([*fixed, centred[None]])
+        scaled = self._plain / window.variance
+        self._weighted_plain = window.on_grid(scaled)
+        self._plain_gram = self._plain @ scaled.T
+        self._plain_low = window.project(Profiles(grid=window.on_grid(self._plain)), self._weighted_plain).low
+        self._lengths: dict[float, FieldColumns] = {}
+        self._fields: list[FieldColumns] | None = None
+        self._made_up = 0.0
+        self.dof = self._count_dof()
+
+    def of_scene(self, scene: Scene) -> CollapsedTarget:
+        """Copy for another scene in the same window with the same priors; its fields are not settled."""
+        if scene.tilt == self.scene.tilt:
+            other = copy(self)
+            other.scene, other._fields, other._made_up = scene, None, 0.0
+            other.dof = other._count_dof()
+            return other
+        return CollapsedTarget(self.problem, scene)
+
+    @property
+    def dimension(self) -> int:
+        """Number of shape parameters."""
+        return len(self.scene.names)
+
+    @property
+    def rotated(self) -> bool:
+        """Whether the ellipse may be rotated."""
+        return self.scene.shape == "rotated"
+
+    @property
+    def structures(self) -> int:
+        """Number of amplitudes: the bump's, and that of a second structure."""
+        return 2 if self.scene.extra else 1
+
+    def _count_dof(self) -> int:
+        """Degrees of freedom of the noise scale."""
+        return max(len(self.window.cells) - len(self._plain) + 1 - self.structures, 1)
+
+    @property
+    def fields(self) -> list[FieldColumns]:
+        """Noise fields of the mixture by length, each with its shares; all of them until settled."""
+        if self._fields is None:
+            self._fields = list(self._from_the_longest())
+        return self._fields
+
+    def __call__(self, theta: FloatArray) -> FloatArray:
+        """(m,) log density of (m, dimension) shape vectors, normalised up to a constant of the data."""
+        return self._mixed(theta, self.by_field(theta))
+
+    def solved_density(self, theta: FloatArray, solved: Solved) -> FloatArray:
+        """As the density, storing in `solved` what `draw_linear` needs at these points."""
+        solution = self.conditional(theta)
+        solved.add(theta, solution)
+        return self._mixed(theta, solution[0] + self._made_up)
+
+    def _mixed(self, theta: FloatArray, by_field: FloatArray) -> FloatArray:
+        total = np.logaddexp.reduce(by_field, axis=1) + self.log_prior(theta)
+        return np.where(np.isfinite(total), total, -np.inf)
+
+    def by_field(self, theta: FloatArray) -> FloatArray:
+        """(m, fields) log of each field's prior times its evidence, without the shape's prior."""
+        parts = [np.concatenate([one for one, _ in part], axis=1) for part in self._parts(theta)]
+        return np.concatenate(parts) + self._made_up
+
+    def log_prior(self, theta: FloatArray) -> FloatArray:
+        """(m,) log prior of the shape; -inf outside the window and where the bump is wider than it."""
+        return self.scene.log_prior(theta, self.problem)
+
+    def settle_fields(self, theta: FloatArray) -> bool:
+        """Keep only the noise fields with evidence at one shape; the others cost time and add nothing.
+
+        Returns
+        -------
+        bool
+            Whether the set changed.
+        """
+        before = self.chosen_fields()
+        projected, cross = self._project(self.scene.templates(theta[None], self.window))
+        found = self._walk(lambda columns: self._under(projected, cross, columns)[0][0])
+        evidence = np.concatenate([one for _, one in found])
+        if not np.isfinite(evidence.max()):
+            self._fields, self._made_up = None, 0.0
+            return before != self.chosen_fields()
+        total = float(np.logaddexp.reduce(evidence))
+        kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in found]
+        self._fields = [
+            self._columns(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
+            for columns, keep in kept
+            if keep.any()
+        ]
+        left = np.concatenate([self._under(projected, cross, columns)[0][0] for columns in self._fields])
+        self._made_up = total - float(np.logaddexp.reduce(left))
+        return before != self.chosen_fields()
+
+    def settle_lengths(self) -> None:
+        """Keep only the lengths with evidence where there is no structure, each with all its shares."""
+        dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
+        found = self._walk(lambda columns: columns.null_evidence(dof=dof))
+        total = float(np.logaddexp.reduce(np.concatenate([one for _, one in found])))
+        self._fields = [columns for columns, one in found if one.max() > total + np.log(NEGLIGIBLE)]
+        self._made_up = 0.0
+
+    def chosen_fields(self) -> list[tuple[float, tuple[float, ...]]]:
+        """Correlation lengths in the mixture, each with its shares."""
+        return [(columns.field.length_mm, tuple(columns.shares)) for columns in self._fields or ()]
+
+    def null_log_evidence(self) -> float:
+        """Log evidence of level and tilt alone under all fields, on the scale of the log density."""
+        dof = max(len(self.window.cells) - len(self._plain) + 1, 1)
+        found = self._walk(lambda columns: columns.null_evidence(dof=dof))
+        return float(np.logaddexp.reduce(np.concatenate([one for _, one in found])))
+
+    def _walk(self, evidence: Callable[[FieldColumns], FloatArray]) -> list[tuple[FieldColumns, FloatArray]]:
+        """Evidence without a field, then from the longest length down, until it has vanished."""
+        found: list[tuple[FieldColumns, FloatArray]] = []
+        best = before = -np.inf
+        for columns in self._from_the_longest():
+            one = evidence(columns)
+            found.append((columns, one))
+            if one.max() < min(before, best + np.log(NEGLIGIBLE)):
+                break
+            best = max(best, float(one.max()))
+            before = float(one.max()) if columns.shares[0] > 0 else -np.inf
+        return found
+
+    def _from_the_longest(self) -> Iterator[FieldColumns]:
+        """No field, then each length with all shares, computed when reached."""
+        shares = np.array(SHARES)
+        for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
+            chosen = shares[(shares > 0) == (length > 0)]
+            if not len(chosen):
+                continue
+            if length not in self._lengths:
+                field = self.window.field(length) if length else no_field(self.window.cosines)
+                self._lengths[length] = self._columns(field, chosen)
+            yield self._lengths[length]
+
+    def field_summary(self, theta: FloatArray) -> dict[str, float]:
+        """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
+        weight = self.field_weights(theta)
+        length = np.concatenate([np.full(len(one.shares), one.field.length_mm) for one in self.fields])
+        share = np.concatenate([one.shares for one in self.fields])
+        return {"field_length_mm": float(weight @ length), "field_share": float(weight @ (share / (1.0 + share)))}
+
+    def conditional(self, theta: FloatArray) -> Solution:
+        """Linear solutions at (m, p) vectors under each of h fields.
+
+        Returns
+        -------
+        evidence, amplitude, power, slope, squares
+            Log of prior times evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power
+            (m, h, v, v), by how much the level falls with each (m, h, v), and the sum of squares (m, h).
+        """
+        parts = []
+        for part in self._parts(theta):
+            evidence, one = _side_by_side(part)
+            parts.append((evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares))
+        return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
+
+    def draw_linear(
+        self, theta: FloatArray, rng: np.random.Generator, *, solved: Solved | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape: exact, field first.
+
+        Points that `solved` knows are not solved again.
+        """
+        unique, back = distinct_rows(theta)
+        evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
+        at_zero, level_variance = self._levels()
+        h = choose(evidence[back], rng)
+        tau2 = squares[back, h] / rng.chisquare(self.dof, size=len(theta))
+        amplitude = self._draw_amplitudes(centre[back, h], power[back, h], tau2, rng)
+        about = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(theta))
+        level = at_zero[h] - np.sum(slope[back, h] * amplitude, axis=1) + about
+        return amplitude, level, np.sqrt(tau2 * self.window.variance.mean())
+
+    def _levels(self) -> tuple[FloatArray, FloatArray]:
+        """(h,) levels at amplitudes of 0 under each field, and their variances over tau^2."""
+        c = len(self._plain) - 1
+        level = [np.einsum("hd,hd->h", one.inverse[:, 0], one.gram[:, :c, c]) for one in self.fields]
+        return self._mean + np.concatenate(level), np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
+
+    def _draw_amplitudes(
+        self, centre: FloatArray, power: FloatArray, tau2: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """(m, v) draws given the noise scale: the normal under a flat prior times the amplitudes' prior."""
+        data = power / tau2[:, None, None]
+        normal = rng.standard_normal((*centre.shape, 1))
+        if self.structures == 1:
+            precision = data[:, 0] + 1.0 / self.amplitude_sd**2
+            return np.asarray(data[:, 0] * centre / precision + normal[:, 0] / np.sqrt(precision))
+        covariance = np.linalg.inv(data + np.eye(self.structures) / self.amplitude_sd**2)
+        mean = (covariance @ (data @ centre[..., None]))[..., 0]
+        return np.asarray(mean + (np.linalg.cholesky(covariance) @ normal)[..., 0])
+
+    def tilt_log_odds(self, theta: FloatArray) -> float:
+        """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
+        evidence, solution = self._solve(theta[None])
+        weight = evidence[0] - np.logaddexp.reduce(evidence[0])
+        slope = solution.level_slope[0][:, :, 1:3]
+        mean = solution.level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
+        spread = np.einsum("hvc,hvw,hwd->hcd", slope, np.linalg.inv(solution.power[0]), slope)
+        tau2 = solution.sum_of_squares[0] / self.dof
+        covariance = tau2[:, None, None] * (solution.level_covariance[:, 1:3, 1:3] + spread)
+        square = np.einsum("hc,hcd,hd->h", mean, np.linalg.inv(covariance), mean)
+        at_zero = -0.5 * (square + np.linalg.slogdet(covariance)[1]) - np.log(2.0 * np.pi)
+        prior = -np.log(2.0 * np.pi * (self.problem.prior.tilt_sd * self.problem.amplitude_scale) ** 2)
+        return float(prior - np.logaddexp.reduce(weight + at_zero))
+
+    def amplitude_at(self, theta: FloatArray) -> float:
+        """Posterior mean of the bump's amplitude at one shape."""
+        evidence, solution = self._solve(theta[None])
+        weight = np.exp(evidence[0] - np.logaddexp.reduce(evidence[0]))
+        return float(weight @ solution.amplitude[0, :, 0])
+
+    def products(self, one: FloatArray, other: FloatArray, theta: FloatArray) -> FloatArray:
+        """(v, w) inner products of (v, n) and (w, n) cell values under the noise field likeliest at one shape."""
+        return np.asarray(self.products_by_field(one, other)[int(np.argmax(self.by_field(theta[None])[0]))])
+
+    def products_by_field(self, one: FloatArray, other: FloatArray) -> FloatArray:
+        """(h, v, w) inner products of (v, n) and (w, n) cell values under each noise field."""
+        low = [
+            self.window.project(Profiles(grid=self.window.on_grid(vectors)), self._weighted_plain).low
+            for vectors in (one, other)
+        ]
+        independent, found = (one / self.window.variance) @ other.T, []
+        for columns in self.fields:
+            first, second = (vectors @ columns.field.turn for vectors in low)
+            found += [independent - (first * weight) @ second.T for weight in columns.weight.T]
+        return np.stack(found)
+
+    def field_weights(self, theta: FloatArray) -> FloatArray:
+        """(h,) posterior probability of each noise field at one shape."""
+        evidence = self.by_field(theta[None])[0]
+        return np.asarray(np.exp(evidence - np.logaddexp.reduce(evidence)))
+
+    def gains(self, templates: Profiles, theta: FloatArray) -> FloatArray:
+        """(m,) log evidence gained at `theta` by adding each template; -inf for a dent.
+
+        Fields are those settled; the scene has one structure.
+        """
+        (bump,) = self.scene.templates(theta[None], self.window)
+        (alone,), _ = self._project([bump])
+        (beside,), _ = self._project([templates])
+        product = self.window.product(bump, templates)
+        base, with_it = [], []
+        for columns in self.fields:
+            one, other = Inner.of(alone, columns), Inner.of(beside, columns)
+            base.append(self._found([one], None, columns)[0][0])
+            cross = one.product(other, product, columns)
+            both = [one.repeated(len(product)), other]
+            with_it.append(solve(both, cross, columns, dof=self.dof - 1, amplitude_sd=self.amplitude_sd)[0])
+        gained = np.logaddexp.reduce(np.concatenate(with_it, axis=1), axis=1)
+        return np.asarray(gained - np.logaddexp.reduce(np.concatenate(base)))
+
+    def _columns(self, field: Whitening, shares: FloatArray) -> FieldColumns:
+        """Level, tilt and data under the fields of one length; without a field, all lengths are one."""
+        log_prior = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
+        if not shares.any():
+            log_prior += float(np.log(len(LENGTHS_MM)))
+        return FieldColumns.of(
+            field, shares, log_prior=log_prior, plain_low=self._plain_low, plain_gram=self._plain_gram
+        )
+
+    def _project(self, templates: list[Profiles]) -> tuple[list[Projected], FloatArray | None]:
+        projected = [self.window.project(one, self._weighted_plain) for one in templates]
+        return projected, self.window.product(*templates) if len(templates) == 2 else None
+
+    def _parts(self, theta: FloatArray) -> Iterator[list[WithEvidence]]:
+        """Blocks of (m, p) vectors, each solved under every length; large where they share a basis."""
+        size = SPANNED if self.scene.separable else BLOCK
+        for i in range(0, len(theta), size):
+            points = theta[i : i + size]
+            spanned = self._spanned(points)
+            if spanned is not None:
+                yield [self._found([spanned.inner(columns)], None, columns) for columns in self.fields]
+                continue
+            for j in range(0, len(points), BLOCK):
+                projected, cross = self._project(self.scene.templates(points[j : j + BLOCK], self.window))
+                yield [self._under(projected, cross, columns) for columns in self.fields]
+
+    def _spanned(self, theta: FloatArray) -> Spanned | None:
+        """Basis shared by the points' bumps; None where there is none, or where it does not save time."""
+        if not self.scene.separable or len(theta) < LEAST_BUMPS:
+            return None
+        (bumps,) = self.scene.templates(theta, self.window)
+        return Spanned.of(bumps, self.window, self._weighted_plain)
+
+    def _under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> WithEvidence:
+        inner = [Inner.of(one, columns) for one in projected]
+        return self._found(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
+
+    def _found(self, inner: list[Inner], cross: FloatArray | None, columns: FieldColumns) -> WithEvidence:
+        return solve(inner, cross, columns, dof=self.dof, amplitude_sd=self.amplitude_sd)
+
+    def _solve(self, theta: FloatArray) -> WithEvidence:
+        """Evidence and solutions under all fields at a few vectors."""
+        projected, cross = self._project(self.scene.templates(theta, self.window))
+        return _side_by_side([self._under(projected, cross, columns) for columns in self.fields])
+
+
+def _side_by_side(found: list[WithEvidence]) -> WithEvidence:
+    """Concatenate fields of all lengths."""
+    return np.concatenate([one for one, _ in found], axis=1), joined([solution for _, solution in found])
+
+
+def independent_variance(cells: FitCells) -> FloatArray:
+    """(n,) independent variance of the cells, mean 1: reading variance over count where readings were counted."""
+    variance = 1.0 / cells.count if cells.reading_variance > 0 else np.ones(len(cells))
+    return np.asarray(variance / variance.mean())
+
+
+def linear_columns(cells: FitCells, *, tilt: bool) -> FloatArray:
+    """(c, n) columns of level and tilt across the window, in units of its half width."""
+    ones = np.ones((1, len(cells)))
+    if not tilt:
+        return ones
+    x, y = cells.x_mm - cells.x_mm.mean(), cells.y_mm - cells.y_mm.mean()
+    size = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
+    return np.concatenate([ones, np.stack([x, y]) / size])
+
+
+def choose(evidence: FloatArray, rng: np.random.Generator) -> IntArray:
+    """(m,) random field for each draw by its share of the evidence; the first where a draw has none."""
+    best = evidence.max(axis=1, keepdims=True)
+    weight = np.exp(evidence - np.where(np.isfinite(best), best, 0.0))
+    edges = np.cumsum(weight, axis=1)
+    uniform = rng.uniform(size=len(evidence)) * edges[:, -1]
+    return np.asarray((edges < uniform[:, None]).sum(axis=1))

@@ -1,1 +1,0 @@
-"""Posterior of a bump under independent errors."""

@@ -1,0 +1,235 @@
+"""Calibrations in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from tactile_bayes.presets import HELD, INTERVAL, RESEARCH_USE
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.pooling import Calibration
+from tactile_bayes.size.spread import PAPER_SPREAD
+from tactile_bayes.size.terms import SiteShift
+
+# --- A site's correction of a size calibration as text for people.
+
+
+def site_words(site: SiteShift, log_width: float | None = None) -> str:
+    """Which calibration was corrected, by how many phantoms and by how much.
+
+    Parameters
+    ----------
+    log_width
+        ln of the mean width in mm of the map in question; that of the phantoms where left out.
+    """
+    p = site.phantoms_log_width if log_width is None else log_width
+    middle, low, high = site.percent(p)
+    by = f"{site.phantoms} phantoms of this site"
+    return f"{site.base}, corrected by {by}: {round(middle):+d} % ({100 * INTERVAL:g} %: {round(low)} to {round(high)})"
+
+
+def site_calibration_text(calibration: BodyCalibration) -> str:
+    """The correction: shift, slope, what it leaves, and what is odd about it."""
+    site = calibration.site
+    if site is None:
+        raise ValueError("the calibration has no correction")
+    (shift, slope), fit = site.mean, site.fit
+    shift_sd, slope_sd = (float(site.covariance[i, i]) ** 0.5 for i in range(2))
+    lines = [f"CAUTION: {text}" for text in site.cautions] + [
+        f"{site_words(site)}, for maps as wide as theirs",
+        f"added to ln d: {shift:+.3f} +- {shift_sd:.3f}, and {slope:+.3f} +- {slope_sd:.3f} times "
+        f"(ln sigma {-site.centre:+.3f}), posterior mean +- SD",
+    ]
+    if fit:
+        lines.append(
+            f"ln d of the phantoms about the calibration, root mean square: {fit['sd_before']:.3f}, "
+            f"corrected {fit['sd_after']:.3f}; their spread is {fit['spread_factor']:.1f} times the expected one"
+        )
+    maps = "" if site.maps == site.phantoms else f" ({site.maps} maps)"
+    lines.append(f"{site.phantoms} phantoms{maps}; the depth of fat is {'' if site.uses_fat else 'not '}used")
+    lines += [f"left out: {text}" for text in site.left_out]
+    lines.append(f"recipe: {calibration.recipe}")
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+# --- A site's repeatability as text for people.
+
+_MOST_NAMED: Final = 5
+FEW: Final = 5
+"""Masses below which the report says that they are few."""
+
+
+def repeatability_text(document: Mapping[str, Any]) -> str:
+    """Report of what repeated exams say of a site, see data_schema/repeatability.schema.json."""
+    calibration = document["calibration"]
+    median, low, high = (100 * document[name] for name in ("median", "low", "high"))
+    lines = [
+        *_cautions(document),
+        f"Exams of one mass differ by {median:.1f} % at this site (95 %: {low:.1f} to {high:.1f}): SD of ln d beyond "
+        "the errors that each map has anyway.",
+        f"Learned from {document['masses']} masses and {document['maps']} exams, sized by {calibration['name']} "
+        f"(frames normalised by {calibration['normalise']}). Maps of one mass in the paper differed by "
+        f"{100 * PAPER_SPREAD:.0f} %.",
+        *_half_width(document),
+        *_names("Took no part", document["left_out"]),
+        "Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json",
+    ]
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _cautions(document: Mapping[str, Any]) -> list[str]:
+    """What to look at before the figure: masses that lie apart, and few masses."""
+    apart = [
+        f"{one['name']} (probability by chance {_chance(one['by_chance'])})"
+        for one in document["repeats"]
+        if one["name"] in document["outlying"]
+    ]
+    lead = "CAUTION: exams lie further apart than the other masses lead one to expect; look at the maps of"
+    lines = _names(lead, apart)
+    if document["masses"] < FEW:
+        lines.append(f"CAUTION: {document['masses']} masses are few; the interval of the spread is wide.")
+    return lines
+
+
+def _chance(probability: float) -> str:
+    return "below 0.0001" if probability < 1e-4 else f"{probability:.2g}"
+
+
+def _half_width(document: Mapping[str, Any]) -> list[str]:
+    found = document.get("half_width")
+    if found is None:
+        return []
+    before, after = 100 * found["as_estimated"], 100 * found["with_it"]
+    return [f"The 95 % interval of one exam: about +-{after:.0f} % of the size with it, +-{before:.0f} % as estimated."]
+
+
+def _names(lead: str, texts: Sequence[str]) -> list[str]:
+    if not texts:
+        return []
+    more = f" and {len(texts) - _MOST_NAMED} more" if len(texts) > _MOST_NAMED else ""
+    return [f"{lead}: {'; '.join(texts[:_MOST_NAMED])}{more}."]
+
+
+# --- A size calibration learned over a population of bodies as text for people.
+
+UNKNOWN_NAMES = {
+    "depth_mm": "depth",
+    "stiffness_ratio": "the lump's stiffness",
+    "seat": "seat",
+    "fat_kpa": "modulus of fat",
+    "gland_ratio": "modulus of gland",
+    "thickness_mm": "thickness of the tissue",
+}
+
+BODY_NAMES = {
+    "d_mm": "d (mm)",
+    "depth_ratio": "h/d",
+    "stiffness_ratio": "E2/E1",
+    "seat": "seat",
+    "fat_kpa": "fat (kPa)",
+    "gland_ratio": "gland over fat",
+    "thickness_mm": "thickness (mm)",
+}
+
+
+def body_calibration_text(calibration: BodyCalibration) -> str:
+    """Constants, spreads, what the unknowns cost, and the errors on masses left out."""
+    fit = calibration.fit
+    lines = [
+        *_eq6_lines(calibration),
+        f"between bodies, SD of ln d {fit.get('body_sd', float('nan')):.3f} (median; it changes with amplitude, width "
+        f"and depth), between exams of a body {fit.get('exam_sd', float('nan')):.3f}",
+        *_other_lines(calibration),
+        unknowns_text(calibration.unknowns),
+        f"{fit.get('bodies', 0):.0f} bodies, {fit.get('maps', 0):.0f} maps; {_left_out_text(fit)}",
+    ]
+    for name, unit in (("amplitude", ""), ("sigma_mm", " mm"), ("d_mm", " mm")):
+        low, high = calibration.domain[name]
+        lines.append(f"range of {name.removesuffix('_mm')}: {low:.3g} to {high:.3g}{unit}")
+    lines += _bodies_lines(calibration.bodies)
+    lines.append(f"recipe: {calibration.recipe}")
+    lines.append(f"for maps made with {calibration.recipe.map_command}")
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
+
+
+def _bodies_lines(bodies: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Ranges of the bodies in one line; none where nobody named them."""
+    parts = [f"{BODY_NAMES.get(name, name)} {low:.3g} to {high:.3g}" for name, (low, high) in bodies.items()]
+    return [f"bodies: {', '.join(parts)}"] if parts else []
+
+
+def _eq6_lines(calibration: BodyCalibration) -> list[str]:
+    """The constants of Eq 6, by the depth of the fat where maps tell it, and its residual."""
+    alpha, p = calibration.centre.log_amplitude, calibration.centre.log_width
+    sigma = f"sigma the geometric mean width, here {np.exp(p):.2g} mm"
+    if calibration.depth is None:
+        sd = np.sqrt(np.diag(calibration.eq6.covariance))
+        return [
+            f"Eq 6: d = m sigma / (e a^f) + b, {sigma}: {constants_text(calibration.constants())}",
+            f"posterior SD: m/e {100 * sd[0]:.1f} %, f {sd[1]:.3f}, b {sd[2]:.2f} mm; u = ln a {-alpha:+.3f}",
+        ]
+    low, high = calibration.depth.fat_mm
+    depths = [one for one in (6.0, 12.0, 24.0) if low <= one <= high]
+    lines = [f"Eq 6: d = m sigma / (e a^f) + b, {sigma}; m, e and f change with the depth of the fat and with sigma"]
+    lines += [f"  fat {one:.3g} mm: {constants_text(calibration.constants(fat_mm=one))}" for one in depths]
+    lines.append(f"the pressure over the head tells the depth of the fat to {100 * calibration.depth.log_sd:.1f} %")
+    if calibration.residual is not None:
+        count = len(calibration.residual.points)
+        lines.append(f"what Eq 6 leaves: a Gaussian process in ln a, ln sigma and ln of the depth, of {count} points")
+    return lines
+
+
+def _other_lines(calibration: BodyCalibration) -> list[str]:
+    """By how much bodies of another origin depart; none where nothing told it."""
+    fit, source = calibration.fit, calibration.spread.other_source
+    if not source:
+        return []
+    return [
+        f"bodies of another origin: SD of ln d {calibration.other_sd:.3f} more (below {fit['other_sd_most']:.3f} with "
+        f"95 % probability), by {source}: mean absolute error {fit['other_mae_percent']:.1f} %, bias "
+        f"{fit['other_bias_percent']:+.1f} %, SD of standardised errors {fit['other_standard_sd']:.2f}"
+    ]
+
+
+def constants_text(constants: Mapping[str, float]) -> str:
+    """m, b, e and f in words."""
+    return "m {m:.2f}, b {b_mm:+.2f} mm, e {e:.3f}, f {f:.3f}".format(**constants)
+
+
+def _left_out_text(fit: Mapping[str, float]) -> str:
+    held = ""
+    if "left_out_held_percent" in fit:
+        held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD:g} % interval"
+    return (
+        "cross-validated by body: "
+        f"mean absolute error {fit.get('left_out_mae_percent', float('nan')):.1f} %, "
+        f"bias {fit.get('left_out_bias_percent', float('nan')):+.1f} %{held}"
+    )
+
+
+def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) -> str:
+    """Which calibration gave the size of a map with this mean width, and what it cannot know."""
+    line = f"Sizes by the {name}"
+    if isinstance(calibration, BodyCalibration):
+        head = "" if calibration.recipe.head is None else f"; for a head of {calibration.recipe.head}"
+        line += f" ({calibration.source}{head}); "
+        beside = "" if calibration.residual is None else " and its residual"
+        line += f"Eq 6 for this map: {constants_text(calibration.constants(sigma_mm))}{beside}; "
+        line += f"{fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
+    return line
+
+
+def fat_text(fat_mm: float | None) -> str:
+    """What the frames told for the sizes, as the beginning of `unknowns_text`; empty where nothing of it is used."""
+    if fat_mm is None:
+        return ""
+    return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; "
+
+
+def unknowns_text(unknowns: Mapping[str, float]) -> str:
+    """Share of the variance between bodies that knowing each property would remove, largest first."""
+    ranked = sorted(unknowns.items(), key=lambda pair: -pair[1])
+    parts = [f"{UNKNOWN_NAMES.get(name, name)} {100 * share:.0f} %" for name, share in ranked if share >= 0.005]
+    return "share of the variance between bodies that knowing one property removes: " + (", ".join(parts) or "none")

@@ -1,0 +1,440 @@
+"""A scan head and a forward model, in words and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.posterior.white import BumpFit
+from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
+from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.report.study import finish
+from tactile_bayes.studies.head_design import HomogeneousTissue, Uniformity, most_even, narrowest
+from tactile_bayes.studies.model_comparison import (
+    NEAR_MM,
+    MeasuredFrames,
+    ModelComparison,
+    centre_line,
+    centre_row,
+    line_bump,
+    residual_map,
+    residual_slope,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+
+
+# --- How evenly heads press, as text and as plain data.
+
+
+def named(head: Head) -> str:
+    """A head in a few words."""
+    arc = "flat" if np.isinf(head.radius_mm) else f"R {head.radius_mm:g} mm"
+    return f"{arc}, {head.shoulders} of {head.shoulder_mm:g} mm"
+
+
+def uniformity_text(found: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> str:
+    """One head: a table of moduli and pressures, and whether it meets the limit."""
+    words = "within" if found.worst <= limit else "beyond"
+    return "\n".join(
+        [
+            _tissue_line(tissue),
+            f"head: {named(found.head)}, face {found.face_mm:.1f} mm wide",
+            *_pressure_table(found, tissue),
+            f"largest departure {100 * found.worst:.1f} %, {words} {100 * limit:g} %",
+        ]
+    )
+
+
+def design_text(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> str:
+    """The whole search: a table for each place of the shoulders, and the answer with its own table."""
+    lines = [_tissue_line(tissue), ""]
+    for kind in dict.fromkeys(one.head.shoulders for one in found):
+        lines += [*_grid(kind, [one for one in found if one.head.shoulders == kind], limit=limit), ""]
+    count = sum(one.worst <= limit for one in found)
+    lines.append(f"{count} of {len(found)} heads stay within {100 * limit:g} % of the mean")
+    best, answer = most_even(found), narrowest(found, limit=limit)
+    lines.append(f"most even: {named(best.head)}, {100 * best.worst:.1f} %, face {best.face_mm:.1f} mm wide")
+    if answer is not None:
+        words = f"{100 * answer.worst:.1f} %, face {answer.face_mm:.1f} mm wide"
+        lines += [f"narrowest within the limit: {named(answer.head)}, {words}", *_pressure_table(answer, tissue)]
+    by_rms = narrowest(found, limit=limit, by_rms=True)
+    if by_rms is not None:
+        words = f"{100 * by_rms.worst_rms:.1f} %, face {by_rms.face_mm:.1f} mm wide"
+        lines.append(f"narrowest whose root mean square is within it: {named(by_rms.head)}, {words}")
+    return "\n".join(lines)
+
+
+def uniformity_document(found: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
+    """One head as plain data; departures as shares of the mean."""
+    return {
+        "schema": "tactile-bayes/head-uniformity/1",
+        **_tissue_document(tissue, limit),
+        **_head_document(found),
+        "largest": found.largest.tolist(),
+        "rms": found.rms.tolist(),
+        "within_limit": found.worst <= limit,
+        "research_use": RESEARCH_USE,
+    }
+
+
+def design_document(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
+    """The whole search as plain data; `answer` is None where no head meets the limit."""
+    answer, by_rms = narrowest(found, limit=limit), narrowest(found, limit=limit, by_rms=True)
+    return {
+        "schema": "tactile-bayes/head-design/1",
+        **_tissue_document(tissue, limit),
+        "heads": [_head_document(one) for one in found],
+        "most_even": _head_document(most_even(found)),
+        "answer": None if answer is None else _head_document(answer),
+        "answer_by_rms": None if by_rms is None else _head_document(by_rms),
+        "research_use": RESEARCH_USE,
+    }
+
+
+def _tissue_line(tissue: HomogeneousTissue) -> str:
+    moduli, pressures = tissue.young_kpa, tissue.mean_kpa
+    return (
+        f"homogeneous tissue of {moduli[0]:g} to {moduli[1]:g} kPa, {tissue.thickness_mm:g} mm thick on a rigid base, "
+        f"nu {tissue.poisson:g}; mean pressures of {pressures[0]:g} to {pressures[1]:g} kPa"
+    )
+
+
+def _pressure_table(found: Uniformity, tissue: HomogeneousTissue) -> list[str]:
+    columns = "".join(f"{f'{value:g} kPa':>16}" for value in tissue.pressures_kpa)
+    lines = ["largest departure of a taxel from its frame's mean, % (root mean square)", f"{'modulus':>9}{columns}"]
+    for modulus, largest, rms in zip(tissue.moduli_kpa, found.largest, found.rms, strict=True):
+        cells = "".join(f"{f'{100 * a:.1f} ({100 * b:.1f})':>16}" for a, b in zip(largest, rms, strict=True))
+        lines.append(f"{f'{modulus:g} kPa':>9}{cells}")
+    return lines
+
+
+def _grid(kind: str, found: Sequence[Uniformity], *, limit: float) -> list[str]:
+    """Radii down, shoulders across; a star marks what meets the limit."""
+    where = "cut into the sensing width" if kind == SHOULDERS_INSIDE else "around the sensing width"
+    shoulders = sorted({one.head.shoulder_mm for one in found})
+    cells = {(one.head.radius_mm, one.head.shoulder_mm): one.worst for one in found}
+    lines = [
+        f"{kind} ({where}): largest departure over all moduli and pressures, %; * within {100 * limit:g} %",
+        f"{'R, mm':>8}" + "".join(f"{f'r {value:g}':>8}" for value in shoulders),
+    ]
+    for radius in sorted({one.head.radius_mm for one in found}):
+        name = "flat" if np.isinf(radius) else f"{radius:g}"
+        row = [_marked(cells.get((radius, shoulder)), limit) for shoulder in shoulders]
+        lines.append(f"{name:>8}" + "".join(f"{cell:>8}" for cell in row))
+    return lines
+
+
+def _marked(value: float | None, limit: float) -> str:
+    if value is None:
+        return "-"
+    return f"{100 * value:.1f}{'*' if value <= limit else ' '}"
+
+
+def _tissue_document(tissue: HomogeneousTissue, limit: float) -> dict[str, object]:
+    return {
+        "modulus_kpa": tissue.moduli_kpa.tolist(),
+        "mean_kpa": tissue.pressures_kpa.tolist(),
+        "thickness_mm": tissue.thickness_mm,
+        "poisson": tissue.poisson,
+        "limit": limit,
+    }
+
+
+def _head_document(found: Uniformity) -> dict[str, Any]:
+    """JSON has no infinity: a flat head's radius is null."""
+    head = found.head
+    return {
+        "radius_mm": None if np.isinf(head.radius_mm) else head.radius_mm,
+        "shoulder_mm": head.shoulder_mm,
+        "shoulders": head.shoulders,
+        "face_mm": found.face_mm,
+        "worst": found.worst,
+        "worst_rms": found.worst_rms,
+    }
+
+
+# --- The homogeneous-pressure condition as a picture: non-uniformity over radius and shoulder, and the answer's frames.
+
+_HEAD_SIZE_IN = (12.0, 7.4)
+_LEAST, _MOST = 2.0, 200.0  # per cent, ends of the colours
+_MODULUS_COLOURS = ("#1f3b73", "#2a8c6e", "#c8641e")
+
+
+def design_figure(
+    found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float, path: Path, force: bool = False
+) -> None:
+    """Draw the search.
+
+    Parameters
+    ----------
+    found
+        Of `head_design.search_heads`; the place of the shoulders that holds the answer is drawn.
+    limit
+        Largest allowed departure, as a share of the mean.
+
+    Raises
+    ------
+    UsageError
+        When `path` exists and `force` is false.
+    """
+    answer = narrowest(found, limit=limit) or most_even(found)
+    shown = [one for one in found if one.head.shoulders == answer.head.shoulders]
+    with figure_file(path, size_in=_HEAD_SIZE_IN, force=force) as figure:
+        axes = figure.subplots(2, 3)
+        pressures = tissue.pressures_kpa
+        for k, part in enumerate((axes[0, 0], axes[0, 1], axes[0, 2])):
+            worst = {_key(one): float(one.largest[:, k].max()) for one in shown}
+            _draw_grid(part, worst, f"({'abc'[k]}) {pressures[k]:g} kPa, any modulus", limit, answer)
+        worst = {_key(one): one.worst for one in shown}
+        mesh = _draw_grid(axes[1, 0], worst, "(d) any modulus and pressure", limit, answer)
+        figure.colorbar(mesh, ax=axes[0, 2], label="largest departure from the mean, %")
+        _draw_shares(axes[1, 1], answer, tissue, limit, "(e) cross")
+        plain = min(shown, key=lambda one: (abs(one.head.radius_mm - 35.0), abs(one.head.shoulder_mm - 3.0)))
+        _draw_shares(axes[1, 2], plain, tissue, limit, "(f) simulated head")
+        text = (
+            f"Homogeneous tissue of {tissue.young_kpa[0]:g} to {tissue.young_kpa[1]:g} kPa, {tissue.thickness_mm:g} mm "
+            f"thick, {answer.head.shoulders}; black line and grey band: {100 * limit:g} %; "
+            f"cross: {named(answer.head)}.  {RESEARCH_USE}"
+        )
+        figure.text(0.01, 0.01, text, fontsize=8, color="0.3")
+
+
+def _key(one: Uniformity) -> tuple[float, float]:
+    return one.head.radius_mm, one.head.shoulder_mm
+
+
+def _draw_grid(
+    axes: Axes, worst: dict[tuple[float, float], float], title: str, limit: float, answer: Uniformity
+) -> QuadMesh:
+    """Radius across, shoulder up, colours on a logarithmic scale; the heads within the limit are outlined."""
+    from matplotlib.colors import LogNorm
+
+    radii = sorted({key[0] for key in worst})
+    shoulders = sorted({key[1] for key in worst})
+    cells: FloatArray = np.array([[100 * worst.get((r, s), np.nan) for r in radii] for s in shoulders])
+    norm = LogNorm(_LEAST, _MOST)
+    mesh = axes.pcolormesh(np.arange(len(radii)), np.arange(len(shoulders)), cells, cmap="cividis", norm=norm)
+    for i, j in zip(*np.nonzero(cells <= 100 * limit), strict=True):
+        axes.plot([j - 0.5, j + 0.5, j + 0.5, j - 0.5, j - 0.5], [i - 0.5, i - 0.5, i + 0.5, i + 0.5, i - 0.5], "k-")
+    place = radii.index(answer.head.radius_mm), shoulders.index(answer.head.shoulder_mm)
+    axes.plot(*place, "x", color="white", markersize=9, markeredgewidth=2.5)
+    axes.set_xticks(range(len(radii)), ["flat" if np.isinf(r) else f"{r:g}" for r in radii], fontsize=7, rotation=60)
+    axes.set_yticks(range(len(shoulders)), [f"{s:g}" for s in shoulders], fontsize=7)
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_xlabel("radius of the arc (mm)", fontsize=9)
+    axes.set_ylabel("radius of the shoulders (mm)", fontsize=9)
+    return mesh
+
+
+def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: float, title: str) -> None:
+    """Pressure over its mean for each modulus (colour) and each mean pressure (line)."""
+    for colour, modulus, shares in zip(_MODULUS_COLOURS, tissue.moduli_kpa, one.share, strict=True):
+        for line, pressure, share in zip(("-", "--", ":"), tissue.pressures_kpa, shares, strict=True):
+            text = f"{modulus:g} kPa under {pressure:g} kPa"
+            axes.plot(one.s_mm, share, line, color=colour, label=text)
+    axes.axhspan(1 - limit, 1 + limit, color="0.88", zorder=0)
+    axes.set_ylim(0.0, 2.6)
+    arc = "flat" if np.isinf(one.head.radius_mm) else f"R {one.head.radius_mm:g} mm"
+    axes.set_title(f"{title}: {arc}, shoulders {one.head.shoulder_mm:g} mm", loc="left", fontsize=10)
+    axes.set_xlabel("position on the head (mm)", fontsize=9)
+    axes.set_ylabel("pressure / mean of its frame", fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=6.5, frameon=False, ncols=2, loc="upper center")
+
+
+# --- A scan against forward models, as text and as plain data.
+
+DEFINITION = "MSD = sum of squared differences over the sum of squares of the model (docs/decisions/0007)"
+_PRINTED = {"frames_centre": "below 15", "map_centre": "below 2.6"}
+_ROWS = {
+    "frames_all": "frames, all taxels, MSD %",
+    "frames_centre": "frames, centre line, MSD %",
+    "frames_near": "frames within 12 mm of the lump, MSD %",
+    "map_all": f"map within {NEAR_MM:g} mm, MSD %",
+    "map_centre": "map, centre line, MSD %",
+    "map_strict": "map over (map - 1), MSD %",
+}
+
+
+def comparison_text(measured: MeasuredFrames, found: Sequence[ModelComparison]) -> str:
+    """Differences of frames and maps, and the bumps on them, a column for each model."""
+    place = measured.place_mm
+    lines = [
+        DEFINITION,
+        f"{len(measured.level_kpa)} frames, mean pressure {measured.level_kpa.mean():.2f} kPa; "
+        f"lump at {place[0]:.1f}, {place[1]:.1f} mm of the map",
+        f"{'':<42}{'paper':>11}" + "".join(f"{one.fidelity:>20}" for one in found),
+    ]
+    for name, words in _ROWS.items():
+        cells = "".join(f"{100 * getattr(one, name):>20.2f}" for one in found)
+        lines.append(f"{words:<42}{_PRINTED.get(name, ''):>11}{cells}")
+    lines.append(f"{'taxel, root mean square difference, kPa':<42}{'':>11}" + _cells(found, "rms_kpa"))
+    slopes = [residual_slope(measured, one) for one in found]
+    for k, words in enumerate(("map: slope of the residual in x, per 10 mm", "the same in y", "RMS beside the slope")):
+        lines.append(f"{words:<42}{'':>11}" + "".join(f"{slope[k]:>20.4f}" for slope in slopes))
+    heads = "".join(f"{'':>20}" for _ in found)
+    lines += ["", f"{'Eq 7 on the map, level 1':<42}{'measured':>11}{heads}"]
+    for k, words in enumerate(("amplitude", "sigma across the head, mm", "sigma along it, mm")):
+        lines.append(_row(words, _shape(measured.lump)[k], [_shape(one.lump)[k] for one in found]))
+    lines += ["Eq 5 on its centre line across the lump, level 1"]
+    ours = line_bump(measured, measured.tactile_map)
+    theirs = [line_bump(measured, one.tactile_map) for one in found]
+    for k, words in enumerate(("amplitude", "sigma, mm")):
+        lines.append(_row(words, ours[k], [pair[k] for pair in theirs]))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _row(words: str, measured: float, models: Sequence[float]) -> str:
+    cells = "".join(f"{_plain(value):>20}" for value in models)
+    return f"{words:<42}{_plain(measured):>11}{cells}"
+
+
+def _plain(value: float) -> str:
+    """A model without a bump in the map's plane, such as a cylinder, has none to show."""
+    return f"{value:.3f}" if np.isfinite(value) else "none"
+
+
+def comparison_document(
+    measured: MeasuredFrames, found: Sequence[ModelComparison], *, inputs: dict[str, Any]
+) -> dict[str, Any]:
+    """The same as plain data; differences as shares, null where no bump was fitted."""
+    return {
+        "schema": "tactile-bayes/compare-model/1",
+        "definition": DEFINITION,
+        "inputs": inputs,
+        "frames": len(measured.level_kpa),
+        "place_mm": list(measured.place_mm),
+        "measured": {
+            **_shape_document(measured.lump),
+            **_line_document(line_bump(measured, measured.tactile_map)),
+        },
+        "models": [
+            {
+                "fidelity": one.fidelity,
+                **{name: _number(getattr(one, name)) for name in (*_ROWS, "rms_kpa")},
+                **_shape_document(one.lump),
+                **_line_document(line_bump(measured, one.tactile_map)),
+                **_slope_document(residual_slope(measured, one)),
+            }
+            for one in found
+        ],
+        "research_use": RESEARCH_USE,
+    }
+
+
+def _cells(found: Sequence[ModelComparison], name: str) -> str:
+    return "".join(f"{getattr(one, name):>20.3f}" for one in found)
+
+
+def _shape(lump: BumpFit | None) -> tuple[float, float, float]:
+    if lump is None:
+        return (float("nan"),) * 3
+    sigma_x, sigma_y, _ = lump.widths()
+    return float(lump.theta[0]), sigma_x, sigma_y
+
+
+def _shape_document(lump: BumpFit | None) -> dict[str, float | None]:
+    names = ("amplitude", "sigma_x_mm", "sigma_y_mm")
+    return {name: _number(value) for name, value in zip(names, _shape(lump), strict=True)}
+
+
+def _line_document(bump: tuple[float, float]) -> dict[str, float]:
+    return {"line_amplitude": bump[0], "line_sigma_mm": bump[1]}
+
+
+def _slope_document(slope: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip(("slope_x_per_10mm", "slope_y_per_10mm", "rms_beside_slope"), slope, strict=True))
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+# --- A scan against forward models, as Fig 6 of the paper: frames, the map's centre line, both maps and the residual.
+
+_MODEL_SIZE_IN = (12.0, 8.0)
+_MODEL_COLOURS = ("#1f3b73", "#c8641e", "#2a8c6e", "#8a4fa3")
+_LINES = ("-", ":", "--", "-.")
+_PLACES_MM = (0.0, 6.0)
+# Frames this near to a place, and this near to the lump along the head, are averaged.
+_BESIDE_MM = 1.0
+_ALONG_MM = 6.0
+
+
+def comparison_figure(
+    measured: MeasuredFrames, found: Sequence[ModelComparison], path: Path, *, title: str, force: bool = False
+) -> None:
+    """Draw the comparison; maps and residual are those of the first model.
+
+    Raises
+    ------
+    UsageError
+        When `path` exists and `force` is false.
+    """
+    with figure_file(path, size_in=_MODEL_SIZE_IN, force=force) as figure:
+        (frames, line, beside), (seen, model, left) = figure.subplots(2, 3)
+        _draw_frames(frames, measured, found, _PLACES_MM[0], "(a)")
+        _draw_frames(line, measured, found, _PLACES_MM[1], "(b)")
+        _draw_line(beside, measured, found)
+        ours, theirs = measured.tactile_map.mean, found[0].tactile_map.mean
+        ends = np.nanmin(theirs), np.nanmax(theirs)
+        for axes, values, name in ((seen, ours, "(d) measured"), (model, theirs, f"(e) {found[0].fidelity}")):
+            mesh = _draw_map(axes, measured, values, name, ends, "viridis")
+        figure.colorbar(mesh, ax=model, shrink=0.7, label="pressure / mean of its frame")
+        residual = residual_map(measured, found[0])
+        most = float(np.nanmax(np.abs(residual)))
+        mesh = _draw_map(left, measured, residual, "(f) measured less modelled", (-most, most), "RdBu_r")
+        figure.colorbar(mesh, ax=left, shrink=0.7, label="difference")
+        figure.text(0.01, 0.01, f"{title}.  {RESEARCH_USE}", fontsize=8, color="0.3")
+
+
+def _draw_frames(
+    axes: Axes, measured: MeasuredFrames, found: Sequence[ModelComparison], place_mm: float, letter: str
+) -> None:
+    """The centre line of frames whose middle lies at a distance from the lump across it, averaged."""
+    off = measured.origin_mm[:, :2] - measured.place_mm
+    near = (np.abs(off[:, 0] - place_mm) <= _BESIDE_MM) & (np.abs(off[:, 1]) <= _ALONG_MM)
+    pitch = measured.scan.head.pitch_mm
+    count = measured.pressure_kpa.shape[1]
+    s: FloatArray = pitch * (np.arange(count) - 0.5 * (count - 1))
+    if near.any():
+        axes.plot(s, centre_line(measured.pressure_kpa)[near].mean(axis=0), color="0.55", lw=3.5, label="measured")
+        for one, colour, style in zip(found, _MODEL_COLOURS, _LINES, strict=False):
+            axes.plot(s, centre_line(one.pressure_kpa)[near].mean(axis=0), style, color=colour, label=one.fidelity)
+    words = f"head {place_mm:g} mm from the lump, {near.sum()} frames"
+    finish(axes, f"{letter} {words}", "position on the head (mm)", "pressure (kPa)")
+
+
+def _draw_line(axes: Axes, measured: MeasuredFrames, found: Sequence[ModelComparison]) -> None:
+    """The map across the lump."""
+    x, mean = centre_row(measured, measured.tactile_map)
+    near = np.abs(x) <= NEAR_MM
+    axes.plot(x[near], mean[near], "x", color="0.45", markersize=4, label="measured")
+    for one, colour, style in zip(found, _MODEL_COLOURS, _LINES, strict=False):
+        x, mean = centre_row(measured, one.tactile_map)
+        near = np.abs(x) <= NEAR_MM
+        axes.plot(x[near], mean[near], style, color=colour, label=f"{one.fidelity} (MSD {100 * one.map_centre:.2f} %)")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.35 * (high - low))
+    finish(axes, "(c) the map across the lump", "distance from the lump (mm)", "pressure / mean of its frame")
+
+
+def _draw_map(
+    axes: Axes, measured: MeasuredFrames, values: FloatArray, title: str, ends: tuple[float, float], colours: str
+) -> QuadMesh:
+    made = measured.tactile_map
+    mesh = axes.pcolormesh(made.x_mm, made.y_mm, values, cmap=colours, vmin=ends[0], vmax=ends[1], shading="nearest")
+    axes.plot(*measured.place_mm, "+", color="black", markersize=10)
+    axes.set_aspect("equal")
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_xlabel("x of the map (mm)", fontsize=9)
+    axes.set_ylabel("y of the map (mm)", fontsize=9)
+    return mesh

@@ -1,0 +1,431 @@
+"""The forward study in words and figures (paper Figs 5 to 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tactile_bayes.forward.body import THICKNESS_MM, Layers
+from tactile_bayes.forward.line import LineFrames, build_line, fit_empirical, press, press_layers
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import HEAD_PITCH_MM, RESEARCH_USE
+from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
+from tactile_bayes.size.learn.eq6 import SizeTable
+from tactile_bayes.studies.paper import (
+    ALIKE,
+    DETECTABLE,
+    HARD_RATIO,
+    Fit,
+    Lookalikes,
+    StudyRow,
+    StudySettings,
+    find_lookalikes,
+    hard_cases,
+    learn_as_printed,
+    seat_name,
+    stiffness_changes,
+    width_changes,
+)
+from tactile_bayes.studies.paper_tables import (
+    PHANTOMS,
+    Curves,
+    FrameAgreement,
+    Scene,
+    mean_squared_difference,
+    scene_curves,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+# --- A forward study in a few lines.
+
+
+def study_text(rows: Sequence[StudyRow]) -> str:
+    """How many cases show; for each seat Eq 6 in two stages along each axis of the head, and Fig 7b in a line."""
+    shown = sum(row.detectable for row in rows)
+    lines = [f"{len(rows)} cases, {len(rows) - shown} not detectable (amplitude below {DETECTABLE:g}, or not resolved)"]
+    heads = dict.fromkeys(row.head for row in rows if row.head is not None)
+    if heads:
+        lines.append(f"head: {', '.join(heads)}")
+    axes = (
+        {"x": ", across the head", "y": ", along it"} if any(row.sigma_y_mm is not None for row in rows) else {"x": ""}
+    )
+    for seat in dict.fromkeys(row.seat for row in rows):
+        for axis, words in axes.items():
+            learned = learn_as_printed([row for row in rows if row.seat == seat], axis=axis)
+            if learned is not None:
+                lines.append(
+                    f"{seat}, E2/E1 = 100{words}: d = {learned.m:.2f} (sigma / delta) {learned.b_mm:+.2f} mm, "
+                    f"delta = {learned.e:.3f} a^{learned.f:.3f} from {learned.cases} cases "
+                    "(Eq 6 in two stages, as printed)"
+                )
+        changes = stiffness_changes([row for row in rows if row.seat == seat])
+        if changes:
+            cells = ", ".join(f"{100 * change:.1f} % at {d:g} mm" for d, change in changes.items())
+            lines.append(f"{seat}, width at h/d 1 from E2/E1 = 8 on: within {cells}")
+    return "\n".join(lines)
+
+
+# --- Figures 5 to 8 of the paper, drawn from this program's own forward models.
+#
+# On one machine and its libraries equal input gives equal bytes.
+
+# Tell apart in greyscale and by colour-blind eyes.
+COLOURS = ("#1f3b73", "#c8641e", "#2a8c6e", "#8a4fa3", "#7a7a7a", "#b8a100")
+MARKS = ("o", "s", "^", "D", "v", "P")
+FAT_MM = (5.0, 10.0, 15.0, 20.0, 30.0, 50.0)
+_FITTED_FAT_MM = 15.0
+_OTHER = (15.0, 1.0)
+PHANTOM = "phantom 12.5 mm"
+_FRAME_PLACES_MM = (0.0, 6.0, 12.0, 20.0)
+_FOUR_SIZE_IN = (10.0, 7.6)
+_SMALL = (5.0, 1.0)
+RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
+SIZE_IN = (10.0, 4.3)
+
+
+def study_figures(
+    rows: Sequence[StudyRow],
+    settings: StudySettings,
+    paths: Sequence[Path],
+    *,
+    seat: float,
+    fit: Fit,
+    phantom: tuple[float, float] = PHANTOMS[PHANTOM],
+    measured: Sequence[FrameAgreement] = (),
+    force: bool = False,
+) -> Lookalikes | None:
+    """Draw figures 5 to 8, and the frames of four lumps, as PNG files.
+
+    Parameters
+    ----------
+    rows
+        The study's table; figures 7b and 8 show what it holds of this seat.
+    seat
+        Of the lumps in figures 5b to 7a.
+    fit
+        Fits Eq 5 to a map.
+    phantom
+        Diameter in mm and h/d of the lump of figure 6.
+    measured
+        Frames for figure 6a, in place of the places drawn without any.
+    paths
+        Of figures 5, 6, 7 and 8, and of the frames of four lumps.
+
+    Returns
+    -------
+    Lookalikes or None
+        The pair that figure 5b shows.
+
+    Raises
+    ------
+    UsageError
+        When one of them exists and `force` is false.
+    """
+    of_seat = [row for row in rows if row.seat == seat_name(seat)]
+    found = find_lookalikes(settings, seat=seat)
+    figure_5(settings, paths[0], seat=seat, found=found, force=force)
+    figure_6(settings, paths[1], seat=seat, phantom=phantom, measured=measured, force=force)
+    figure_7(of_seat, settings, paths[2], seat=seat, fit=fit, force=force)
+    figure_8(of_seat, paths[3], force=force)
+    four_lumps(settings, paths[4], seat=seat, force=force)
+    return found
+
+
+def lookalikes_text(found: Lookalikes | None) -> str:
+    """Figure 5b's pair in a line, or that there is none."""
+    if found is None:
+        return "figure 5b: no two visible lumps of sizes that differ by half"
+    pair = " and ".join(f"d {one.d_mm:g} mm at h/d {one.depth_ratio:.3g}" for one in (found.small, found.large))
+    share = f"{100 * found.difference:.1f} % of what the lump adds ({100 * found.of_mean:.2f} % of the mean)"
+    if found.difference <= ALIKE:
+        return f"figure 5b: indistinguishable are {pair}: their frames differ by {share}"
+    return f"figure 5b: no pair within {100 * ALIKE:g} %; the most alike frames, {pair}, differ by {share}"
+
+
+def figure_5(
+    settings: StudySettings, path: Path, *, seat: float, found: Lookalikes | None, force: bool = False
+) -> None:
+    """Frames far from the lump on fat of six thicknesses with Eq 1, and frames over lumps, two of which look alike."""
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
+        left, right = figure.subplots(1, 2)
+        for colour, fat in zip(COLOURS, FAT_MM, strict=True):
+            _draw_far(left, settings, fat, colour)
+        cases = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
+        for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), [*cases, _OTHER], strict=False):
+            elastic = _centred(settings, d, h, seat)
+            right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
+        title = (
+            "no two visible lumps" if found is None else f"two differ by {100 * found.difference:.1f} % of their rise"
+        )
+        finish(
+            left, "(a) far from the lump, fat over gland, 70 mm in all", "position on the head (mm)", "pressure (kPa)"
+        )
+        finish(right, f"(b) over the lump: {title}", "position on the head (mm)", "pressure (kPa)", headroom=0.15)
+        figure.text(0.01, 0.01, _caption("Figure 5", settings, seat), fontsize=7.5, color="0.3")
+
+
+def _draw_far(axes: Axes, settings: StudySettings, fat_mm: float, colour: str) -> None:
+    """P1 on one thickness of fat; on one of them, Eq 1 fitted to what the taxels see."""
+    layers = Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
+    frame = press_layers(layers, head=settings.head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
+    axes.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat_mm:g} mm")
+    if fat_mm == _FITTED_FAT_MM:
+        seen, half = frame.as_taxels(HEAD_PITCH_MM), settings.head.half_width_mm
+        model = fit_empirical(seen.s_mm, seen.at(0.0), seen.at(0.0), d_mm=1.0, half_width_mm=half)
+        text = f"Eq 1 fitted to taxels, fat {fat_mm:g} mm"
+        axes.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
+
+
+def _centred(settings: StudySettings, d_mm: float, depth_ratio: float, seat: float) -> LineFrames:
+    """The frame over a hard lump, cell by cell."""
+    surface = settings.surface(settings.body(d_mm, depth_ratio, seat=seat))
+    return press(surface, HARD_RATIO, np.zeros(1), head=settings.head, mean_kpa=settings.mean_kpa)
+
+
+def frames_text(measured: Sequence[FrameAgreement]) -> list[str]:
+    """How far measured frames are from both models, a line for each."""
+    return [
+        f"figure 6: frame at {one.measured.x_c_mm:g} mm, MSD {100 * one.elastic_difference:.2f} % of the elastic "
+        f"model, {100 * one.empirical_difference:.2f} % of the empirical one"
+        for one in measured
+    ]
+
+
+def figure_6(
+    settings: StudySettings,
+    path: Path,
+    *,
+    seat: float,
+    phantom: tuple[float, float] = PHANTOMS[PHANTOM],
+    measured: Sequence[FrameAgreement] = (),
+    force: bool = False,
+) -> None:
+    """Frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
+    d, h = phantom
+    curves = scene_curves(Scene(PHANTOM, d, h, seat), settings)
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
+        left, right = figure.subplots(1, 2)
+        for colour, one in zip(COLOURS, measured, strict=False):
+            s = one.measured.s_mm
+            text = f"measured, head at {one.measured.x_c_mm:g} mm"
+            left.plot(s, one.measured.pressure_kpa, color=colour, lw=3.5, alpha=0.4, label=text)
+            left.plot(s, one.elastic_kpa, color=colour)
+            left.plot(s, one.empirical_kpa, ":", color=colour)
+        for colour, place in zip(COLOURS, () if measured else _FRAME_PLACES_MM, strict=False):
+            left.plot(curves.elastic.s_mm, curves.elastic.at(place), color=colour, label=f"head at {place:g} mm")
+            left.plot(curves.empirical.s_mm, curves.empirical.at(place), ":", color=colour)
+        _draw_maps(right, curves)
+        finish(left, f"(a) frames, d {d:g} mm, h/d {h:g}; dotted: Eq 3", "position on the head (mm)", "pressure (kPa)")
+        finish(right, "(b) maps", "place on the skin (mm)", "pressure / mean of its frame", headroom=0.25)
+        figure.text(0.01, 0.01, _caption("Figure 6", settings, seat), fontsize=7.5, color="0.3")
+
+
+def four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool = False) -> None:
+    """Frame by frame for the phantoms of section 2.3, elastic and empirical: its curves "for four lumps"."""
+    with figure_file(path, size_in=_FOUR_SIZE_IN, force=force) as figure:
+        for axes, (d, h) in zip(figure.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
+            curves = scene_curves(Scene("", d, h, seat), settings)
+            ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
+            share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
+            for colour, place in zip(COLOURS, _FRAME_PLACES_MM, strict=False):
+                axes.plot(theirs.s_mm, theirs.at(place), color=colour, label=f"head at {place:g} mm")
+                axes.plot(ours.s_mm, ours.at(place), ":", color=colour)
+            title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
+            finish(axes, title, "position on the head (mm)", "pressure (kPa)", headroom=0.15)
+        text = _caption("Dotted: Eq 3", settings, seat)
+        figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
+
+
+def figure_7(
+    rows: Sequence[StudyRow], settings: StudySettings, path: Path, *, seat: float, fit: Fit, force: bool = False
+) -> None:
+    """Maps of a small lump of several stiffnesses, and how little the width depends on stiffness."""
+    d, h = _SMALL
+    surface = settings.surface(settings.body(d, h, seat=seat))
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
+        left, right = figure.subplots(1, 2)
+        for colour, ratio in zip(COLOURS, RATIOS, strict=False):
+            line = build_line(settings.frames(surface, ratio))
+            found = fit(line, settings.fit_radius_mm)
+            near = np.abs(line.x_mm) <= 20.0
+            text = f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {found.sigma_mm:.2f} mm"
+            left.plot(line.x_mm[near], line.mean[near], color=colour, label=text)
+        level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
+        hardest = {row.d_mm: row.sigma_x_mm for row in level if row.stiffness_ratio == HARD_RATIO}
+        for i, diameter in enumerate(hardest):
+            points = sorted((r.stiffness_ratio, r.sigma_x_mm / hardest[diameter]) for r in level if r.d_mm == diameter)
+            right.plot(
+                *zip(*points, strict=True), marker=MARKS[i % 6], color=COLOURS[i % 6], label=f"d {diameter:g} mm"
+            )
+        right.axhspan(0.95, 1.05, color="0.9", zorder=0)
+        right.set_xscale("log")
+        finish(
+            left,
+            f"(a) maps, d {d:g} mm, h/d {h:g}",
+            "place on the skin (mm)",
+            "pressure / mean of its frame",
+            headroom=0.4,
+        )
+        finish(right, "(b) width, h/d 1; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
+        figure.text(0.01, 0.01, _caption("Figure 7", settings, seat), fontsize=7.5, color="0.3")
+
+
+def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> None:
+    """Width change against amplitude with its power law, and width against diameter with its line."""
+    hard = hard_cases(rows)
+    learned = learn_as_printed(rows)
+    with figure_file(path, size_in=SIZE_IN, force=force) as figure:
+        left, right = figure.subplots(1, 2)
+        change = width_changes(hard)
+        for i, d in enumerate(dict.fromkeys(row.d_mm for row in hard)):
+            mine = [k for k, row in enumerate(hard) if row.d_mm == d]
+            amplitude = [hard[k].amplitude for k in mine]
+            left.plot(amplitude, change[mine], MARKS[i % 6], color=COLOURS[i % 6], label=f"d {d:g} mm")
+        level = [row for row in hard if abs(row.depth_ratio - 1.0) < 1e-9]
+        right.plot([row.sigma_x_mm for row in level], [row.d_mm for row in level], "o", color=COLOURS[0])
+        if learned is not None:
+            a = np.geomspace(min(row.amplitude for row in hard), max(row.amplitude for row in hard), 100)
+            power = f"{learned.e:.2f} a^{learned.f:.2f}"
+            left.plot(a, learned.e * a**learned.f, "k-", label=power)
+            sigma = np.linspace(0.0, max(row.sigma_x_mm for row in level) * 1.1, 2)
+            line = f"d = {learned.m:.2f} sigma {learned.b_mm:+.2f} mm"
+            right.plot(sigma, learned.m * sigma + learned.b_mm, "k-", label=line)
+        left.set_xscale("log")
+        right.set_ylim(bottom=0)
+        right.set_xlim(left=0)
+        finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
+        finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
+        seat = rows[0].seat if rows else "no cases"
+        text = f"Figure 8: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}.  {RESEARCH_USE}"
+        figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
+
+
+def _draw_maps(axes: Axes, curves: Curves) -> None:
+    """Both maps within 40 mm, and their mean squared difference."""
+    near = np.abs(curves.elastic_map.x_mm) <= 40.0
+    elastic, empirical = curves.elastic_map.mean[near], curves.empirical_map.mean[near]
+    share = 100 * mean_squared_difference(empirical, elastic)
+    axes.plot(curves.elastic_map.x_mm[near], elastic, color=COLOURS[0], label="elastic model")
+    text = f"empirical model (MSD {share:.1f} %)"
+    axes.plot(curves.empirical_map.x_mm[near], empirical, ":", color=COLOURS[1], label=text)
+
+
+def _caption(name: str, settings: StudySettings, seat: float) -> str:
+    head = settings.head
+    return (
+        f"{name}: lumps {seat_name(seat)}, head R {head.radius_mm:g} mm with {head.shoulder_mm:g} mm {head.shoulders}, "
+        f"mean {settings.mean_kpa:g} kPa, nu {settings.poisson:g}, E2/E1 = {HARD_RATIO:g} unless said.  {RESEARCH_USE}"
+    )
+
+
+def finish(axes: Axes, title: str, x_label: str, y_label: str, *, headroom: float = 0.0) -> None:
+    """Title, labels and a legend; `headroom` is space above the curves for it, as a share of their height."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + headroom * (high - low))
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_xlabel(x_label, fontsize=9)
+    axes.set_ylabel(y_label, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=7.5, frameon=False)
+
+
+# --- Fig 8 of the paper for any table of lumps: Eq 6 with the points that it was learned from.
+
+_SIZE_IN = (13.0, 4.6)
+_COLOURS = {"x": "#1f3b73", "y": "#c8641e"}
+_MARKS = {"x": "o", "y": "s"}
+_NAMES = {"x": "across the head", "y": "along it"}
+_BAND = (0.05, 0.95)
+_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
+
+
+def eq6_figure(
+    calibration: SizeCalibration, lumps: SizeTable, path: Path, *, title: str = "", force: bool = False
+) -> None:
+    """Draw width change against amplitude, diameter against corrected width, and the plane of amplitude and width.
+
+    Parameters
+    ----------
+    lumps
+        What the calibration was learned from; rows without a positive amplitude take no part.
+    title
+        Name of the table, for the caption.
+
+    Raises
+    ------
+    UsageError
+        When `path` exists and `force` is false.
+    """
+    rising = lumps.amplitude > 0
+    axes = [("x", calibration.x, lumps.sigma_x_mm, lumps.width_change_x)]
+    if lumps.sigma_y_mm is not None:
+        axes.append(("y", calibration.y, lumps.sigma_y_mm, lumps.width_change_y))
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+        change, line, plane = figure.subplots(1, 3)
+        for name, axis, sigma, ratio in axes:
+            known = None if ratio is None else ratio[rising]
+            _draw_change(change, name, axis, lumps.amplitude[rising], known)
+            _draw_line(line, name, axis, lumps.d_mm[rising], lumps.amplitude[rising], sigma[rising])
+        _draw_plane(plane, calibration.x, lumps.d_mm[rising], lumps.amplitude[rising], lumps.sigma_x_mm[rising])
+        change.set_xscale("log")
+        finish(change, "(a) width change: posterior mean and 90 %", "amplitude a", "width change e a^f")
+        finish(line, "(b) diameter, posterior mean and 90 %", "sigma / (e a^f) (mm)", "diameter d (mm)")
+        line.set_ylim(bottom=0)
+        finish(plane, "(c) lines of equal d, across the head", "amplitude a", "sigma (mm)")
+        text = f"Eq 6 learned from {title or 'the table'}, {int(rising.sum())} lumps.  {RESEARCH_USE}"
+        figure.text(0.01, 0.01, text, fontsize=7.5, color="0.3")
+
+
+def _draw_change(axes: Axes, name: str, axis: AxisCalibration, amplitude: FloatArray, ratio: FloatArray | None) -> None:
+    """The power law, and the ratios of widths where the table has depths to take them from."""
+    a = np.geomspace(amplitude.min(), amplitude.max(), 100)
+    e, f = axis.draws[:, 2:3], axis.draws[:, 3:4]
+    words = f"{e.mean():.2f} a^{f.mean():.2f}, {_NAMES[name]}"
+    low, high = np.quantile(e * a**f, _BAND, axis=0)
+    axes.plot(a, e.mean() * a ** f.mean(), color=_COLOURS[name], label=words)
+    axes.fill_between(a, low, high, color=_COLOURS[name], alpha=0.15, lw=0)
+    if ratio is not None:
+        axes.plot(amplitude, ratio, _MARKS[name], color=_COLOURS[name], markersize=4)
+
+
+def _draw_line(
+    axes: Axes, name: str, axis: AxisCalibration, d_mm: FloatArray, amplitude: FloatArray, sigma: FloatArray
+) -> None:
+    """d on sigma / (e a^f): the points by the posterior mean's e and f, the line with the band of m and b alone."""
+    m, b, e, f = (axis.draws[:, k : k + 1] for k in range(4))
+    corrected = sigma / (e.mean() * amplitude ** f.mean())
+    x = np.linspace(0.0, 1.05 * corrected.max(), 100)
+    # m and e trade against each other: a draw's own width change at the mean amplitude brings it to the same abscissa.
+    middle = np.exp(np.log(amplitude).mean())
+    scale = (e.mean() * middle ** f.mean()) / (e * middle**f)
+    low, high = np.quantile(m * scale * x + b, _BAND, axis=0)
+    mean = np.mean(m * scale * x + b, axis=0)
+    axes.plot(corrected, d_mm, _MARKS[name], color=_COLOURS[name], markersize=4)
+    axes.plot(x, mean, color=_COLOURS[name], label=f"m {m.mean():.2f}, b {b.mean():+.2f} mm, {_NAMES[name]}")
+    axes.fill_between(x, low, high, color=_COLOURS[name], alpha=0.15, lw=0)
+
+
+def _draw_plane(axes: Axes, axis: AxisCalibration, d_mm: FloatArray, amplitude: FloatArray, sigma: FloatArray) -> None:
+    """Where Eq 6 puts each diameter in the plane of amplitude and width; points in the colour of their true d."""
+    from matplotlib import colormaps
+    from matplotlib.colors import Normalize
+
+    norm, colours = Normalize(min(_DIAMETERS_MM), max(_DIAMETERS_MM)), colormaps["viridis"]
+    m, b, e, f = axis.draws.mean(axis=0)[:4]
+    a = np.geomspace(amplitude.min(), amplitude.max(), 100)
+    for d in _DIAMETERS_MM:
+        width = (d - b) / m * e * a**f
+        if (width > 0).any():
+            axes.plot(a, np.where(width > 0, width, np.nan), color=colours(norm(d)), label=f"d {d:g} mm")
+    axes.scatter(amplitude, sigma, c=d_mm, norm=norm, cmap=colours, s=22, edgecolors="black", linewidths=0.4)
+    axes.set_xscale("log")
+    axes.set_ylim(0.0, 1.15 * sigma.max())

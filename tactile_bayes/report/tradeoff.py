@@ -1,0 +1,397 @@
+"""Trade-offs in words, documents and figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tactile_bayes.posterior.lump_probability import LIKELY
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_text import SOURCES
+from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.studies.estimate_tradeoff import Ladder, PooledRow, Priced
+from tactile_bayes.studies.size_answers import SIZE, SizeAnswer
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+# --- One paragraph at the end of a trade-off: which setting is enough, and what would help instead.
+
+
+def advice(ladder: Ladder) -> list[str]:
+    """What to choose, why more buys nothing, and what moves the answer more than any arithmetic."""
+    if ladder.reference.answer is None:
+        return [_without_number(ladder)]
+    lines = [f"Advice: {_enough(ladder)}", *_moving(ladder), *_disagreeing(ladder), *_pooling_advice(ladder)]
+    return list(lines)
+
+
+def _enough(ladder: Ladder) -> str:
+    best, default = ladder.enough(), ladder.default
+    half = f"the interval's half width is {_reference_half(ladder):.1f} mm"
+    if best is None:
+        return (
+            f"no setting has its interval ends within {ladder.tolerance_mm:g} mm of the reference; the default's are "
+            f"{default.off.ends:.2g} mm off, and {half}."
+        )
+    took = f"{best.label}{' (the default)' if best.default else ''}: {best.seconds:.2f} s"
+    text = f"{took}, interval ends within {max(best.off.ends, 0.01):.2g} mm; more buys nothing: {half}"
+    shares = ladder.reference.answer.shares if ladder.reference.answer else {}
+    if not shares:
+        return f"{text}."
+    source, share = max(shares.items(), key=lambda one: one[1])
+    if source == "map":
+        return f"{text}, and {share:.0f} % of its variance is the map's errors: scan more slowly or with more lines."
+    rest = 100.0 - shares.get("map", 0.0)
+    return f"{text}, and {rest:.0f} % of its variance is no error of the map ({share:.0f} % is {SOURCES[source]})."
+
+
+def _reference_half(ladder: Ladder) -> float:
+    return float("nan") if ladder.reference.answer is None else ladder.reference.answer.half_width_mm
+
+
+def _moving(ladder: Ladder) -> Iterator[str]:
+    """The settings whose ends lie further off than the tolerance."""
+    found = [one for one in ladder.rows if one.off.ends > ladder.tolerance_mm]
+    if found:
+        moved = "; ".join(f"{one.label} {one.off.ends:.1f} mm" for one in found)
+        yield f"What moves the ends more than {ladder.tolerance_mm:g} mm: {moved}."
+
+
+def _disagreeing(ladder: Ladder) -> Iterator[str]:
+    """Settings that find nothing on a map that has a size by default."""
+    silent = [one.label for one in ladder.rows if one.answer.reported is None]
+    if silent:
+        yield f"No size by {', '.join(silent)}."
+
+
+def _pooling_advice(ladder: Ladder) -> Iterator[str]:
+    sized = [one for one in ladder.pooled if one.answer.reported is not None]
+    if len(sized) > 1:
+        first, last = sized[0], sized[-1]
+        yield (
+            f"{last.maps} maps pooled instead of {first.maps} change the half width from "
+            f"{first.answer.half_width_mm:.1f} to {last.answer.half_width_mm:.1f} mm for "
+            f"{last.cpu_s - first.cpu_s:.2f} s of CPU{_another(first, last)}."
+        )
+
+
+def _another(first: PooledRow, last: PooledRow) -> str:
+    if not math.isfinite(first.another_half_mm + last.another_half_mm):
+        return ""
+    return f", and from {first.another_half_mm:.1f} to {last.another_half_mm:.1f} mm if exams differ as in the paper"
+
+
+def _without_number(ladder: Ladder) -> str:
+    """Nothing to compare: what the settings say of a lump."""
+    sized = [one for one in ladder.rows if one.answer.reported is not None]
+    chances = [one.answer.probability for one in ladder.rows if one.answer.probability is not None]
+    span = f" (probability of one {_span(min(chances), max(chances))})" if chances else ""
+    if not sized:
+        return f"Advice: no setting gives a size{span}; more accuracy changes no answer, another scan may."
+    some = ", ".join(one.label for one in sized)
+    return (
+        f"Advice: the default gives no size, {len(sized)} of {len(ladder.rows)} settings do ({some}){span}: "
+        "the map is at the limit of what can be sized. Believe none of them; scan the place again."
+    )
+
+
+def _span(low: float, high: float) -> str:
+    one, other = (f"{value:.2g}" if value >= 0.001 else "below 0.001" for value in (low, high))
+    return one if one == other else f"{one} to {other}"
+
+
+# --- Reports of `tradeoff estimate` and `tradeoff map` as JSON data.
+
+SCHEMA = "tactile-bayes/tradeoff/1"
+SCHEMA_FILE = "tradeoff.schema.json"
+
+
+def ladder_document(ladder: Ladder, *, what: str, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """The same as plain data, by data_schema/tradeoff.schema.json.
+
+    Parameters
+    ----------
+    what
+        ``"estimate"`` or ``"map"``: what is varied.
+    """
+    reference, frontier = ladder.reference, ladder.frontier()
+    enough = ladder.enough()
+    return {
+        "schema": SCHEMA,
+        "varied": what,
+        "tolerance_mm": ladder.tolerance_mm,
+        "reference": {
+            "words": reference.words,
+            "mc_error_mm": _plain(reference.error_mm),
+            "half_width_mm": _plain(float("nan") if reference.answer is None else reference.answer.half_width_mm),
+            "cpu_s": _plain(reference.cpu_s),
+            "answer": None if reference.answer is None else _answer(reference.answer),
+        },
+        "settings": [_row_document(one) | {"frontier": any(one is other for other in frontier)} for one in ladder.rows],
+        "enough": None if enough is None else enough.label,
+        "pooled": [
+            {
+                "maps": one.maps,
+                "cpu_s": _plain(one.cpu_s),
+                "answer": _answer(one.answer),
+                "another_half_width_mm": _plain(one.another_half_mm),
+            }
+            for one in ladder.pooled
+        ],
+        "shared_cpu_s": {name: _plain(seconds) for name, seconds in ladder.shared_cpu_s.items()},
+        "advice": advice(ladder),
+        "provenance": dict(provenance),
+        "research_use": RESEARCH_USE,
+    }
+
+
+def _row_document(one: Priced) -> dict[str, Any]:
+    return {
+        "axis": one.axis,
+        "setting": one.label,
+        "default": one.default,
+        "usable": one.usable,
+        "runs": len(one.answers),
+        "cpu_s": {name: _plain(seconds) for name, seconds in one.cpu_s.items()},
+        "median_off_mm": _plain(one.off.median),
+        "ends_off_mm": _plain(one.off.ends),
+        "width_ends_off_mm": _plain(one.off.width_ends),
+        "answer": _answer(one.answer),
+    }
+
+
+def _answer(answer: SizeAnswer) -> dict[str, Any]:
+    return {
+        "reason": answer.reason,
+        "detected_probability": None if answer.probability is None else _plain(answer.probability),
+        "method": answer.method,
+        "quantities": {
+            name: {part: _plain(getattr(one, part)) for part in ("median", "low", "high", "mc_error")}
+            for name, one in answer.quantities.items()
+        },
+        "variance_share": {name: _plain(share) for name, share in answer.shares.items()},
+    }
+
+
+def _plain(value: float) -> float | None:
+    return float(f"{value:.6g}") if math.isfinite(value) else None
+
+
+# --- Reports of `tradeoff estimate` and `tradeoff map` as text: the table of settings.
+
+_NAME, _REASON = 42, 100
+
+
+def ladder_text(ladder: Ladder) -> str:
+    """The whole report; advice and the research-use line come last."""
+    lines = [_head(ladder)]
+    for axis, rows in groupby(ladder.rows, key=lambda one: one.axis):
+        lines += [axis, *(_row(one, ladder) for one in rows)]
+    if ladder.pooled:
+        lines += ["maps pooled", *map(_pooled, ladder.pooled)]
+    return "\n".join([*lines, "", *_notes(ladder), "", *advice(ladder), RESEARCH_USE])
+
+
+def _head(ladder: Ladder) -> str:
+    parts = "".join(f"{f'{name} s':>12}" for name in ladder.default.cpu_s)
+    what = "size mm" if sized(ladder) else "sigma mm"
+    return f"{'':<{_NAME}}{parts}{what:>10}{'95 % interval':>18}{'ends off':>10}{'widths off':>12}"
+
+
+def sized(ladder: Ladder) -> bool:
+    """Whether what is reported is a size; without a calibration it is a width."""
+    return any(SIZE in one.answer.quantities for one in ladder.rows) or ladder.reference.answer is None
+
+
+def _row(one: Priced, ladder: Ladder) -> str:
+    name = f"{'*' if one.default else ' '} {one.label}"
+    cost = "".join(f"{seconds:>12.3f}" for seconds in one.cpu_s.values())
+    if one.answer.reported is None:
+        return f"{name:<{_NAME}}{cost}  {_no_number(one.answer)}"
+    off = f"{_mm(one.off.ends):>10}{_mm(one.off.width_ends):>12}"
+    note = "" if SIZE in one.answer.quantities or not sized(ladder) else "  (a width: this map has no size)"
+    if one.answer.method == "ensemble" and "ensemble" not in one.label:
+        note += "  (by MCMC: importance sampling failed)"
+    return f"{name:<{_NAME}}{cost}{_number(one.answer)}{off}{note}"
+
+
+def _number(answer: SizeAnswer) -> str:
+    found = answer.reported
+    assert found is not None
+    return f"{found.median:>10.2f}{f'{found.low:.2f} to {found.high:.2f}':>18}"
+
+
+def _no_number(answer: SizeAnswer) -> str:
+    """Why there is no number, with the probability of a lump where the reason does not name one."""
+    reason = answer.reason if len(answer.reason) <= _REASON else f"{answer.reason[: _REASON - 3]}..."
+    if answer.probability is None or "probability" in reason:
+        return reason
+    return f"probability of a lump {answer.probability:.2g}: {reason}"
+
+
+def _mm(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else "-"
+
+
+def _pooled(one: PooledRow) -> str:
+    name = f"  {one.maps} map{'s' if one.maps > 1 else ''}"
+    if one.answer.reported is None:
+        return f"{name:<{_NAME}}{one.cpu_s:>12.3f}  {_no_number(one.answer)}"
+    half = f"half width {one.answer.half_width_mm:.2f} mm"
+    if math.isfinite(one.another_half_mm):
+        half += f", {one.another_half_mm:.2f} if exams differ as in the paper"
+    return f"{name:<{_NAME}}{one.cpu_s:>12.3f}{_number(one.answer)}  {half}"
+
+
+def _notes(ladder: Ladder) -> Iterator[str]:
+    yield "* is the default. CPU seconds of this machine, warm, the least of the runs; the interval is of this exam."
+    if any("optimise" in one.label or one.axis == "fit window" for one in ladder.rows) and sized(ladder):
+        yield "Least squares and other windows: sized as if the calibration were learned so; `estimate` refuses that."
+    reference = ladder.reference
+    if reference.answer is not None:
+        yield (
+            f"Off: mm, root mean square over runs and both ends, from a reference: {reference.words}; its own "
+            f"Monte-Carlo error is {reference.error_mm:.2g} mm, its cost {reference.cpu_s:.1f} s."
+        )
+    else:
+        yield "There is no reference to compare with: what it would be made from has no size."
+    for name, seconds in ladder.shared_cpu_s.items():
+        yield f"{name}: {seconds:.2f} s of CPU besides."
+
+
+# --- The Pareto picture of a trade-off: distance of interval ends against CPU time, both logarithmic.
+
+_SIZE_IN = (10.0, 6.0)
+_MARKS = ("o", "^", "s", "D", "v", "P")
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_LETTER, _LINE = 3.95, 9.0
+"""Width of a letter and height of a line of a name, points."""
+Box = tuple[float, float, float, float]
+_LEAST_MM = 1e-3
+"""Smaller distances are drawn here: below rounding of what anybody reads."""
+
+
+def draw_ladder(ladder: Ladder, path: Path, *, title: str, force: bool = False) -> None:
+    """Draw every setting as a point, with the frontier and the lines that say what matters.
+
+    Without a reference there is no distance: then the probability of a lump is drawn.
+
+    Raises
+    ------
+    UsageError
+        When the file exists and `force` is false.
+    """
+    shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
+    with figure_file(path, size_in=_SIZE_IN, force=force) as figure:
+        axes = figure.subplots()
+        for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
+            rows = [one for one in shown if one.axis == axis]
+            axes.plot(*_places(rows, ladder), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
+        default = [one for one in shown if one.default]
+        axes.plot(*_places(default, ladder), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
+        if ladder.reference.answer is not None:
+            axes.step(
+                *_places(ladder.frontier(), ladder), where="post", color="0.3", lw=1.0, label="frontier", zorder=2
+            )
+            axes.set_ylabel("distance of the interval's ends from the reference, mm (rms)")
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
+        else:
+            axes.set_ylabel("probability of a lump (no size to compare)")
+            axes.set_ylim(-0.05, 1.15)
+        _lines(axes, ladder)
+        if shown:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "235" else "")
+            axes.margins(x=0.12, y=0.08)
+            _names(axes, shown, ladder)
+        axes.set_xlabel("CPU time, s")
+        axes.set_title(title, fontsize=10)
+        figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+        figure.text(0.01, 0.01, RESEARCH_USE, fontsize=7, color="0.3")
+
+
+def _height(one: Priced, ladder: Ladder) -> float:
+    """Distance from the reference, mm; without a reference the probability of a lump."""
+    if ladder.reference.answer is not None:
+        return max(one.off.ends, _LEAST_MM)
+    return float("nan") if one.answer.probability is None else one.answer.probability
+
+
+def _places(rows: list[Priced], ladder: Ladder) -> tuple[list[float], list[float]]:
+    return [max(one.seconds, 1e-4) for one in rows], [_height(one, ladder) for one in rows]
+
+
+def _lines(axes: Axes, ladder: Ladder) -> None:
+    """The interval's half width, the tolerance and the reference's own error, each named at the right."""
+    answer = ladder.reference.answer
+    if answer is None:
+        axes.axhline(LIKELY, color="0.5", ls="--", lw=1.0, label=f"needed for a size, {LIKELY:g}")
+        return
+    named = (
+        (answer.half_width_mm, "k", "-", "half width of the interval"),
+        (ladder.tolerance_mm, "0.5", "--", "tolerance"),
+        (ladder.reference.error_mm, "0.5", ":", "the reference's own error"),
+    )
+    for value, colour, style, name in named:
+        if value > 0:
+            shown = max(value, _LEAST_MM)
+            axes.axhline(shown, color=colour, ls=style, lw=1.0, zorder=1)
+            axes.annotate(
+                f"{name}, {value:.2g} mm",
+                (1.0, shown),
+                xycoords=("axes fraction", "data"),
+                xytext=(-4, 3),
+                textcoords="offset points",
+                fontsize=8,
+                ha="right",
+                color=colour,
+            )
+
+
+def _names(axes: Axes, shown: list[Priced], ladder: Ladder) -> None:
+    """A name beside each point, moved up or down until it covers no other name and no point."""
+    figure = axes.figure
+    figure.draw_without_rendering()  # type: ignore[union-attr]
+    scale = 72.0 / figure.dpi
+    right = axes.get_window_extent().x1 * scale
+    places = [[float(v) * scale for v in axes.transData.transform(point)] for point in _points(shown, ladder)]
+    taken: list[Box] = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    for one, (x, y) in sorted(zip(shown, places, strict=True), key=lambda pair: pair[1][1]):
+        text = one.label.removeprefix("--method ").removeprefix("--")
+        box = _free_place(x, y, _LETTER * len(text), taken, right=right)
+        taken.append(box)
+        axes.annotate(
+            text,
+            (one.seconds, _height(one, ladder)),
+            xytext=(box[0] - x, box[1] + 2 - y),
+            textcoords="offset points",
+            fontsize=7,
+            zorder=5,
+            bbox={"facecolor": "w", "edgecolor": "none", "alpha": 0.7, "pad": 0.3},
+        )
+
+
+def _points(shown: list[Priced], ladder: Ladder) -> list[tuple[float, float]]:
+    return list(zip(*_places(shown, ladder), strict=True))
+
+
+def _free_place(x: float, y: float, wide: float, taken: list[Box], *, right: float) -> Box:
+    """Where a name of so many points of width goes: at the right of its point, or the left where the picture ends."""
+    begin = x - 8 - wide if x + wide + 8 > right else x + 8
+    for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
+        low = y - 4.5 + step * _LINE
+        box = (begin, low, begin + wide, low + _LINE)
+        if not any(_cover(box, other) for other in taken):
+            break
+    return box
+
+
+def _cover(one: Box, other: Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]

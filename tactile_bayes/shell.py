@@ -1,0 +1,179 @@
+"""The process and its terminal: text that is printed, readers that leave, Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any, TextIO
+
+from tactile_bayes.errors import UsageError
+
+# --- All printing: control characters are escaped, and a full disk is one error line.
+
+# C0 but tab and newline, delete, C1, line and direction marks, halves of surrogate pairs
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
+
+
+class ReaderGoneError(Exception):
+    """The reader of the standard output stopped: ``tactile-bayes show scan.mcap | head -1``."""
+
+
+def printable(text: str) -> str:
+    r"""The text with each control character as its escape, for example ``\x1b``; tabs and newlines stay.
+
+    What a file holds may reach a terminal only so: control characters can move its cursor, rename its window or hide
+    what was printed before.
+    """
+    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+class PrintableStream:
+    """A text stream that escapes control characters; all else goes to the stream underneath.
+
+    Parameters
+    ----------
+    stream
+        Where to write.
+    required
+        Whether a failed write is an error (standard output) or let go (standard error, where no one could be told).
+    """
+
+    def __init__(self, stream: TextIO, *, required: bool) -> None:
+        self._stream = stream
+        self._required = required
+        self._failure: Exception | None = None  # told again at the next call: whoever printed may have let it go
+
+    @property
+    def encoding(self) -> str:
+        """UTF-8 in any locale: click writes past a stream that says it is ASCII, and past what is escaped here."""
+        return "utf-8"
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write the text, made printable."""
+        self._try(self._stream.write, printable(text))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream underneath.
+
+        Raises
+        ------
+        UsageError
+            When the standard output cannot take it.
+        ReaderGoneError
+            When its reader has gone.
+        """
+        self._try(self._stream.flush)
+
+    def _try(self, action: Callable[..., object], *arguments: object) -> None:
+        try:
+            action(*arguments)
+        except OSError as error:
+            _abandon(self._stream)
+            self._failure = _failure(error) if self._required else None
+        if self._failure is not None:
+            raise self._failure
+
+
+def _failure(error: OSError) -> Exception:
+    if error.errno == errno.EPIPE:
+        return ReaderGoneError()
+    return UsageError(f"the standard output cannot be written ({error.strerror}); make room, or send it elsewhere")
+
+
+def _abandon(stream: TextIO) -> None:
+    """Discard buffered output; otherwise Python would try again at exit and print a traceback."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+def protect_streams() -> None:
+    """Make the standard streams of this process printable, in any locale; where one is closed, nothing is there."""
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull)  # noqa: PTH123, SIM115 (it stays open)
+    for name, required in (("stdout", True), ("stderr", False)):
+        stream = getattr(sys, name)
+        if stream is None:  # what is printed to None goes to the standard output
+            stream = open(os.devnull, "w")  # noqa: PTH123, SIM115
+        if not isinstance(stream, PrintableStream):
+            if isinstance(stream, io.TextIOWrapper):
+                stream = _buffered(stream)
+            setattr(sys, name, PrintableStream(stream, required=required))
+
+
+def _buffered(stream: io.TextIOWrapper) -> io.TextIOWrapper:
+    """The stream with a buffer and without an error of encoding.
+
+    Without a buffer (``PYTHONUNBUFFERED=1``, as in many containers) Python drops what a nearly full disk does not take.
+    """
+    if isinstance(stream.buffer, io.RawIOBase):
+        raw = io.FileIO(stream.fileno(), "w", closefd=False)
+        stream = io.TextIOWrapper(io.BufferedWriter(raw), encoding=stream.encoding, line_buffering=True)
+    stream.reconfigure(errors="backslashreplace")
+    return stream
+
+
+def release_streams() -> None:
+    """Restore the original streams."""
+    sys.stdout, sys.stderr = raw_stream(sys.stdout), raw_stream(sys.stderr)
+
+
+def raw_stream(stream: Any) -> TextIO:
+    """The stream underneath, for code that draws with control characters."""
+    found: TextIO = stream._stream if isinstance(stream, PrintableStream) else stream
+    return found
+
+
+# --- Signals that end a command in order, as Ctrl-C does.
+
+_asked = False
+
+
+@contextlib.contextmanager
+def ended_in_order() -> Iterator[None]:
+    """Let SIGTERM (`kill`, `timeout`, a batch system) and SIGHUP (a closed terminal) interrupt as Ctrl-C does.
+
+    What is ignored stays so: `nohup` ignores SIGHUP.
+    """
+    global _asked
+    _asked = False
+    before: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # called in a thread, which gets no signals
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+                before[number] = signal.signal(number, _interrupt)
+    try:
+        yield
+    finally:
+        _asked = False
+        for changed, handler in before.items():
+            signal.signal(changed, handler)
+
+
+def raise_if_asked() -> None:
+    """Raise the interruption again where code of others let it go, as compiled modules do while they are imported.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        When a signal has come in the block of `ended_in_order`.
+    """
+    if _asked:
+        raise KeyboardInterrupt
+
+
+def _interrupt(number: int, frame: object) -> None:
+    del number, frame
+    global _asked
+    _asked = True
+    raise KeyboardInterrupt

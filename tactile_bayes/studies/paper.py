@@ -1,0 +1,477 @@
+"""The paper's forward study: sizes, depths and stiffnesses on a line."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, SEATS, Body
+from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.line import (
+    MEAN_KPA,
+    POSITIONS_MM,
+    LineFrames,
+    TactileLine,
+    build_line,
+    press,
+    press_layers,
+    slide,
+)
+from tactile_bayes.forward.plane_strain import CELL_MM, FINENESS, SurfaceCompliance, condense
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import HEAD_PITCH_MM
+
+# --- The forward study of section 2.4: the Gaussian that each lump's map shows, over sizes, depths and stiffnesses.
+
+PAPER_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
+PAPER_DEPTH_RATIOS = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
+PAPER_STIFFNESS_RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
+FIT_RADIUS_MM = 48.0
+# A bump lower than this share of the background is not called detectable, nor one whose width is not resolved.
+DETECTABLE = 0.02
+HARD_RATIO = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class StudySettings:
+    """Settings of a study: everything but its cases that the table depends on.
+
+    Parameters
+    ----------
+    head
+        Cross-section of the head.
+    mean_kpa
+        Force over the head's area.
+    poisson, fat_kpa, gland_ratio, thickness_mm
+        As in `body.Body`.
+    positions_mm
+        First and last position of the head and the step between them.
+    fit_radius_mm
+        Eq 5 is fitted where abs(x) is at most this.
+    cell_mm, fineness
+        Of the contact and of the mesh, see `condense.condense`.
+    """
+
+    head: Head = field(default_factory=Head)
+    mean_kpa: float = MEAN_KPA
+    poisson: float = POISSON
+    fat_kpa: float = FAT_KPA
+    gland_ratio: float = GLAND_RATIO
+    thickness_mm: float | None = None
+    positions_mm: tuple[float, float, float] = POSITIONS_MM
+    fit_radius_mm: float = FIT_RADIUS_MM
+    cell_mm: float = CELL_MM
+    fineness: int = FINENESS
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain data for a store's header and for a report."""
+        return asdict(self)
+
+    def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
+        """The body of a case."""
+        return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
+
+    def surface(self, body: Body) -> SurfaceCompliance:
+        """The body condensed onto the surface that the head travels over."""
+        half_face_mm = 0.5 * self.cell_mm * len(self.head.sensing_cells(self.cell_mm))
+        reach = max(abs(self.positions_mm[0]), abs(self.positions_mm[1])) + half_face_mm
+        return condense(body, reach_mm=reach, cell_mm=self.cell_mm, fineness=self.fineness)
+
+    def frames(self, surface: SurfaceCompliance, stiffness_ratio: float | None) -> LineFrames:
+        """Frames of the head at all its positions."""
+        return slide(surface, stiffness_ratio, head=self.head, mean_kpa=self.mean_kpa, positions_mm=self.positions_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """Cases with the same geometry, which share one factorisation: one body, several stiffnesses of its lump.
+
+    Parameters
+    ----------
+    seat, d_mm, depth_ratio
+        As in `body.Body`.
+    stiffness_ratios
+        E2/E1, the lump's modulus over that of fat.
+    """
+
+    seat: float
+    d_mm: float
+    depth_ratio: float
+    stiffness_ratios: tuple[float, ...]
+
+    @property
+    def key(self) -> str:
+        """The item's name in a batch."""
+        ratios = "/".join(f"{ratio:g}" for ratio in self.stiffness_ratios)
+        return f"seat {self.seat:g}, d {self.d_mm:g} mm, h/d {self.depth_ratio:g}, E2/E1 {ratios}"
+
+
+@dataclass(frozen=True, slots=True)
+class LineFit:
+    """The fit of Eq 5 to a line.
+
+    Parameters
+    ----------
+    amplitude, sigma_mm
+        a and sigma of Eq 5.
+    rms
+        Root mean square of what the Gaussian leaves, in units of the background.
+    resolved
+        Whether the width lies within what the fit looks at, and not at an end of it.
+    """
+
+    amplitude: float
+    sigma_mm: float
+    rms: float
+    resolved: bool = True
+
+
+Fit = Callable[[TactileLine, float], LineFit]
+"""Fits Eq 5 to a line within a radius in mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class StudyRow:
+    """One case and the Gaussian its map shows; the fields are the columns of a size table.
+
+    A map in two dimensions has no `sigma_y_mm`. `thickness_mm` (depth of the chest wall), `head_radius_mm` (of its arc)
+    and `head` (where its shoulders lie, one of `presets.HEADS`) are what the case was computed with. The rest is the
+    recipe of the map: how its frames were normalised, whether its level was ``"fixed"`` at 1 or ``"free"``, the radius
+    of the fit, the errors it was fitted under, and whether the head's own response was divided out (None in two
+    dimensions, which have none).
+    """
+
+    seat: str
+    d_mm: float
+    depth_ratio: float
+    stiffness_ratio: float
+    amplitude: float
+    sigma_x_mm: float
+    fit_rms: float
+    detectable: bool
+    sigma_y_mm: float | None = None
+    thickness_mm: float | None = None
+    head_radius_mm: float | None = None
+    head: str | None = None
+    normalise: str | None = None
+    background: str | None = None
+    fit_radius_mm: float | None = None
+    noise: str | None = None
+    flat_field: bool | None = None
+
+
+def seat_name(seat: float) -> str:
+    """``centred``, ``resting`` or the number."""
+    return next((name for name, value in SEATS.items() if value == seat), f"{seat:g}")
+
+
+def paper_grid(seat: float) -> list[Geometry]:
+    """The 150 cases of section 2.4 at one seat, as 30 geometries."""
+    return [Geometry(seat, d, h, PAPER_STIFFNESS_RATIOS) for d in PAPER_DIAMETERS_MM for h in PAPER_DEPTH_RATIOS]
+
+
+def group_cases(cases: Iterable[tuple[float, float, float, float]]) -> list[Geometry]:
+    """Geometries of cases (seat, d_mm, depth_ratio, stiffness_ratio), in the order in which they first appear.
+
+    Raises
+    ------
+    BadDataError
+        When a case appears twice or cannot be.
+    """
+    ratios: dict[tuple[float, float, float], list[float]] = {}
+    for seat, d, h, ratio in cases:
+        known = ratios.setdefault((seat, d, h), [])
+        if ratio in known:
+            raise BadDataError(
+                f"the case seat {seat_name(seat)}, d {d:g} mm, h/d {h:g}, E2/E1 {ratio:g} appears twice",
+                way_out="keep it once",
+            )
+        known.append(ratio)
+    return [Geometry(*geometry, tuple(found)) for geometry, found in ratios.items()]
+
+
+def run_geometry(geometry: Geometry, *, settings: StudySettings, fit: Fit) -> list[StudyRow]:
+    """The rows of one geometry.
+
+    Parameters
+    ----------
+    fit
+        How Eq 5 is fitted; importable by name, as `batch` needs it.
+    """
+    body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
+    surface = settings.surface(body)
+    rows = []
+    for ratio in geometry.stiffness_ratios:
+        found = fit(build_line(settings.frames(surface, ratio)), settings.fit_radius_mm)
+        rows.append(
+            StudyRow(
+                seat_name(geometry.seat),
+                geometry.d_mm,
+                geometry.depth_ratio,
+                ratio,
+                found.amplitude,
+                found.sigma_mm,
+                found.rms,
+                bool(found.amplitude >= DETECTABLE and found.resolved),
+                thickness_mm=body.layers.thickness_mm,
+                head_radius_mm=settings.head.radius_mm,
+                head=settings.head.shoulders,
+                normalise="mean",
+                background="fixed",
+                fit_radius_mm=settings.fit_radius_mm,
+                noise="independent",
+            )
+        )
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class PrintedEq6:
+    """Eq 6 learned in two stages as in the paper, without uncertainty.
+
+    Parameters
+    ----------
+    m, b_mm
+        Line of d on sigma at one diameter depth.
+    e, f
+        Power law of the width change on the amplitude.
+    cases
+        Hard, detectable cases that e and f were learned from.
+    """
+
+    m: float
+    b_mm: float
+    e: float
+    f: float
+    cases: int
+
+
+def hard_cases(rows: Sequence[StudyRow]) -> list[StudyRow]:
+    """The detectable cases of the hardest lumps (E2/E1 = 100, which the paper assumes of all)."""
+    return [row for row in rows if row.stiffness_ratio == HARD_RATIO and row.detectable]
+
+
+def widths(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
+    """(n,) widths across (``"x"``) or along the head (``"y"``; NaN in rows without one)."""
+    if axis == "x":
+        return np.array([row.sigma_x_mm for row in rows])
+    return np.array([np.nan if row.sigma_y_mm is None else row.sigma_y_mm for row in rows])
+
+
+def width_changes(rows: Sequence[StudyRow], *, axis: str = "x") -> FloatArray:
+    """Delta sigma of each row: its width over that of the same lump at one diameter depth; NaN without such a row."""
+    sigma = widths(rows, axis=axis)
+    lump = [(row.seat, row.d_mm, row.stiffness_ratio) for row in rows]
+    level = [abs(row.depth_ratio - 1.0) < 1e-9 for row in rows]
+    reference = {key: width for key, width, at in zip(lump, sigma, level, strict=True) if at}
+    return np.array([width / reference.get(key, np.nan) for key, width in zip(lump, sigma, strict=True)])
+
+
+def stiffness_changes(rows: Sequence[StudyRow], *, least_ratio: float = 8.0) -> dict[float, float]:
+    """By diameter: largest change of the width at one diameter depth from `least_ratio` on, as a share (Fig 7b).
+
+    The reference is the width at E2/E1 = 100; diameters without two detectable cases have no entry.
+    """
+    level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
+    changes = {}
+    for d in sorted({row.d_mm for row in level}):
+        sigma = {row.stiffness_ratio: row.sigma_x_mm for row in level if row.d_mm == d}
+        others = [value for ratio, value in sigma.items() if least_ratio <= ratio != HARD_RATIO]
+        if HARD_RATIO in sigma and others:
+            changes[d] = max(abs(value / sigma[HARD_RATIO] - 1.0) for value in others)
+    return changes
+
+
+def learn_as_printed(rows: Sequence[StudyRow], *, axis: str = "x") -> PrintedEq6 | None:
+    """Eq 6 in two stages from the hard, detectable cases of one seat; None where they are too few.
+
+    Parameters
+    ----------
+    axis
+        Of the head: ``"x"`` across it, ``"y"`` along it.
+
+    Notes
+    -----
+    Figure 8: least squares of d on sigma at h/d = 1, and of ln Delta sigma on ln a over all depths.
+    """
+    hard = hard_cases(rows)
+    change = width_changes(hard, axis=axis)
+    amplitude = np.array([row.amplitude for row in hard])
+    level = [row for row in hard if abs(row.depth_ratio - 1.0) < 1e-9]
+    known = np.isfinite(change)
+    if len({row.d_mm for row in level}) < 2 or known.sum() < 2 or np.ptp(amplitude[known]) <= 0:
+        return None
+    m, b = np.polyfit(widths(level, axis=axis), [row.d_mm for row in level], 1)
+    f, log_e = np.polyfit(np.log(amplitude[known]), np.log(change[known]), 1)
+    return PrintedEq6(float(m), float(b), float(np.exp(log_e)), float(f), int(known.sum()))
+
+
+# --- Lumps of different size whose frames look alike (Fig 5b of the paper), sought over sizes and depths.
+#
+# The paper says that some combinations of size and depth lead to identical pressure distributions over the lump.
+# How alike two frames are is measured against what the lump itself adds: frames of two faint lumps are alike
+# because both are those of no lump.
+
+DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
+DEPTH_RATIOS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5)
+LEAST_RISE = 0.1
+"""A lump takes part when it raises the middle of the head by this share of the frame's mean: five times the noise."""
+LEAST_SIZE_RATIO = 1.5
+"""Of the larger lump's diameter to the smaller one's."""
+ALIKE = 0.05
+"""Frames that differ by less than this share of what the lump adds are called indistinguishable."""
+# Of the depths in diameters that are tried by interpolation between those solved.
+_STEP = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CentredFrame:
+    """The frame with the head's centre over a lump, as taxels see it.
+
+    Parameters
+    ----------
+    d_mm, depth_ratio
+        Size and depth of the lump.
+    s_mm : (n,) array
+        Taxel positions across the head.
+    share : (n,) array
+        Pressure over the frame's mean.
+    added : (n,) array
+        `share` less that of the same layers without the lump.
+    """
+
+    d_mm: float
+    depth_ratio: float
+    s_mm: FloatArray
+    share: FloatArray
+    added: FloatArray
+
+    @property
+    def rise(self) -> float:
+        """What the lump adds in the middle of the head."""
+        return float(_middle(self.added))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lookalikes:
+    """Two lumps of different size with the most alike frames.
+
+    Parameters
+    ----------
+    small, large
+        Their frames.
+    difference
+        Root mean square difference of the frames over the root mean square of what the smaller lump adds.
+    """
+
+    small: CentredFrame
+    large: CentredFrame
+    difference: float
+
+    @property
+    def of_mean(self) -> float:
+        """Root mean square difference as a share of the frames' mean."""
+        return _rms(self.large.share - self.small.share)
+
+
+def centred_frame(d_mm: float, depth_ratio: float, *, settings: StudySettings, seat: float) -> CentredFrame:
+    """The frame over a hard lump of one size and depth."""
+    body = settings.body(d_mm, depth_ratio, seat=seat)
+    head: Head = settings.head
+    reach = 0.5 * settings.cell_mm * len(head.sensing_cells(settings.cell_mm))
+    surface = condense(body, reach_mm=reach, cell_mm=settings.cell_mm, fineness=settings.fineness)
+    over = press(surface, HARD_RATIO, np.zeros(1), head=head, mean_kpa=settings.mean_kpa).as_taxels(HEAD_PITCH_MM)
+    far = press_layers(body.layers, head=head, mean_kpa=settings.mean_kpa, cell_mm=settings.cell_mm)
+    share, plain = _share(over.at(0.0)), _share(far.as_taxels(HEAD_PITCH_MM).at(0.0))
+    return CentredFrame(d_mm, depth_ratio, over.s_mm, share, share - plain)
+
+
+def find_lookalikes(
+    settings: StudySettings,
+    *,
+    seat: float,
+    diameters_mm: Sequence[float] = DIAMETERS_MM,
+    depth_ratios: Sequence[float] = DEPTH_RATIOS,
+    least_size_ratio: float = LEAST_SIZE_RATIO,
+) -> Lookalikes | None:
+    """The pair of visible lumps of different size whose frames are most alike; None where no two are visible.
+
+    Parameters
+    ----------
+    settings
+        Body, head and pressure; hard lumps (E2/E1 = 100).
+    seat
+        As in `body.Body`.
+    diameters_mm, depth_ratios
+        Rising; depths between the first and the last are tried in steps of 0.01.
+    least_size_ratio
+        Diameter of the larger lump over that of the smaller, at least.
+
+    Notes
+    -----
+    Frames are interpolated between the depths solved (cubic splines in h/d); the best depth of the larger lump of the
+    best pair is then sought with the model itself.
+    """
+    from scipy.optimize import minimize_scalar
+
+    coarse = replace(settings, fineness=1)
+    tried = np.round(np.arange(depth_ratios[0], depth_ratios[-1] + 1e-9, _STEP), 6)
+    shares, added = {}, {}
+    for d in diameters_mm:
+        frames = [centred_frame(d, h, settings=coarse, seat=seat) for h in depth_ratios]
+        shares[d], added[d] = _interpolated(frames, depth_ratios, tried)
+    best: tuple[float, float, float, float, float] | None = None
+    for d, e in itertools.combinations(sorted(diameters_mm), 2):
+        if least_size_ratio * d > e:
+            continue
+        gaps = np.sqrt(np.mean((shares[d][:, None] - shares[e]) ** 2, axis=2))
+        gaps /= np.sqrt(np.mean(added[d] ** 2, axis=1))[:, None]
+        gaps[(_middle(added[d]) < LEAST_RISE)[:, None] | (_middle(added[e]) < LEAST_RISE)] = np.inf
+        i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
+        if np.isfinite(gaps[i, j]) and (best is None or gaps[i, j] < best[0]):
+            best = (float(gaps[i, j]), d, float(tried[i]), e, float(tried[j]))
+    if best is None:
+        return None
+    _, small_mm, small_depth, d_mm, depth = best
+    small = centred_frame(small_mm, small_depth, settings=settings, seat=seat)
+
+    def gap(depth_ratio: float) -> float:
+        return _difference(small, centred_frame(d_mm, depth_ratio, settings=settings, seat=seat))
+
+    ends = max(depth - 2 * _STEP, depth_ratios[0]), min(depth + 2 * _STEP, depth_ratios[-1])
+    found = float(minimize_scalar(gap, bounds=ends, method="bounded", options={"xatol": 1e-3}).x)
+    large_frame = centred_frame(d_mm, found, settings=settings, seat=seat)
+    return Lookalikes(small, large_frame, _difference(small, large_frame))
+
+
+def _interpolated(
+    frames: Sequence[CentredFrame], depth_ratios: Sequence[float], tried: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Frames (k, n) of one size of lump at the depths tried, and what the lump adds to them."""
+    from scipy.interpolate import CubicSpline
+
+    knots = np.asarray(depth_ratios)
+    shares = CubicSpline(knots, np.stack([frame.share for frame in frames]))(tried)
+    return shares, CubicSpline(knots, np.stack([frame.added for frame in frames]))(tried)
+
+
+def _difference(small: CentredFrame, large: CentredFrame) -> float:
+    return _rms(large.share - small.share) / _rms(small.added)
+
+
+def _share(frame_kpa: FloatArray) -> FloatArray:
+    return np.asarray(frame_kpa / frame_kpa.mean())
+
+
+def _middle(across: FloatArray) -> FloatArray:
+    """Mean over the two middle taxels of (..., n) values."""
+    half = across.shape[-1] // 2
+    return np.asarray(across[..., half - 1 : half + 1].mean(axis=-1))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

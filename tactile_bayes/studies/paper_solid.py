@@ -1,0 +1,411 @@
+"""The forward study in the solid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.axisymmetric import CondensedLump, Tissue, condense_lump
+from tactile_bayes.forward.body import FAT_KPA, GLAND_RATIO, POISSON, Body
+from tactile_bayes.forward.layers import LayeredBody
+from tactile_bayes.forward.line import MEAN_KPA
+from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
+from tactile_bayes.forward.plane_strain import FINENESS
+from tactile_bayes.forward.scene import Head
+from tactile_bayes.forward.solid import RANK_TOLERANCE, PlacedLump, SolidHead, skin_perturbation, solid_head
+from tactile_bayes.forward.solid_scan import face_of
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.presets import FIT_RADIUS_MM
+from tactile_bayes.studies.paper import DETECTABLE, Geometry, StudyRow, seat_name
+
+if TYPE_CHECKING:
+    from tactile_bayes.mapping.map import TactileMap
+    from tactile_bayes.posterior.fit_window import FitCells
+    from tactile_bayes.scan import CountArray, Scan
+
+
+# --- Maps of a study's raster of frames, built and fitted like a patient's.
+
+# Readings travel as whole numbers: this many a unit of the frame's mean, so that 30 times the mean still fits.
+_COUNTS: Final = 2048
+# Where the rest of the program would leave out frames by their mean, which here is 1.
+_WINDOW: Final = (0.5, 2.0)
+# A narrower bump than this share of the taxels' pitch is one that the pitch does not resolve.
+_LEAST_WIDTH_IN_PITCHES: Final = 0.8
+# Widths that are tried before the best pair of them is refined, along each axis.
+_TRIED: Final = 14
+
+
+def raster_scan(frames: RasterFrames) -> Scan:
+    """Convert a raster to a scan: level poses in the body's frame, readings over the frame's mean."""
+    import numpy as np
+
+    from tactile_bayes.scan import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+
+    head, count = frames.head, len(frames.x_mm)
+    time = np.arange(float(count)) / 100.0
+    readings = _readings(frames.pressure_kpa)
+    shape = (head.rows, head.columns)
+    return Scan(
+        frames=PressureFrames(time, readings),
+        poses=TrackerPoses(
+            time, np.stack([frames.x_mm, frames.y_mm, frames.depth_mm], axis=-1), np.tile([1.0, 0, 0, 0], (count, 1))
+        ),
+        head=HeadGeometry(head.surface_mm(), head.pitch_mm, np.eye(4)),
+        element_calibration=ElementCalibration(
+            np.full(shape, 1.0 / _COUNTS), np.zeros(shape), saturation_count=np.iinfo(np.uint16).max
+        ),
+        landmarks=None,
+        session={"source": "simulated"},
+    )
+
+
+def raster_map(frames: RasterFrames) -> TactileMap:
+    """Build the map of a raster with cells of half a pitch, so that every reading lies in the middle of one.
+
+    Notes
+    -----
+    Where the raster has a plain frame, the head's own response is taken off as `map --flat-field` takes off a
+    patient's. There it is found from the scan's own calm frames; here it is known.
+    """
+    from tactile_bayes.mapping.accumulate import FlatField
+    from tactile_bayes.mapping.build import build_map
+
+    scan = raster_scan(frames)
+    if frames.plain_kpa is not None:
+        plain = _readings(frames.plain_kpa)
+        scan = FlatField(plain / plain.mean(), frames=1).applied(scan)
+    return build_map(scan, cell_mm=frames.head.pitch_mm / 2, pressure_window_kpa=_WINDOW, normalise="mean")
+
+
+def _readings(pressure_kpa: FloatArray) -> CountArray:
+    """(..., rows, columns) frames over their means, as whole numbers."""
+    import numpy as np
+
+    share = pressure_kpa / pressure_kpa.mean(axis=(-2, -1), keepdims=True)
+    counts: CountArray = np.clip(np.rint(share * _COUNTS), 0, np.iinfo(np.uint16).max - 1).astype(np.uint16)
+    return counts
+
+
+def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
+    """Fit Eq 7 about the lump's axis with equal weights; the level is fitted or 1, by the settings.
+
+    Notes
+    -----
+    All readings of a cell come from its middle, so the Gaussian is not averaged over it. A patient's readings are
+    spread over their cells and the Gaussian is averaged there; what remains in both is the average over a taxel.
+
+    The lowest minimum between widths of half a taxel and three quarters of the radius is sought with the amplitude, and
+    a free level, eliminated, as in `study.fit_line`: steps of Gauss and Newton do not settle on a faint bump in its
+    trough.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from tactile_bayes.posterior.fit_window import window_cells
+    from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
+
+    radius_mm, free = settings.fit_radius_mm, settings.background == "free"
+    cells = replace(window_cells(raster_map(frames), (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
+    pitch = frames.head.pitch_mm
+    ends = np.log([LEAST_WIDTH_IN_CELLS * pitch, WIDEST_IN_RADII * radius_mm])
+    log_widths = _lowest(cells, ends, free=free)
+    amplitude, sse = _height(log_widths, cells, free=free)
+    narrow, wide = sorted(np.exp(log_widths))
+    resolved = (
+        narrow >= _LEAST_WIDTH_IN_PITCHES * pitch
+        and log_widths.max() < ends[1] - 1e-6
+        and wide <= MOST_AXIS_RATIO * narrow
+    )
+    sigma_x, sigma_y = (float(width) for width in np.exp(log_widths))
+    return RasterFit(amplitude, sigma_x, sigma_y, float(np.sqrt(sse / len(cells))), bool(resolved))
+
+
+def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[float, float]:
+    """Best amplitude of a bump of given widths on a level of 1 or a free one, and the remaining sum of squares."""
+    import numpy as np
+
+    from tactile_bayes.posterior.bump import Bump
+
+    p, q = np.array([[0.5, 0.5], [0.5, -0.5]]) @ log_widths
+    shape = Bump(background=1.0).unit_bump(np.array([[1.0, 0.0, 0.0, p, q]]), cells)[0]
+    excess = cells.value - 1.0
+    if free:
+        # what is left of both once a level is taken off
+        shape, excess = shape - shape.mean(), excess - excess.mean()
+    height = float(shape @ excess / (shape @ shape))
+    return height, float(np.sum((excess - height * shape) ** 2))
+
+
+def _lowest(cells: FitCells, ends: FloatArray, *, free: bool) -> FloatArray:
+    """(2,) log widths of the lowest minimum between the ends."""
+    import numpy as np
+    from scipy.optimize import minimize
+
+    def left(log_widths: FloatArray) -> float:
+        return _height(log_widths, cells, free=free)[1]
+
+    line = np.linspace(ends[0], ends[1], _TRIED)
+    tried = [np.array([x, y], dtype=np.float64) for x in line for y in line]
+    start: FloatArray = min(tried, key=left)
+    inwards = np.where(start > ends.mean(), -0.4, 0.4) * (line[1] - line[0])
+    found = minimize(
+        left,
+        start,
+        method="Nelder-Mead",
+        bounds=[(float(ends[0]), float(ends[1]))] * 2,
+        options={
+            "xatol": 1e-9,
+            "fatol": np.inf,
+            "maxiter": 400,
+            "initial_simplex": start + inwards * np.array([[0, 0], [1, 0], [0, 1]]),
+        },
+    )
+    return np.asarray(found.x, dtype=np.float64)
+
+
+# --- The forward study in three dimensions: the frames over a ball, over sizes, depths, stiffnesses and seats.
+#
+# The head stands on a raster of places about the lump. By symmetry a quarter of them is solved and the rest
+# mirrored.
+
+REACH_MM = 33.0
+LINES_MM = (0.0, 6.0, 12.0)
+BACKGROUNDS = ("fixed", "free")
+_LEVEL = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True)
+class SolidSettings:
+    """Settings of a solid study: everything but its cases that the table depends on.
+
+    Parameters
+    ----------
+    head
+        The array and the rim around it.
+    mean_kpa
+        Mean over the taxels.
+    poisson, fat_kpa, gland_ratio, thickness_mm
+        As in `body.Body`.
+    reach_mm, lines_mm
+        The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on lines at these
+        distances either side along it, which must be whole steps.
+    fit_radius_mm
+        Eq 7 is fitted within this distance of the lump's axis.
+    fineness
+        Of the mesh; twice is half the element. See `mesh_size`.
+    rank_tolerance
+        See `frames.skin_perturbation`.
+    mesh_reach_mm
+        Radius at which the mesh ends, on a rim that does not move.
+    background
+        ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
+    flat_field
+        Whether each taxel is divided by what it reads of the same body without the lump.
+    """
+
+    head: Head = field(default_factory=Head)
+    mean_kpa: float = MEAN_KPA
+    poisson: float = POISSON
+    fat_kpa: float = FAT_KPA
+    gland_ratio: float = GLAND_RATIO
+    thickness_mm: float | None = None
+    reach_mm: float = REACH_MM
+    lines_mm: tuple[float, ...] = LINES_MM
+    fit_radius_mm: float = FIT_RADIUS_MM
+    fineness: int = FINENESS
+    rank_tolerance: float = RANK_TOLERANCE
+    mesh_reach_mm: float = MeshSize().reach_mm
+    background: str = "free"
+    flat_field: bool = True
+
+    def __post_init__(self) -> None:
+        half = self.head.rows * self.head.pitch_mm / 2
+        if not self.head.radius_mm > half:
+            raise BadDataError(
+                f"radius_mm of the head is {self.head.radius_mm:g}",
+                way_out=f"it must be above {half:g} mm, half the head's width",
+            )
+        if self.background not in BACKGROUNDS:
+            raise BadDataError(f"background is {self.background!r}", way_out=f"it must be {' or '.join(BACKGROUNDS)}")
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain data for a store's header."""
+        return {"model": "solid", **asdict(self)}
+
+    def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
+        """The body of a case."""
+        return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
+
+    def geometry(self, body: Body) -> LumpGeometry:
+        """The ball in the body."""
+        layers, radius = body.layers, body.radius_mm
+        return LumpGeometry(radius, radius, body.centre_mm, layers.fat_mm, layers.thickness_mm)
+
+    def condensed(self, body: Body) -> CondensedLump:
+        """The body around the ball, condensed."""
+        tissue = Tissue(body.fat_kpa, body.gland_ratio, body.poisson)
+        return condense_lump(self.geometry(body), tissue, size=self.mesh_size)
+
+    @property
+    def mesh_size(self) -> MeshSize:
+        """Mesh size for the fineness and the reach."""
+        return mesh_size(self.fineness, reach_mm=self.mesh_reach_mm)
+
+    def on(self, body: Body) -> SolidHead:
+        """The head on the body without a lump."""
+        layers = body.layers
+        moduli = (body.fat_kpa, body.fat_kpa * body.gland_ratio)
+        thicknesses = (layers.fat_mm, layers.thickness_mm - layers.fat_mm)
+        return solid_head(face_of(self.head), LayeredBody(moduli, thicknesses, body.poisson))
+
+    def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> PlacedLump:
+        """The lump under the middle of the raster."""
+        change = skin_perturbation(
+            condensed,
+            stiffness_ratio * self.fat_kpa,
+            square_mm=self.head.pitch_mm,
+            tolerance=self.rank_tolerance,
+        )
+        return PlacedLump(change, 0.0, 0.0)
+
+
+def mesh_size(fineness: int, *, reach_mm: float = MeshSize().reach_mm) -> MeshSize:
+    """Mesh size of a fineness; 2 is the default, and doubling it halves every element."""
+    default = MeshSize()
+    share = fineness / FINENESS
+    return MeshSize(
+        arc=round(default.arc * share),
+        rings=round(default.rings * share),
+        core=int(np.ceil(default.core * share)),
+        grade=float(default.grade ** (1.0 / share)),
+        reach_mm=reach_mm,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RasterFrames:
+    """Frames of a level head on a raster of places.
+
+    Parameters
+    ----------
+    x_mm, y_mm, depth_mm : (n,) arrays
+        Where the apex of the head's face is, from the lump's axis and from the undisturbed skin.
+    pressure_kpa : (n, rows, columns) array
+    head
+        What was pressed.
+    plain_kpa : (rows, columns) array
+        The head's frame over the same body without the lump, where the map is to be divided by it.
+    """
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    depth_mm: FloatArray
+    pressure_kpa: FloatArray
+    head: Head
+    plain_kpa: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RasterFit:
+    """The fit of Eq 7 to a raster's map.
+
+    Parameters
+    ----------
+    amplitude, sigma_x_mm, sigma_y_mm
+        a (height above the level, in units of the map) and the widths of Eq 7, across and along the head.
+    rms
+        Root mean square of what the Gaussian leaves, in units of the background.
+    resolved
+        Whether both widths are ones that array and window can tell.
+    """
+
+    amplitude: float
+    sigma_x_mm: float
+    sigma_y_mm: float
+    rms: float
+    resolved: bool
+
+
+RasterFitter = Callable[[RasterFrames, SolidSettings], RasterFit]
+"""Builds the map of a raster and fits Eq 7 with the radius and the level of the settings."""
+
+
+def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSettings) -> RasterFrames:
+    """Frames of the raster over a lump, or over the plain body.
+
+    Notes
+    -----
+    The lump is symmetric about both axes of the level head, so the frame at (-x, y) is the one at (x, y) with its rows
+    turned about, and that at (x, -y) with its columns. The layers are alike everywhere, so one frame tells all that the
+    head reads without the lump.
+    """
+    pitch = settings.head.pitch_mm
+    count = int(np.floor(settings.reach_mm / pitch + 1e-9))
+    places, depths, frames = [], [], []
+    touching: NDArray[np.bool_] | None = None
+    for line in settings.lines_mm:
+        y = pitch * round(line / pitch)
+        for x in pitch * np.arange(count + 1.0):
+            one = head.frame(
+                [] if lump is None else [lump],
+                rotation=_LEVEL,
+                x_mm=float(x),
+                y_mm=y,
+                mean_kpa=settings.mean_kpa,
+                touching=touching,
+            )
+            touching = one.contact.touching
+            for side in (1, -1) if x > 0 else (1,):
+                for end in (1, -1) if y > 0 else (1,):
+                    places.append((side * x, end * y))
+                    depths.append(one.depth_mm)
+                    frames.append(one.pressure_kpa[::side, ::end])
+    plain = None
+    if settings.flat_field:
+        plain = head.frame([], rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa).pressure_kpa
+    place = np.array(places)
+    return RasterFrames(place[:, 0], place[:, 1], np.array(depths), np.stack(frames), settings.head, plain)
+
+
+def run_solid_geometry(geometry: Geometry, *, settings: SolidSettings, fit: RasterFitter) -> list[StudyRow]:
+    """The rows of one geometry: the body is condensed once for all stiffnesses of its lump.
+
+    Parameters
+    ----------
+    fit
+        How the map is built and Eq 7 fitted; importable by name, as `batch` needs it.
+    """
+    body = settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
+    head, condensed = settings.on(body), settings.condensed(body)
+    rows = []
+    for ratio in geometry.stiffness_ratios:
+        found = fit(raster_frames(head, settings.placed(condensed, ratio), settings), settings)
+        rows.append(
+            StudyRow(
+                seat_name(geometry.seat),
+                geometry.d_mm,
+                geometry.depth_ratio,
+                ratio,
+                found.amplitude,
+                found.sigma_x_mm,
+                found.rms,
+                bool(found.amplitude >= DETECTABLE and found.resolved),
+                found.sigma_y_mm,
+                body.layers.thickness_mm,
+                settings.head.radius_mm,
+                settings.head.shoulders,
+                normalise="mean",
+                background=settings.background,
+                fit_radius_mm=settings.fit_radius_mm,
+                noise="independent",
+                flat_field=settings.flat_field,
+            )
+        )
+    return rows

@@ -1,0 +1,536 @@
+"""Trade-offs of a map and of the forward model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError
+from tactile_bayes.forward.body import THICKNESS_MM, Body
+from tactile_bayes.forward.line import build_line, fit_empirical, head_positions, press, press_layers
+from tactile_bayes.forward.scene import Scene
+from tactile_bayes.forward.tissue import SceneBody, fat_thickness
+from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping import build_map
+from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.select import first_seconds
+from tactile_bayes.posterior.options import EstimateOptions
+from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, HEAD_PITCH_MM, NORMALISE, SHOULDERS_INSIDE
+from tactile_bayes.scan import Scan
+from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
+from tactile_bayes.size.eq6 import SizeCalibration
+from tactile_bayes.size.pooling import Calibration
+from tactile_bayes.size.terms import outside_domain
+from tactile_bayes.studies.estimate_tradeoff import Estimator, Ladder, Reference, Run, Work, climbed, default_run
+from tactile_bayes.studies.paper import (
+    HARD_RATIO,
+    Fit,
+    Geometry,
+    StudyRow,
+    StudySettings,
+    learn_as_printed,
+    run_geometry,
+)
+from tactile_bayes.studies.paper_solid import RasterFitter, SolidSettings, raster_frames, run_solid_geometry
+from tactile_bayes.studies.size_answers import SizeAnswer
+
+# --- Cost and error of each forward model and setting for one lump, measured on this machine.
+#
+# The same lump is mapped by the empirical model, by the plane-strain one at several cells, and by the solid one at
+# several meshes, ranks and rims. Each model's finest setting is the reference of its others.
+
+EMPIRICAL, PLANE, SOLID = "empirical", "plane-strain", "solid"
+# Fineness of the mesh and cell of the contact in mm, the finest last.
+_PLANE = ((1, 0.5), (1, 0.25), (2, 0.5), (2, 0.25), (3, 0.25), (4, 0.125))
+_RANKS = (1e-3, 1e-4)
+_FINENESSES = (1, 2, 3)
+_REACHES_MM = (110.0,)
+# What Eq 6 is learned from where no calibration is given.
+_TAUGHT_MM = (10.0, 15.0, 20.0, 25.0)
+_TAUGHT_DEPTHS = (0.8, 1.0, 1.2)
+
+Clock = Callable[[], float]
+"""Seconds of CPU."""
+
+
+@dataclass(frozen=True, slots=True)
+class LumpCase:
+    """The lump of a comparison.
+
+    Parameters
+    ----------
+    d_mm, depth_ratio, stiffness_ratio, seat
+        As in `study.Geometry`.
+    plane, solid
+        The default settings of both models for its body and head. All maps are as they are and fitted with a level of
+        1, as those in two dimensions are.
+    """
+
+    d_mm: float
+    depth_ratio: float
+    stiffness_ratio: float
+    seat: float
+    plane: StudySettings
+    solid: SolidSettings
+
+    @property
+    def body(self) -> Body:
+        """Geometry and tissues of the body."""
+        return self.plane.body(self.d_mm, self.depth_ratio, seat=self.seat)
+
+    @property
+    def heads(self) -> dict[str, str]:
+        """Place of the shoulders of each model's head, one of `presets.HEADS`."""
+        return {PLANE: self.plane.head.shoulders, SOLID: self.solid.head.shoulders}
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One way to compute the map.
+
+    Parameters
+    ----------
+    model
+        ``"empirical"``, ``"plane-strain"`` or ``"solid"``.
+    label
+        For people.
+    settings
+        Of the model; the empirical one is fitted to plane-strain frames of these.
+    kind
+        ``"mesh"`` where only the elements differ from the default, ``"default"``, ``"reference"`` for the finest mesh,
+        else what differs.
+    """
+
+    model: str
+    label: str
+    settings: StudySettings | SolidSettings
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Cost and map of one setting.
+
+    Parameters
+    ----------
+    setting
+        What was measured.
+    element_mm
+        Mean length of an element on the lump's surface.
+    lump_s
+        CPU for a lump: mesh, factorisation, condensing, the head on the body.
+    map_s
+        CPU for another stiffness of it: its frames and their map.
+    amplitude, sigma_x_mm, sigma_y_mm
+        The map's Gaussian; no `sigma_y_mm` in two dimensions.
+    """
+
+    setting: Setting
+    element_mm: float
+    lump_s: float
+    map_s: float
+    amplitude: float
+    sigma_x_mm: float
+    sigma_y_mm: float | None
+
+    @property
+    def seconds(self) -> float:
+        """CPU seconds for one map from scratch."""
+        return self.lump_s + self.map_s
+
+
+def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
+    """Lump of a scene, with both models' settings for its body and head.
+
+    Parameters
+    ----------
+    head
+        One of `presets.HEADS`: where the shoulders of the scene's head lie, in both models. None: inside the array in
+        two dimensions, and as the scene gives them in three.
+
+    Raises
+    ------
+    BadDataError
+        When it has not exactly one lump, a ball of tissue and no rib.
+    """
+    if scene.lumps or scene.ribs or len(scene.solid_lumps) != 1:
+        many = "bumps" if scene.lumps else "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps"
+        raise BadDataError(f"the scene has {many}", way_out="give one lump of tissue: d_mm, depth_ratio")
+    (lump,), body = scene.solid_lumps, scene.body or SceneBody()
+    if lump.vertical_mm != lump.d_mm:
+        raise BadDataError(f"lump[0].height_mm is {lump.vertical_mm:g}", way_out="leave it out: both models are round")
+    seat = (fat_thickness(body, [lump]) - lump.depth_mm) / (lump.d_mm / 2)
+    tissue = (scene.background.mean_kpa, body.nu, body.fat_kpa, body.gland_ratio, body.thickness_mm)
+    section = scene.head.section(head or SHOULDERS_INSIDE)
+    array = scene.head if head is None else scene.head.with_shoulders(head)
+    case = LumpCase(
+        lump.d_mm,
+        lump.depth_ratio,
+        lump.stiffness_ratio,
+        round(seat, 9) + 0.0,
+        StudySettings(section, *tissue),
+        SolidSettings(array, *tissue, background="fixed", flat_field=False),
+    )
+    _ = case.body  # refuses what neither model can do
+    return case
+
+
+def forward_settings(case: LumpCase) -> list[Setting]:
+    """All settings to compare: within a model the cheap ones first, its reference last."""
+    found = [Setting(EMPIRICAL, "Eqs 1 to 4", case.plane, "default")]
+    for fineness, cell in _PLANE:
+        chosen = replace(case.plane, fineness=fineness, cell_mm=cell)
+        kind = _kind(chosen == case.plane, cell == case.plane.cell_mm, (fineness, cell) == _PLANE[-1], "contact cell")
+        found.append(Setting(PLANE, f"fineness {fineness}, cell {cell:g} mm", chosen, kind))
+    for fineness in _FINENESSES:
+        chosen_solid = replace(case.solid, fineness=fineness)
+        kind = _kind(chosen_solid == case.solid, True, fineness == _FINENESSES[-1], "")
+        found.append(Setting(SOLID, f"fineness {fineness}", chosen_solid, kind))
+    for rank in _RANKS:
+        found.append(Setting(SOLID, f"rank tolerance {rank:g}", replace(case.solid, rank_tolerance=rank), "rank"))
+    for reach in _REACHES_MM:
+        found.append(Setting(SOLID, f"mesh ends at {reach:g} mm", replace(case.solid, mesh_reach_mm=reach), "reach"))
+    edge = "shoulders" if case.solid.head.shoulders == SHOULDERS_INSIDE else "rim"
+    bare = replace(case.solid, head=replace(case.solid.head, shoulder_mm=0.0, rim_mm=0.0))
+    found.append(Setting(SOLID, f"head without its {edge}", bare, "rim"))
+    return [setting for setting in found if setting.kind != "reference"] + [
+        setting for setting in found if setting.kind == "reference"
+    ]
+
+
+def _kind(default: bool, mesh_only: bool, reference: bool, other: str) -> str:
+    if reference:
+        return "reference"
+    return "default" if default else "mesh" if mesh_only else other
+
+
+def measure_forward(
+    case: LumpCase, setting: Setting, *, fit: Fit, raster_fit: RasterFitter, clock: Clock, runs: int = 1
+) -> Measured:
+    """Compute the map by one setting and measure the time.
+
+    Parameters
+    ----------
+    fit, raster_fit
+        Of Eq 5 to a line, and of Eq 7 to a raster.
+    clock
+        Called before and after each part.
+    runs
+        The least of this many is kept.
+    """
+    work = {EMPIRICAL: _empirical, PLANE: _plane, SOLID: _solid}[setting.model]
+    times = []
+    for _ in range(runs):
+        begun = clock()
+        prepared = work(case, setting)
+        middle = clock()
+        found = prepared(fit, raster_fit)
+        times.append((middle - begun, clock() - middle))
+    lump, one_map = np.min(times, axis=0)
+    return Measured(setting, _element_mm(case, setting), float(lump), float(one_map), *found)
+
+
+_Shown = tuple[float, float, float | None]
+_Prepared = Callable[[Fit, RasterFitter], _Shown]
+
+
+def _empirical(case: LumpCase, setting: Setting) -> _Prepared:
+    settings = setting.settings
+    assert isinstance(settings, StudySettings)
+    head, mean, cell = settings.head, settings.mean_kpa, settings.cell_mm
+    far = press_layers(case.body.layers, head=head, mean_kpa=mean, cell_mm=cell).as_taxels(HEAD_PITCH_MM)
+    over = press(settings.surface(case.body), case.stiffness_ratio, np.zeros(1), head=head, mean_kpa=mean)
+    seen = over.as_taxels(HEAD_PITCH_MM)
+    model = fit_empirical(seen.s_mm, far.at(0.0), seen.at(0.0), d_mm=case.d_mm, half_width_mm=head.half_width_mm)
+
+    def shown(fit: Fit, _: RasterFitter) -> _Shown:
+        frames = model.frames(head_positions(settings.positions_mm), over.s_mm)
+        found = fit(build_line(frames), settings.fit_radius_mm)
+        return found.amplitude, found.sigma_mm, None
+
+    return shown
+
+
+def _plane(case: LumpCase, setting: Setting) -> _Prepared:
+    settings = setting.settings
+    assert isinstance(settings, StudySettings)
+    surface = settings.surface(case.body)
+
+    def shown(fit: Fit, _: RasterFitter) -> _Shown:
+        found = fit(build_line(settings.frames(surface, case.stiffness_ratio)), settings.fit_radius_mm)
+        return found.amplitude, found.sigma_mm, None
+
+    return shown
+
+
+def _solid(case: LumpCase, setting: Setting) -> _Prepared:
+    settings = setting.settings
+    assert isinstance(settings, SolidSettings)
+    head, condensed = settings.on(case.body), settings.condensed(case.body)
+
+    def shown(_: Fit, raster_fit: RasterFitter) -> _Shown:
+        frames = raster_frames(head, settings.placed(condensed, case.stiffness_ratio), settings)
+        found = raster_fit(frames, settings)
+        return found.amplitude, found.sigma_x_mm, found.sigma_y_mm
+
+    return shown
+
+
+def _element_mm(case: LumpCase, setting: Setting) -> float:
+    """Half the lump's circumference over the elements on it."""
+    settings = setting.settings
+    if isinstance(settings, SolidSettings):
+        from tactile_bayes.forward.mesh import lump_mesh
+
+        nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
+    else:
+        from tactile_bayes.forward.plane_strain import rim_nodes
+
+        nodes = rim_nodes(case.body, fineness=settings.fineness)
+    return float(np.pi * case.body.radius_mm / ((nodes - 1) / 2))
+
+
+def teach(
+    case: LumpCase, model: str, *, fit: Fit, raster_fit: RasterFitter, progress: Callable[[int, int], None]
+) -> list[StudyRow]:
+    """Simulate hard lumps of several sizes and depths in the case's body, to learn Eq 6 from."""
+    geometries = [Geometry(case.seat, d, h, (HARD_RATIO,)) for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS]
+    deepest = max(d * (h + max(0.6, 0.5 * case.seat)) + 2.0 for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS)
+    thickness = max(case.solid.thickness_mm or THICKNESS_MM, deepest)
+    rows: list[StudyRow] = []
+    for number, geometry in enumerate(geometries, start=1):
+        if model == SOLID:
+            rows += run_solid_geometry(geometry, settings=replace(case.solid, thickness_mm=thickness), fit=raster_fit)
+        else:
+            rows += run_geometry(geometry, settings=replace(case.plane, thickness_mm=thickness), fit=fit)
+        progress(number, len(geometries))
+    return rows
+
+
+def change(value: float | None, reference: float | None) -> float:
+    """Relative difference; NaN where either is missing."""
+    if value is None or reference is None:
+        return float("nan")
+    return value / reference - 1.0
+
+
+def cheapest(found: Sequence[Measured], errors: FloatArray, *, tolerance: float) -> Measured | None:
+    """The cheapest of the settings whose error is at most `tolerance`."""
+    good = [one for one, error in zip(found, errors, strict=True) if abs(error) <= tolerance]
+    return min(good, key=lambda one: one.seconds, default=None)
+
+
+# --- Point estimates of size from one map's Gaussian, by either form of the size calibration.
+
+Sizes = Callable[[float, float, float | None], list[float]]
+"""Diameters in mm from an amplitude and the widths across and along the head."""
+Outside = Callable[[float, float, float | None], list[str]]
+"""In what the same lie outside the table that a calibration was learned from, in words."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SizeRule:
+    """Rule that converts amplitude and widths to a size.
+
+    Parameters
+    ----------
+    sizes
+        Diameters; the largest is the size.
+    scatter
+        Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out.
+    source
+        In words.
+    outside_of
+        What of a map is none of the calibration's.
+    """
+
+    sizes: Sizes
+    scatter: float
+    source: str
+    outside_of: Outside | None = None
+
+    def size_mm(self, one: Measured) -> float:
+        """Size of a measured map; NaN where its amplitude allows none."""
+        if not one.amplitude > 0:
+            return float("nan")
+        return max(self.sizes(one.amplitude, one.sigma_x_mm, one.sigma_y_mm))
+
+    def outside(self, one: Measured) -> list[str]:
+        """Quantities of a measured map that lie outside the calibration's table, in words."""
+        if self.outside_of is None:
+            return []
+        return self.outside_of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm)
+
+
+def learned_rule(rows: Sequence[StudyRow]) -> SizeRule:
+    """Learn Eq 6 in two stages from a study's rows, for each axis of the head, and its scatter over the rows."""
+    axes = ["x", "y"] if rows[0].sigma_y_mm is not None else ["x"]
+    learned = [learn_as_printed(rows, axis=axis) for axis in axes]
+
+    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
+        widths = (sigma_x_mm, sigma_y_mm)
+        return [
+            one.m * width / (one.e * amplitude**one.f) + one.b_mm
+            for one, width in zip(learned, widths, strict=False)
+            if one is not None and width is not None
+        ] or [float("nan")]
+
+    shown = [row for row in rows if row.detectable]
+    left = [max(sizes(row.amplitude, row.sigma_x_mm, row.sigma_y_mm)) / row.d_mm for row in shown]
+    scatter = float(np.sqrt(np.mean(np.log(np.maximum(left, 1e-3)) ** 2))) if shown else float("nan")
+    kind = "balls" if len(axes) == 2 else "cylinders"
+    return SizeRule(sizes, scatter, f"Eq 6 in two stages from {len(shown)} hard {kind} of 10 to 25 mm in this body")
+
+
+def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
+    """The point estimate of a calibration of either form; `name` is for people."""
+    if isinstance(calibration, BodyCalibration):
+        return _body_rule(calibration, name)
+    return _eq6_rule(calibration, name)
+
+
+def _eq6_rule(calibration: SizeCalibration, name: str) -> SizeRule:
+    """Eq 6 with its mean coefficients for each axis of the head."""
+
+    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
+        a = np.array([amplitude])
+        found = [float(calibration.x.size_mm(np.array([sigma_x_mm]), a)[0])]
+        if sigma_y_mm is not None:
+            found.append(float(calibration.y.size_mm(np.array([sigma_y_mm]), a)[0]))
+        return found
+
+    def outside(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[str]:
+        along = [] if sigma_y_mm is None else outside_domain(calibration.y.domain, amplitude, sigma_y_mm)
+        return list(dict.fromkeys([*outside_domain(calibration.x.domain, amplitude, sigma_x_mm), *along]))
+
+    return SizeRule(sizes, float(calibration.x.draws.mean(axis=0)[4]), f"Eq 6 of {name}", outside)
+
+
+def _body_rule(calibration: BodyCalibration, name: str) -> SizeRule:
+    """A calibration over a population with its mean coefficients, for a round lump in a body of which nothing is known.
+
+    Notes
+    -----
+    It is the median of what `pooled_size` draws where the map says a and the widths exactly. A map in two dimensions
+    has one width, which stands for both.
+    """
+
+    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
+        width = mean_width_mm(sigma_x_mm, sigma_y_mm)
+        log_a, log_width = np.log(np.array(amplitude)), np.log(np.array(width))
+        return [float(np.exp(calibration.corrected_log_size(log_a, log_width)))]
+
+    scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
+    return SizeRule(sizes, float(scatter), f"{calibration.form_name} of {name}", calibration.outside)
+
+
+# --- Cost of accuracy before the map: cells, frames, time of strokes and normalising, each up to the size.
+
+FINEST_CELL_MM = 0.5
+CELLS_MM = (FINEST_CELL_MM, 0.75, 1.5, 2.0, 3.0, 4.0)
+EVERY = (2, 4, 8, 16, 32)
+SHARES_OF_TIME = (0.75, 0.5, 0.25)
+CELL, FRAMES, TIME, LEVEL = "cell size", "frames used", "time of strokes", "normalising"
+Inputs = Callable[[TactileMap], tuple[Calibration | None, EstimateOptions]]
+
+
+@dataclass(frozen=True, slots=True)
+class MapSetting:
+    """One way to build a map.
+
+    Parameters
+    ----------
+    axis, label, default, usable
+        As of `Priced`.
+    options
+        Of `build_map`.
+    duration_s
+        Use the first so many seconds only; None uses all.
+    weight
+        About how many times the default's CPU time it takes, for a forecast.
+    """
+
+    axis: str
+    label: str
+    options: dict[str, Any] = field(default_factory=dict)
+    duration_s: float | None = None
+    weight: float = 1.0
+    default: bool = False
+    usable: bool = True
+
+
+def map_settings(scan: Scan) -> list[MapSetting]:
+    """Everything that is tried, the default first."""
+    time_s = scan.frames.time_s
+    whole_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    return [
+        MapSetting(CELL, f"--cell-mm {CELL_MM:g}", default=True),
+        *(MapSetting(CELL, f"--cell-mm {h:g}", {"cell_mm": h}, weight=0.5 + 0.5 / h**2) for h in CELLS_MM),
+        *(MapSetting(FRAMES, f"--every {n}", {"every": n}, weight=0.5 + 0.5 / n) for n in EVERY),
+        *(
+            MapSetting(TIME, f"the first {share * whole_s:.3g} s of {whole_s:.3g} s", {}, share * whole_s, usable=False)
+            for share in SHARES_OF_TIME
+            if whole_s > 0
+        ),
+        *(
+            MapSetting(LEVEL, f"--normalise {way}", {"normalise": way}, usable=False)
+            for way in NORMALISE
+            if way != DEFAULT_NORMALISE
+        ),
+    ]
+
+
+def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
+    """Build and estimate the map of a scan at every setting.
+
+    Parameters
+    ----------
+    inputs
+        From a map to the calibration and the options with which `estimate` takes it by itself.
+
+    Raises
+    ------
+    BadDataError
+        When no map can be built by default.
+    """
+    clock = work.clock
+
+    def run_of(one: MapSetting) -> Run:
+        def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
+            begun = clock()
+            try:
+                tactile_map = _build(scan, one)
+                built_s = clock() - begun
+                calibration, options = inputs(tactile_map)
+                estimator = Estimator(tactile_map, calibration, work.seed, clock, work.probability)
+                seconds, answer = estimator.run(options)(number)
+            except BadDataError as error:
+                if one.default:
+                    raise
+                return {"map": clock() - begun, "estimate": 0.0}, SizeAnswer(str(error))
+            return {"map": built_s, **seconds}, answer
+
+        return once
+
+    settings = map_settings(scan)
+    seconds, _ = default_run(run_of(settings[0]))
+    return climbed(settings, run_of, lambda: _reference(scan, inputs, work), default_s=seconds, work=work)
+
+
+def _build(scan: Scan, one: MapSetting) -> TactileMap:
+    used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
+    return build_map(used, **one.options)
+
+
+def _reference(scan: Scan, inputs: Inputs, work: Work) -> Reference:
+    """A long run on the map with the finest cells, of all frames."""
+    begun = work.clock()
+    finest = build_map(scan, cell_mm=FINEST_CELL_MM)
+    calibration, options = inputs(finest)
+    found = Estimator(finest, calibration, work.seed, work.clock, work.probability).reference(options)
+    words = found.words.replace("the default's posterior", f"the map of all frames in cells of {FINEST_CELL_MM:g} mm")
+    return replace(found, words=words, cpu_s=work.clock() - begun)

@@ -1,0 +1,441 @@
+"""Limits of agreement, with their tolerance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import numpy as np
+
+from tactile_bayes.trial.figures import (
+    Figure,
+    Sample,
+    Scale,
+    SumStatistic,
+    UndefinedError,
+    columns,
+    figure,
+    interval_from_values,
+    kurtosis_freedom,
+    method_of,
+    on_scale,
+    ratio,
+)
+from tactile_bayes.trial.lines import centred, student
+from tactile_bayes.trial.readings import FloatArray, ModalitySizes
+
+# --- Exact factors k such that mean + k SD of a normal sample bounds its percentiles with a stated confidence.
+
+_NODES = 400
+
+
+@cache
+def percentile_factor(n: int, *, percentile: float, confidence: float) -> float:
+    r"""k with :math:`P(\mu + z_p \sigma \le \bar x + k s) =` `confidence` for a sample of n.
+
+    A quantile of the noncentral t distribution over root n: the one-sided tolerance factor (Odeh & Owen 1980).
+    Carkeet (2015), Optom. Vis. Sci. 92, e71, uses it for limits of agreement taken one at a time.
+    """
+    from scipy.special import ndtr, ndtri
+
+    z = float(ndtri(percentile))
+    chi, weight = _chi_nodes(n - 1)
+
+    def reached(k: float) -> float:
+        return float(weight @ ndtr(math.sqrt(n) * (k * chi - z)))
+
+    return _root(reached, confidence)
+
+
+@cache
+def content_factor(n: int, *, content: float, confidence: float) -> float:
+    r"""k such that mean +- k SD of a sample of n holds at least `content` of the population with this confidence.
+
+    Two-sided tolerance factor of Wald & Wolfowitz (1946), exact as in Odeh & Owen (1980); Carkeet (2015) uses it for
+    the two limits of agreement taken as a pair.
+    """
+    from scipy.special import gammaincc, ndtri
+
+    at, normal = np.polynomial.legendre.leggauss(_NODES)
+    reach = min(9.0, float(ndtri(1 - 1e-17)))
+    off = (at + 1) / 2 * reach
+    weight = normal / 2 * reach * 2 * np.exp(-(off**2) / 2) / math.sqrt(2 * math.pi)
+    radius = _radius(off / math.sqrt(n), content)
+    freedom = n - 1
+
+    def reached(k: float) -> float:
+        if k <= 0:
+            return 0.0
+        return float(weight @ gammaincc(freedom / 2, freedom * (radius / k) ** 2 / 2))
+
+    return _root(reached, confidence)
+
+
+def _radius(shift: FloatArray, content: float) -> FloatArray:
+    """Solve Phi(shift + r) - Phi(shift - r) = content for r."""
+    from scipy.special import ndtr, ndtri
+
+    low, high = np.zeros_like(shift), np.abs(shift) + float(ndtri(0.5 + 0.5 * content)) + 1e-9
+    for _ in range(80):
+        middle = (low + high) / 2
+        short = ndtr(shift + middle) - ndtr(shift - middle) < content
+        low, high = np.where(short, middle, low), np.where(short, high, middle)
+    return (low + high) / 2
+
+
+def _chi_nodes(freedom: int) -> tuple[FloatArray, FloatArray]:
+    """Values of s / sigma and their probabilities: Gauss-Legendre in the logarithm of s^2 / sigma^2."""
+    from scipy.special import gammaincinv, gammaln
+
+    half = freedom / 2
+    low = max(float(gammaincinv(half, 1e-18)), 1e-300) / half
+    high = float(half + 12 * math.sqrt(half) + 80) / half
+    at, normal = np.polynomial.legendre.leggauss(_NODES)
+    a, b = math.log(low), math.log(high)
+    log_v = a + (at + 1) / 2 * (b - a)
+    v = np.exp(log_v)
+    weight = normal / 2 * (b - a) * np.exp(half * (log_v - v) + half * math.log(half) - float(gammaln(half)))
+    return np.sqrt(v), weight / weight.sum()
+
+
+def _root(function: Callable[[float], float], target: float) -> float:
+    """Solve an increasing function for a target by bisection, to 1e-12 of its size."""
+    low, high = -1.0, 1.0
+    while function(high) < target and high < 1e12:
+        low, high = high, 4 * high
+    while function(low) > target and low > -1e12:
+        low, high = 4 * low, low
+    for _ in range(200):
+        middle = (low + high) / 2
+        if middle in (low, high) or high - low < 1e-13 * max(1.0, abs(middle)):
+            break
+        low, high = (middle, high) if function(middle) < target else (low, middle)
+    return (low + high) / 2
+
+
+# --- Limits of agreement: bias and spread of the differences between two methods, with and without replicates.
+#
+# Differences are the method under test less the reference, y - x. Intervals take the masses as independent; where a
+# patient has several masses the jackknife over patients stands beside them.
+
+Ends = tuple[float, float]
+# Share of the differences that lie between the limits.
+SHARE = 0.95
+# Times that errors proportional to size must be likelier than constant ones, and masses needed to judge it.
+LIKELIER = 3.0
+LEAST_MASSES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of agreement and their intervals; all in the unit of the differences.
+
+    Attributes
+    ----------
+    sd
+        Standard deviation that the limits are built on: of one difference, for single readings.
+    low, high
+        bias -+ z sd, between which the stated share of differences lies.
+    low_interval, high_interval
+        Each limit on its own: exact for single readings (Carkeet 2015), by variance recovery with replicates.
+    pair_intervals
+        Of both limits taken together, exact (Carkeet 2015); None with replicates.
+    approximate_intervals
+        Bland & Altman's (1986), for comparison with other programs; None with replicates.
+    components
+        Variances that add up to ``sd`` squared, by name; empty for single readings.
+    """
+
+    n: int
+    bias: float
+    bias_interval: Ends | None
+    sd: float
+    low: float
+    high: float
+    low_interval: Ends | None = None
+    high_interval: Ends | None = None
+    pair_intervals: tuple[Ends, Ends] | None = None
+    approximate_intervals: tuple[Ends, Ends] | None = None
+    components: dict[str, float] | None = None
+
+
+def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
+    r"""Limits of agreement of single readings, between which `SHARE` of the differences lie.
+
+    Parameters
+    ----------
+    differences : (n,) array
+        y - x of each mass.
+
+    Notes
+    -----
+    Bland & Altman (1986), Lancet i, 307: limits :math:`\bar d \mp z s`, their standard error
+    :math:`s\sqrt{1/n + z^2/(2(n-1))}` for the approximate intervals. The exact ones are tolerance factors: Carkeet
+    (2015), Optom. Vis. Sci. 92, e71.
+
+    Raises
+    ------
+    UndefinedError
+        With fewer than two differences.
+    """
+    n = len(differences)
+    if n < 2:
+        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
+    bias, sd = float(differences.mean()), float(differences.std(ddof=1))
+    z, tail = _normal(0.5 + 0.5 * SHARE), 0.5 + 0.5 * confidence
+    t = student(n - 1, confidence=confidence)
+    inner = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
+    outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
+    pair = [content_factor(n, content=SHARE, confidence=c) for c in (1 - tail, tail)]
+    reach = t * math.sqrt(1 / n + z * z / (2 * (n - 1)))
+    return Limits(
+        n=n,
+        bias=bias,
+        bias_interval=(bias - t * sd / math.sqrt(n), bias + t * sd / math.sqrt(n)),
+        sd=sd,
+        low=bias - z * sd,
+        high=bias + z * sd,
+        low_interval=(bias - outer * sd, bias - inner * sd),
+        high_interval=(bias + inner * sd, bias + outer * sd),
+        pair_intervals=((bias - pair[1] * sd, bias - pair[0] * sd), (bias + pair[0] * sd, bias + pair[1] * sd)),
+        approximate_intervals=(
+            (bias - (z + reach) * sd, bias - (z - reach) * sd),
+            (bias + (z - reach) * sd, bias + (z + reach) * sd),
+        ),
+    )
+
+
+def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confidence: float = 0.95) -> Limits:
+    r"""Limits for single readings from unpaired replicates of an unchanging true size.
+
+    Parameters
+    ----------
+    x, y
+        Replicates of each mass by the reference and by the method under test, one or more each.
+
+    Notes
+    -----
+    The variance of the differences of means, plus what averaging took out of it:
+
+    .. math:: s^2 = s_{\bar d}^2 + (1 - 1/m_x) s_{xw}^2 + (1 - 1/m_y) s_{yw}^2
+
+    with the harmonic means m of the numbers of replicates and the within-mass variances of one-way analyses of
+    variance: Bland & Altman (1999), Stat. Methods Med. Res. 8, 135, section 5; intervals by variance recovery, Zou
+    (2013), Stat. Methods Med. Res. 22, 630.
+    """
+    means = np.array([b.mean() - a.mean() for a, b in zip(x, y, strict=True)])
+    parts = [_within(x), _within(y)]
+    return _from_means(means, parts, names=("reference_within", "within"), confidence=confidence)
+
+
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """How differences change with size: slope of a least-squares line, per unit of size, with its t test."""
+
+    slope: float
+    interval: Ends | None
+    p_value: float | None
+
+
+def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.95) -> Trend:
+    """Test proportional bias: slope of the differences on size.
+
+    `sizes` are the means of both methods (Bland & Altman 1999) or, when the reference is much the better of the two,
+    the reference itself (Krouwer 2008, Stat. Med. 27, 778): against the mean, unequal errors alone make a slope.
+    """
+    from scipy.special import stdtr
+
+    from tactile_bayes.trial.lines import least_squares
+
+    line = least_squares(sizes, differences)
+    both = line.intervals(confidence=confidence)
+    if both is None or line.slope_se is None:
+        return Trend(line.slope, None, None)
+    if line.slope_se == 0:
+        return Trend(line.slope, both[1], 1.0 if line.slope == 0 else 0.0)
+    return Trend(line.slope, both[1], 2 * float(stdtr(line.n - 2, -abs(line.slope) / line.slope_se)))
+
+
+def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
+    r"""Whether normal ln y - ln x with one SD is likelier than normal y - x, by a factor of `LIKELIER`.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays, above 0
+        Ex-vivo sizes and sizes; False for fewer than `LEAST_MASSES`.
+
+    Notes
+    -----
+    Likelihoods of y, profiled over mean and SD as in Box & Cox (1964), J. R. Stat. Soc. B 26, 211: the logarithm's
+    carries the Jacobian :math:`\prod 1/y`.
+    """
+    n = len(x)
+    if n < LEAST_MASSES:
+        return False
+    with np.errstate(all="ignore"):
+        logs, off = np.var(np.log(y) - np.log(x)), np.var(y - x)
+        gain = 0.5 * n * (np.log(off) - np.log(logs)) - float(np.sum(np.log(y)))
+    return bool(np.isfinite(gain) and gain > np.log(LIKELIER))
+
+
+@dataclass(frozen=True, slots=True)
+class _Within:
+    """Pooled within-mass variance, its degrees of freedom and the harmonic mean number of replicates."""
+
+    variance: float
+    freedom: int
+    harmonic: float
+
+    @property
+    def restored(self) -> float:
+        """Variance of one reading that averaging over replicates removed."""
+        return (1 - 1 / self.harmonic) * self.variance
+
+
+def _within(groups: Sequence[FloatArray]) -> _Within:
+    numbers = np.array([len(group) for group in groups])
+    freedom = int(numbers.sum()) - len(groups)
+    squares = sum(float(np.sum((group - group.mean()) ** 2)) for group in groups if len(group) > 1)
+    return _Within(squares / freedom if freedom else 0.0, freedom, len(groups) / float(np.sum(1 / numbers)))
+
+
+def _from_means(means: FloatArray, within: Sequence[_Within], *, names: Sequence[str], confidence: float) -> Limits:
+    n = len(means)
+    if n < 2:
+        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
+    between = float(means.var(ddof=1))
+    total = between + sum(one.restored for one in within)
+    bias, z = float(means.mean()), _normal(0.5 + 0.5 * SHARE)
+    low, high = bias - z * math.sqrt(total), bias + z * math.sqrt(total)
+    parts = [(between, n - 1), *((one.restored, one.freedom) for one in within)]
+    wide, narrow = _recovered(parts, total, z=z, bias_variance=between / n, confidence=confidence)
+    t = student(n - 1, confidence=confidence) * math.sqrt(between / n)
+    return Limits(
+        n=n,
+        bias=bias,
+        bias_interval=(bias - t, bias + t),
+        sd=math.sqrt(total),
+        low=low,
+        high=high,
+        low_interval=(low - wide, low + narrow),
+        high_interval=(high - narrow, high + wide),
+        components={"means": between} | {name: one.restored for name, one in zip(names, within, strict=True)},
+    )
+
+
+def _recovered(
+    parts: Sequence[tuple[float, int]], total: float, *, z: float, bias_variance: float, confidence: float
+) -> Ends:
+    """Outer and inner reach of a limit's interval, from chi-squared intervals of each variance (Zou 2013)."""
+    from scipy.special import chdtri
+
+    tail = 0.5 - 0.5 * confidence
+    below = above = 0.0
+    for variance, freedom in parts:
+        if freedom == 0 or variance == 0:
+            continue
+        below += (variance * (1 - freedom / float(chdtri(freedom, tail)))) ** 2
+        above += (variance * (1 - freedom / float(chdtri(freedom, 1 - tail)))) ** 2
+    low, high = math.sqrt(max(0.0, total - math.sqrt(below))), math.sqrt(total + math.sqrt(above))
+    of_bias = _normal(1 - tail) ** 2 * bias_variance
+    wide = math.sqrt(of_bias + (z * (high - math.sqrt(total))) ** 2)
+    narrow = math.sqrt(of_bias + (z * (math.sqrt(total) - low)) ** 2)
+    return wide, narrow
+
+
+def _normal(probability: float) -> float:
+    from scipy.special import ndtri
+
+    return float(ndtri(probability))
+
+
+# --- Limits of agreement with intervals over patients, for differences of any distribution and any masses per patient.
+#
+# The exact and the approximate intervals that other programs print take the masses as independent and the
+# differences as normal; they are in `bland_altman` and stand beside these in the JSON report.
+
+# 95 % of a normal distribution lie within so many SDs.
+_SHARE = 1.959963984540054
+_ONE = "one mass has no spread"
+
+
+def figures(found: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+    """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
+    made: dict[str, Figure] = {}
+    for unit, terms in (("mm", _mm_terms), ("log_ratio", _log_terms)):
+        for side, sign in (("low", -1), ("high", 1)):
+            made[f"limit_{side}_{unit}"] = _limit(terms, sign, found, confidence=confidence)
+    return made
+
+
+def _limit(
+    terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
+) -> Figure:
+    plain = figure(SumStatistic(terms, partial(_end, sign), _ONE), found, scale="linear", confidence=confidence)
+    if method_of(confidence) != "corrected" or plain.interval is None:
+        return plain
+    try:
+        return replace(plain, interval=_recovered_of_patients(terms, sign, found, confidence=confidence))
+    except UndefinedError as undefined:
+        return replace(plain, interval=None, interval_reason=str(undefined))
+
+
+def _recovered_of_patients(
+    terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
+) -> Ends:
+    """Interval of a limit from those of the mean and, on the log scale, of the SD (Zou 2013, see `bland_altman`)."""
+    mean, around = _jackknifed(SumStatistic(terms, _mean, _ONE), found, scale="linear", confidence=confidence)
+    sd, about = _jackknifed(SumStatistic(terms, _sd, _ONE), found, scale="log", confidence=confidence)
+    limit = mean + sign * _SHARE * sd
+    inner, outer = _SHARE * (sd - about[0]), _SHARE * (about[1] - sd)
+    below, above = (inner, outer) if sign > 0 else (outer, inner)
+    return limit - math.hypot(mean - around[0], below), limit + math.hypot(around[1] - mean, above)
+
+
+def _jackknifed(
+    statistic: SumStatistic, found: ModalitySizes, *, scale: Scale, confidence: float
+) -> tuple[float, Ends]:
+    """Value with its jackknife interval, and the degrees of freedom of its leave-one-out values."""
+    sample = Sample(statistic, found)
+    value, left = sample.value(), sample.left_out()
+    freedom = kurtosis_freedom(np.asarray(on_scale(left, scale)))
+    return value, interval_from_values(value, left, scale=scale, confidence=float(confidence), freedom=freedom)
+
+
+def _mm_terms(sizes: ModalitySizes) -> FloatArray:
+    return _terms(sizes.size_mm - sizes.ex_vivo_mm, sizes.replicates_mm)
+
+
+def _log_terms(sizes: ModalitySizes) -> FloatArray:
+    logs = tuple(np.log(group) for group in sizes.replicates_mm)
+    if not any(len(group) > 1 for group in logs):
+        return _terms(np.log(sizes.size_mm / sizes.ex_vivo_mm), logs)
+    return _terms(np.array([group.mean() for group in logs]) - np.log(sizes.ex_vivo_mm), logs)
+
+
+def _terms(differences: FloatArray, replicates: tuple[FloatArray, ...]) -> FloatArray:
+    """1, d, d', d'd', 1/m, squares about the mass's mean and their degrees of freedom; ' about the mean of all d."""
+    if len(differences) == 0:
+        raise UndefinedError("no mass was detected")
+    off = centred(differences, differences.mean())
+    number = np.array([max(len(group), 1) for group in replicates], dtype=np.float64)
+    squares = np.array([float(np.sum((group - group.mean()) ** 2)) if len(group) > 1 else 0.0 for group in replicates])
+    return columns(1.0, differences, off, off * off, 1 / number, squares, number - 1)
+
+
+def _mean(sums: FloatArray) -> FloatArray:
+    return ratio(sums[..., 1], sums[..., 0])
+
+
+def _sd(sums: FloatArray) -> FloatArray:
+    """SD of one difference: that of the masses' means, plus the part that averaging over replicates removed."""
+    n, _, first, second, inverse, squares, freedom = np.moveaxis(sums, -1, 0)
+    between = ratio(second - first**2 / n, n - 1)
+    within = np.where(freedom > 0.5, ratio(squares, freedom), 0.0)
+    return np.asarray(np.sqrt(np.maximum(between + (1 - inverse / n) * within, 0.0)))
+
+
+def _end(sign: int, sums: FloatArray) -> FloatArray:
+    return np.asarray(_mean(sums) + sign * _SHARE * _sd(sums))
