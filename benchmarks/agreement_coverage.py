@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.trial import accuracy, method_comparison
 from tactile_bayes.trial import accuracy as origin_line
 from tactile_bayes.trial import limits as patient_limits

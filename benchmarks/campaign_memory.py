@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import LocalWorkers, open_executor, run_batch
 from tactile_bayes.campaign.settings import put_in_place
 from tactile_bayes.campaign.steps import Task, run_step
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256
 

@@ -7,13 +7,14 @@ uneven depth, convex skin, or ribs. Nothing was chosen after seeing an answer.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from benchmarks.stress import STRESSES
 from benchmarks.stress_frames import stressed_scan
+from tactile_bayes.declarations import replace
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import Rib, fat_thickness

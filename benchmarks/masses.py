@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from benchmarks.masses_scenes import KINDS, SEED, Exam, exams, make
 from benchmarks.scene_rates import ROWS, draw_map
 from tactile_bayes.api.estimating import answer_of, estimate_one
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.geometry import apply
 from tactile_bayes.mapping.build import build_map

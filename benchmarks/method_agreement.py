@@ -13,12 +13,12 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import arviz
 import numpy as np
 
 from benchmarks.scene_rates import AXIS, gaussian, ridge
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.scene import Lump
 from tactile_bayes.forward.simulate import simulate

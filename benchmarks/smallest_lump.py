@@ -17,7 +17,6 @@ import argparse
 import json
 import pickle
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from scipy.optimize import least_squares
 
 from tactile_bayes.api.estimating import estimate_inputs, estimate_one
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate

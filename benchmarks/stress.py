@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import pickle
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 from benchmarks.stress_frames import Physics, VaryingLayers, stressed_scan
 from tactile_bayes.api.estimating import answer_of, estimate_one
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, TactileBayesError
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.geometry import FloatArray

@@ -21,12 +21,13 @@ What is changed, and how it is derived:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.forward.contact import ContactStiffness
 from tactile_bayes.forward.instrument import frame_times, head_positions, level_kpa, record
 from tactile_bayes.forward.layers import LayeredBody, skin_flexibility, taxel_compliance

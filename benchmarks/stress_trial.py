@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import pickle
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from benchmarks.stress_frames import stressed_scan
 from tactile_bayes.api.estimating import Answer, answer_of, estimate_one
 from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.scan import Scan

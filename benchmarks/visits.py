@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import numpy as np
 
 from tactile_bayes.api.estimating import estimate_one, pooling_shape
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.forward.scene import Scene, SceneLandmarks
 from tactile_bayes.forward.simulate import simulate

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +11,7 @@ from typing import Any, Final
 from tactile_bayes.api.estimating import Answer, answer_of, estimate_one
 from tactile_bayes.api.pooled import check_one_mass, elsewhere, pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.mapping.map import TactileMap

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 from tactile_bayes.api.arguments import check_keywords, door
 from tactile_bayes.api.estimates import PooledSize, SizeEstimate, listed
 from tactile_bayes.api.maps import Map, PathLike, path_of
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, read_exam, shared_facts
 from tactile_bayes.exports.identity import identity_of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -11,6 +11,7 @@ from tactile_bayes import __version__
 from tactile_bayes.campaign.match import growth_rows, growth_text
 from tactile_bayes.campaign.run import Campaign
 from tactile_bayes.campaign.tables import Row, exam_rows, write_tables
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.campaign_names import (
     DONE,

@@ -6,12 +6,13 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import field, replace
+from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.presets import DEFAULT_NORMALISE, MATCH_MM
 from tactile_bayes.records import dataclass

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes.campaign.match import unnamed
 from tactile_bayes.campaign.run import Campaign
+from tactile_bayes.declarations import replace
 from tactile_bayes.files.campaign_names import DONE, ESTIMATE, EXAMS, FAILURES, MASSES, POOLED, SIZED, TRIAL
 from tactile_bayes.files.documents import load_json, load_schema
 from tactile_bayes.files.manifest_csv import Exam, table_text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,6 +10,7 @@ import click
 
 from tactile_bayes.api.settings import GROWN_BY, Comparing, Settings, refuse_checkpoint, times_of
 from tactile_bayes.commands.options import FORCE, METAVAR, FigurePath, FilePath, FiniteRange, also_read, seed_option
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import METHODS, REGISTRATION_MM
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 
 if TYPE_CHECKING:

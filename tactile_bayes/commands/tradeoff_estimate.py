@@ -64,12 +64,12 @@ def command(
     Example: tactile-bayes tradeoff estimate map.nc --figure methods.png
     """
     import time
-    from dataclasses import replace
 
     from tactile_bayes.api.tradeoffs import pooled_rows, tradeoff_of_map
     from tactile_bayes.commands.options import settings_of
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.tradeoff_options import forecast, fresh_cpu_s, show
+    from tactile_bayes.declarations import replace
     from tactile_bayes.errors import UsageError
     from tactile_bayes.files.atomic import given_twice, refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs

@@ -43,12 +43,12 @@ def command(
     Example: tactile-bayes tradeoff map scan.mcap --figure cells.png
     """
     import time
-    from dataclasses import replace
 
     from tactile_bayes.api.settings import Settings
     from tactile_bayes.api.tradeoffs import tradeoff_of_scan
     from tactile_bayes.commands.progress import progress_bar
     from tactile_bayes.commands.tradeoff_options import forecast, show
+    from tactile_bayes.declarations import replace
     from tactile_bayes.files.atomic import refuse_existing
     from tactile_bayes.files.provenance import Provenance, hash_inputs
     from tactile_bayes.files.scan_mcap import read_scan

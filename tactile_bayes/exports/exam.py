@@ -7,10 +7,10 @@ import hashlib
 import importlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, UsageError
 from tactile_bayes.exports.codes import NOT_DETECTED, NOT_SIZED, SIZED, Code
 from tactile_bayes.files.atomic import sha256

@@ -8,10 +8,11 @@ import logging
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.exports.exam import required
 from tactile_bayes.files.documents import check_document, load_json, load_schema, refuse_unknown

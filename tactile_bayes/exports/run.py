@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.exam import EstimateFile, MapFile, check_pairs
 from tactile_bayes.exports.identity import Identity

@@ -7,12 +7,12 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from tactile_bayes.declarations import from_plain, schema_name
+from tactile_bayes.declarations import from_plain, replace, schema_name
 from tactile_bayes.errors import BadDataError, meant
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
 from tactile_bayes.studies.population import BodyPrior, ExamPrior

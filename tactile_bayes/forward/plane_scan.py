@@ -8,10 +8,11 @@ poses, not in the pressures, and how deep the head sinks is not followed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.body import MOST_SEAT, Body, Layers
 from tactile_bayes.forward.contact import Head

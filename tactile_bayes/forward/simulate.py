@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Final
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.instrument import SimulatedScan, head_positions, level_kpa, record
 from tactile_bayes.forward.scene import Scene, normalised_pressure, refuse_bumps

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray

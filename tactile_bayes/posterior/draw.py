@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Literal, assert_never
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import POSE_NOISE

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.fit import FieldFit

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Final, Literal, assert_never
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.posterior.bump import BumpPrior
 from tactile_bayes.posterior.field import Profiles, Window

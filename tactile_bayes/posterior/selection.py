@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import field, replace
+from dataclasses import field
 from functools import partial
 from itertools import islice
 from math import lgamma, log, pi
@@ -11,6 +11,7 @@ from typing import assert_never
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.forward.gaussian import covariance_from_log_widths
 from tactile_bayes.geometry import FloatArray

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import assert_never
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import NO_LUMP
 from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.geometry import apply

@@ -8,11 +8,11 @@ model (docs/decisions/0007).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.line import fit_shape, lump_pressure
 from tactile_bayes.forward.scene import Scene

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.trial.figures import (
     Figure,
     Sample,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Literal, Protocol, TypeVar, assert_never
 
 import numpy as np
 import numpy.typing as npt
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Jackknife intervals over patients, keeping a patient's masses together.

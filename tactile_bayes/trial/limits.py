@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.trial.figures import (
     Figure,
     Sample,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.report.tables_text import heads_text, tables_text

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from in_process import run_here
 
 import tactile_bayes as tb
 from tactile_bayes.campaign import run as campaigns
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.provenance import Provenance, recordings

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from map_files import PROVENANCE, assert_same, plain_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap

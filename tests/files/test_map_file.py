@@ -6,7 +6,6 @@ import json
 import math
 import shutil
 import stat
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -19,6 +18,7 @@ from hypothesis.extra.numpy import arrays
 from map_files import PROVENANCE, assert_same, plain_map
 from mapping_scans import rotation
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.map_nc import SCHEMA, read_map, read_map_header, write_map
 from tactile_bayes.geometry import rigid

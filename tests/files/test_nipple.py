@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from in_process import run_here
 from map_files import PROVENANCE, plain_map
 from mapping_scans import make_scan, strokes
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.instrument_json import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import CHUNK_BYTES, ScanWriter, read_scan, read_scan_report, read_truth, write_scan
@@ -300,7 +300,7 @@ def test_an_existing_file_stays_unless_forced(scan: Scan, tmp_path: Path) -> Non
 def test_a_session_that_may_name_a_person_is_refused(
     scan: Scan, tmp_path: Path, session: dict[str, str], words: str
 ) -> None:
-    named = dataclasses.replace(scan, session=session)
+    named = replace(scan, session=session)
     with pytest.raises(BadDataError, match=words):
         write_scan(tmp_path / "s.mcap", named, provenance=MADE)
     assert not list(tmp_path.iterdir())

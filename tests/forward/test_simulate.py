@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tactile_bayes
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
@@ -58,7 +59,7 @@ def test_without_noise_the_scan_is_the_scenes_function() -> None:
 
 
 def test_load_sharing_keeps_the_mean_of_each_frame() -> None:
-    scene = dataclasses.replace(QUIET, background=Background(ramp_s=0.0, load_sharing=True))
+    scene = replace(QUIET, background=Background(ramp_s=0.0, load_sharing=True))
     scan = run(scene)
     level = level_kpa(scene.background, scan.frames.time_s)
     np.testing.assert_allclose(scan.pressure_kpa().mean(axis=(1, 2)), level, atol=0.0042)  # half a count
@@ -66,16 +67,16 @@ def test_load_sharing_keeps_the_mean_of_each_frame() -> None:
 
 @given(st.tuples(*[st.floats(-170, 170)] * 3), st.tuples(*[st.floats(-500, 500)] * 3))
 def test_turning_the_base_changes_nothing_after_the_transform(turn: Any, shift: Any) -> None:
-    short = dataclasses.replace(QUIET, duration_s=0.1)
-    scene = dataclasses.replace(short, tracker=Tracker(base_rotation_deg=turn, base_offset_mm=shift))
+    short = replace(QUIET, duration_s=0.1)
+    scene = replace(short, tracker=Tracker(base_rotation_deg=turn, base_offset_mm=shift))
     scan, still = run(scene), run(short)
     np.testing.assert_array_equal(scan.frames.counts, still.frames.counts)
     np.testing.assert_allclose(taxels_in_plane(scan, scene), taxels_in_plane(still, short), atol=1e-8)
 
 
 def test_swapping_widths_is_turning_the_lump() -> None:
-    a = dataclasses.replace(LUMP, sigma_x_mm=4.0, sigma_y_mm=6.0, angle_deg=120.0)
-    turned = run(dataclasses.replace(QUIET, lumps=(a,))).frames.counts.astype(int)
+    a = replace(LUMP, sigma_x_mm=4.0, sigma_y_mm=6.0, angle_deg=120.0)
+    turned = run(replace(QUIET, lumps=(a,))).frames.counts.astype(int)
     assert np.abs(turned - run(QUIET).frames.counts).max() <= 1
 
 
@@ -93,8 +94,8 @@ def test_a_longer_scan_keeps_its_calibration() -> None:
 
 
 def test_noise_has_the_size_it_says() -> None:
-    noisy = dataclasses.replace(QUIET, duration_s=3.0, noise=Noise(0.3, 0.4, 0.2, 0.0, 0.0))
-    scan, still = run(noisy), run(dataclasses.replace(noisy, noise=SILENT))
+    noisy = replace(QUIET, duration_s=3.0, noise=Noise(0.3, 0.4, 0.2, 0.0, 0.0))
+    scan, still = run(noisy), run(replace(noisy, noise=SILENT))
     assert np.std(scan.pressure_kpa() - still.pressure_kpa()) == pytest.approx(0.3, rel=0.02)
     assert np.std(scan.poses.position_mm - still.poses.position_mm) == pytest.approx(0.4, rel=0.1)
     dots = np.abs(np.einsum("ij,ij->i", scan.poses.quaternion_wxyz, still.poses.quaternion_wxyz))
@@ -103,14 +104,14 @@ def test_noise_has_the_size_it_says() -> None:
 
 
 def test_stamps_are_late_by_the_latency_and_the_poses_are_not() -> None:
-    late = dataclasses.replace(QUIET, tracker=Tracker(latency_ms=12.0))
+    late = replace(QUIET, tracker=Tracker(latency_ms=12.0))
     a, b = run(late).poses, run(QUIET).poses
     np.testing.assert_allclose(a.time_s - b.time_s, 0.012, atol=1e-9)
     np.testing.assert_array_equal(a.position_mm, b.position_mm)
 
 
 def test_faulty_taxels_read_nothing_or_full_scale() -> None:
-    scan = run(dataclasses.replace(QUIET, taxels=Taxels(dead=((0, 1),), saturated=((15, 25),))))
+    scan = run(replace(QUIET, taxels=Taxels(dead=((0, 1),), saturated=((15, 25),))))
     assert (scan.frames.counts[:, 0, 1] == 0).all()
     assert (scan.frames.counts[:, 15, 25] == 4095).all()
     assert np.isnan(scan.pressure_kpa()[:, 15, 25]).all()
@@ -134,11 +135,11 @@ def test_truth_says_where_the_lump_is_in_every_frame() -> None:
     np.testing.assert_allclose(lump["patient_mm"], [64.0, 87.0, 0.0], atol=1e-9)
     plane = apply(np.array(simulated.truth["plane_from_base"]), np.array(lump["base_mm"]))
     np.testing.assert_allclose(plane, [4.0, -3.0, 0.0], atol=1e-9)
-    assert run(dataclasses.replace(QUIET, landmarks=SceneLandmarks(touched=False))).landmarks is None
+    assert run(replace(QUIET, landmarks=SceneLandmarks(touched=False))).landmarks is None
 
 
 def test_the_heads_face_is_an_arc_with_shoulders() -> None:
-    arc, rounded = Scene().head.surface_mm(), dataclasses.replace(Scene().head, shoulder_mm=3.0).surface_mm()
+    arc, rounded = Scene().head.surface_mm(), replace(Scene().head, shoulder_mm=3.0).surface_mm()
     np.testing.assert_allclose(arc[..., 0] ** 2 + (arc[..., 2] + 35) ** 2, 35**2)
     assert (rounded[[0, -1], :, 2] < arc[[0, -1], :, 2] - 0.5).all()
     np.testing.assert_array_equal(rounded[4:12], arc[4:12])

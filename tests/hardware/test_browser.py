@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from test_live import seen_of
 from test_orientation import UPPER_RIGHT, corner, live_state, lump_in_base
 from websockets.sync.client import ClientConnection, connect
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.hardware.live import LiveMap
 from tactile_bayes.hardware.serve import LiveServer, document
 

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from tactile_bayes.commands.live_view import Turn, live_estimate
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import (
     Feed,

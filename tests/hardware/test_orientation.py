@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from mapping_scans import gaussian, make_scan, strokes
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.hardware.live import LiveMap, LiveState, SeenFrame, SeenLandmark, SeenPose
 from tactile_bayes.hardware.serve import document
 from tactile_bayes.mapping import build_map

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from posterior_maps import bump_map, find_bump
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.forward.gaussian import cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.inference.draws import Solution, Solved
 from tactile_bayes.posterior.bump import Bump, BumpPrior

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mapping_scans as scans
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid, build_map

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mapping_scans as scans
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
 from benchmarks.stress_frames import on_sphere
+from tactile_bayes.declarations import replace
 from tactile_bayes.forward.instrument import head_positions
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import simulate

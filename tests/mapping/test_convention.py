@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import mapping_scans as scans
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from tactile_bayes.mapping import build_map, convention

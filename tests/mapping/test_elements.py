@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mapping_scans as scans
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.select import find_faults
 from tactile_bayes.scan import ElementCalibration, Scan
 

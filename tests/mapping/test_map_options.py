@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mapping_scans as scans
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.map import advise_cell

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import mapping_scans as scans
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.mapping import Instrument, MapAccumulator, MapGrid, build_map
 from tactile_bayes.mapping.errors import LEAST_SHARE
 from tactile_bayes.mapping.map import TactileMap

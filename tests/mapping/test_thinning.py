@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mapping_scans as scans
 import numpy as np
 import pytest
 
 import tactile_bayes as tb
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.convention import POOL_S, every_stretch, thinning

@@ -125,7 +125,7 @@ def test_the_size_is_equation_6_of_the_map() -> None:
     [
         (replace(RECIPE, normalise="gain"), "normalise mean (the calibration: gain)"),
         (replace(RECIPE, background="free"), "background fixed (the calibration: free)"),
-        (Recipe(radius_mm=15.0), "fit radius 20 mm (the calibration: 15 mm)"),
+        (replace(RECIPE, radius_mm=15.0), "fit radius 20 mm (the calibration: 15 mm)"),
     ],
 )
 def test_a_calibration_by_another_recipe_is_refused(recipe: Recipe, words: str) -> None:

@@ -12,7 +12,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -32,6 +32,7 @@ from tactile_bayes.api.maps import Map
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.campaign.match import growth_text
 from tactile_bayes.campaign.tables import Row, done_text
+from tactile_bayes.declarations import replace
 from tactile_bayes.exports.exam import MapFile, estimate_of
 from tactile_bayes.exports.fhir import bundle_of
 from tactile_bayes.exports.identity import Identity

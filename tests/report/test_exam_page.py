@@ -7,7 +7,6 @@ import io
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,6 +17,7 @@ import pytest
 from mapping_scans import gaussian, make_scan, strokes
 
 import tactile_bayes as tb
+from tactile_bayes.declarations import replace
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping import build_map
 from tactile_bayes.mapping.map import TactileMap

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import stat
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.map import MapRecipe, TactileMap

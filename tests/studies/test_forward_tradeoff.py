@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from click.testing import CliRunner
 
 from tactile_bayes.commands import tradeoff_forward
 from tactile_bayes.commands.study import fit_line
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.files.shipped import size_calibration_path
 from tactile_bayes.files.size_json import read_size_calibration
@@ -176,7 +176,7 @@ def test_each_form_says_what_it_leaves_and_where_it_ends() -> None:
         assert 0.05 < rule.scatter < 0.4
         found = report().found[-1]
         assert rule.outside(found) == []
-        (said, *_) = rule.outside(dataclasses.replace(found, amplitude=30.0))
+        (said, *_) = rule.outside(replace(found, amplitude=30.0))
         assert said.startswith("amplitude 30 (table: ")
 
 
@@ -206,7 +206,7 @@ def test_the_advice_names_the_cheapest_that_is_enough() -> None:
     assert "a mesh finer than 1.5 mm is wasted below that, the finest costs 2 times as much" in text
     assert "plane-strain: fineness 2, cell 0.5 mm" in text
     assert "a rule, which itself leaves 12 % (SD of ln d)" in text
-    strict = dataclasses.replace(made, tolerance=1e-9)
+    strict = replace(made, tolerance=1e-9)
     assert "solid: only the finest setting keeps the size within" in tradeoff_text(strict)
     errors = np.array([made.size_error(one) for one in made.found])
     assert cheapest(made.found, errors, tolerance=-1.0) is None
@@ -230,10 +230,10 @@ def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
 REFUSED = {
     "bumps": (Scene(lumps=(Lump(),)), "the scene has bumps; give one lump of tissue"),
     "none": (Scene(), "the scene has 0 lumps"),
-    "two": (Scene(solid_lumps=(BALL, dataclasses.replace(BALL, x_mm=30.0))), "the scene has 2 lumps"),
+    "two": (Scene(solid_lumps=(BALL, replace(BALL, x_mm=30.0))), "the scene has 2 lumps"),
     "rib": (Scene(solid_lumps=(BALL,), ribs=(Rib(),)), "the scene has a rib"),
-    "flat": (Scene(solid_lumps=(dataclasses.replace(BALL, height_mm=8.0),)), r"lump\[0\].height_mm is 8"),
-    "high": (Scene(solid_lumps=(dataclasses.replace(BALL, seat=2.5),)), "seat is 2.5"),
+    "flat": (Scene(solid_lumps=(replace(BALL, height_mm=8.0),)), r"lump\[0\].height_mm is 8"),
+    "high": (Scene(solid_lumps=(replace(BALL, seat=2.5),)), "seat is 2.5"),
 }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from click.testing import CliRunner
 from in_process import run_here
 
 from tactile_bayes.cli import cli
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
 from tactile_bayes.files.scene_toml import read_scene
 from tactile_bayes.forward.simulate import simulate

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -11,6 +10,7 @@ from subprocess import CompletedProcess
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_truth
 from tactile_bayes.forward import scene as scene_types
@@ -67,7 +67,7 @@ def test_the_empirical_frames_are_eqs_1_to_4() -> None:
 
 
 def test_a_turned_head_has_its_columns_at_different_places() -> None:
-    turned = dataclasses.replace(SCENE, strokes=dataclasses.replace(SCENE.strokes, yaw_deg=20.0))
+    turned = replace(SCENE, strokes=replace(SCENE.strokes, yaw_deg=20.0))
     time = frame_times(turned)[25:26]
     section = plane_section(turned, "plane-strain")
     found = plane_frames(turned, time, section.solved, lump_x_mm=3.0)[0]
@@ -82,7 +82,7 @@ def test_a_turned_head_has_its_columns_at_different_places() -> None:
 
 
 def test_without_a_lump_every_frame_is_that_of_the_layers() -> None:
-    bare = dataclasses.replace(SCENE, solid_lumps=(), body=SceneBody(fat_mm=10.0))
+    bare = replace(SCENE, solid_lumps=(), body=SceneBody(fat_mm=10.0))
     section = plane_section(bare, "plane-strain")
     found = plane_frames(bare, np.array([0.1, 0.15]), section.solved, lump_x_mm=0.0)
     level = level_kpa(bare.background, np.array([0.15]))[0]
@@ -91,7 +91,7 @@ def test_without_a_lump_every_frame_is_that_of_the_layers() -> None:
 
 
 def test_the_truth_names_the_model_and_its_shape() -> None:
-    short = dataclasses.replace(SCENE, duration_s=0.06)
+    short = replace(SCENE, duration_s=0.06)
     for fidelity in ("empirical", "plane-strain"):
         truth = simulate(short, rng=np.random.default_rng(0), fidelity=fidelity).truth
         assert truth["model"] == fidelity
@@ -107,22 +107,22 @@ def test_the_counts_are_the_frames() -> None:
 
 BALL = SolidLump(seat=0.0)
 IMPOSSIBLE = {
-    "two lumps": ({"solid_lumps": (BALL, dataclasses.replace(BALL, x_mm=30.0))}, "the scene has 2 lumps; the .* solid"),
+    "two lumps": ({"solid_lumps": (BALL, replace(BALL, x_mm=30.0))}, "the scene has 2 lumps; the .* solid"),
     "rib": (
         {"ribs": (Rib(),)},
         "the scene has a rib; .* one lump and no rib; use --fidelity solid",
     ),
     "spheroid": (
-        {"solid_lumps": (dataclasses.replace(BALL, height_mm=9.0),)},
+        {"solid_lumps": (replace(BALL, height_mm=9.0),)},
         r"lump\[0\].height_mm is 9; .* circle",
     ),
-    "above the gland": ({"solid_lumps": (dataclasses.replace(BALL, seat=3.0),)}, r"seats lump\[0\] at 3; .* 0 to 2"),
+    "above the gland": ({"solid_lumps": (replace(BALL, seat=3.0),)}, r"seats lump\[0\] at 3; .* 0 to 2"),
     "in the gland": (
-        {"solid_lumps": (dataclasses.replace(BALL, seat=None),), "body": SceneBody(fat_mm=10.0)},
+        {"solid_lumps": (replace(BALL, seat=None),), "body": SceneBody(fat_mm=10.0)},
         r"the gland lies 10 mm deep, which seats lump\[0\] at -0.667",
     ),
     "hardly any skin": (
-        {"solid_lumps": (dataclasses.replace(BALL, depth_ratio=0.515),)},
+        {"solid_lumps": (replace(BALL, depth_ratio=0.515),)},
         r"lump\[0\]: depth_ratio is 0.515",
     ),
     "strokes off the mesh": (
@@ -145,7 +145,7 @@ IMPOSSIBLE = {
 def test_what_two_dimensions_cannot_follow_is_told_in_one_line(name: str, fidelity: str) -> None:
     changes, words = IMPOSSIBLE[name]
     with pytest.raises(BadDataError, match=words) as caught:
-        simulate(dataclasses.replace(SCENE, **changes), rng=np.random.default_rng(0), fidelity=fidelity)
+        simulate(replace(SCENE, **changes), rng=np.random.default_rng(0), fidelity=fidelity)
     assert "\n" not in str(caught.value)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from tactile_bayes.cli import cli
 from tactile_bayes.commands.study import fit_line, table_text
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.gaussian import cell_mean_gaussian

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from posterior_maps import find_bump
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan, read_truth
 from tactile_bayes.files.scene_toml import read_scene, scene_from_toml
@@ -87,8 +87,8 @@ def test_the_counts_are_the_frames() -> None:
 
 
 def test_the_truth_names_the_tissue_and_where_it_lies() -> None:
-    lump = dataclasses.replace(BALL, x_mm=4.0, y_mm=-3.0, seat=1.2)
-    scene = dataclasses.replace(SHORT, duration_s=0.02, solid_lumps=(lump,))
+    lump = replace(BALL, x_mm=4.0, y_mm=-3.0, seat=1.2)
+    scene = replace(SHORT, duration_s=0.02, solid_lumps=(lump,))
     truth = simulate(scene, rng=np.random.default_rng(0)).truth
     assert truth["model"] == "solid"
     assert truth["body"]["fat_mm"] == pytest.approx(24.0)
@@ -99,16 +99,16 @@ def test_the_truth_names_the_tissue_and_where_it_lies() -> None:
 
 
 def test_the_same_seed_gives_the_same_scan_and_tracker_noise_leaves_the_frames() -> None:
-    scene = dataclasses.replace(SHORT, duration_s=0.03, noise=Noise())
+    scene = replace(SHORT, duration_s=0.03, noise=Noise())
     a = simulate(scene, rng=np.random.default_rng(5)).scan
-    late = dataclasses.replace(scene, tracker=Tracker(latency_ms=7.0))
+    late = replace(scene, tracker=Tracker(latency_ms=7.0))
     np.testing.assert_array_equal(simulate(late, rng=np.random.default_rng(5)).scan.frames.counts, a.frames.counts)
 
 
 def test_a_spheroid_and_several_lumps() -> None:
-    flat = dataclasses.replace(BALL, height_mm=8.0)
-    pair = dataclasses.replace(SHORT, duration_s=0.01, solid_lumps=(flat, dataclasses.replace(flat, x_mm=30.0)))
-    alone = dataclasses.replace(pair, solid_lumps=(flat,))
+    flat = replace(BALL, height_mm=8.0)
+    pair = replace(SHORT, duration_s=0.01, solid_lumps=(flat, replace(flat, x_mm=30.0)))
+    alone = replace(pair, solid_lumps=(flat,))
     two, one = (solid_frames(scene, np.array([0.125]))[0] for scene in (pair, alone))
     assert np.abs(two - one).max() > 0.01
 
@@ -220,7 +220,7 @@ def test_the_command_makes_a_solid_scan_whose_truth_stays_in_the_file(run_cli: R
 @pytest.mark.slow
 def test_the_map_of_a_ball_is_the_other_programs() -> None:
     """15 mm, h/d 1, centred, 100 times as stiff: amplitude .30, sigma 5.1 and 4.0 mm in a scan of the other program."""
-    scene = dataclasses.replace(SHORT, duration_s=7.0, strokes=Strokes(tilt_deg=0.1), background=Background())
+    scene = replace(SHORT, duration_s=7.0, strokes=Strokes(tilt_deg=0.1), background=Background())
     made = simulate(scene, rng=np.random.default_rng(1))
     fit = find_bump(build_map(made.scan, normalise="mean"), FitOptions())[-1].fit
     assert fit is not None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -15,6 +14,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from tactile_bayes.commands.study import table_text
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.studies.paper import Geometry, StudyRow
 from tactile_bayes.studies.paper_solid import (

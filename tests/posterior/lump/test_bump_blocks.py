@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from posterior_maps import bump_map
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.bump import BLOCK, LEAST_BLOCK, Bump, block_size
 from tactile_bayes.posterior.detection import ErrorModel
 from tactile_bayes.posterior.fit_window import FitCells, window_cells

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,6 +9,7 @@ from hypothesis import strategies as st
 from posterior_maps import TRUTH, bump_map, bump_values, find_bump, grid_map
 from scipy.special import erf
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import white as fit_module
 from tactile_bayes.posterior.bump import BumpPrior
