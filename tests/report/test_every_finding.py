@@ -267,25 +267,21 @@ OUTPUTS: dict[str, Output] = {
 }
 PRINTERS = {
     # behind the outputs above
-    "api/comparisons", "api/maps", "api/sized", "commands/diagnose", "commands/show", "exports/dicom_map",
-    "exports/dicom_picture", "exports/dicom_report", "exports/fhir", "exports/nrrd_map", "exports/redcap",
-    "files/posterior_nc", "report/campaign_html", "report/compare_document", "report/compare_figure",
-    "report/compare_text", "report/estimate_document", "report/estimate_summary", "report/estimate_text",
-    "report/exam_page", "report/fit_figure", "report/map_figure", "report/map_text", "report/pooled",
-    "report/size_figure",
+    "api/comparing", "api/maps", "api/sized", "commands/diagnose", "commands/show", "exports/dicom",
+    "exports/dicom_map", "exports/fhir", "exports/nrrd", "exports/redcap", "files/posterior_nc",
+    "report/campaign_html", "report/compare", "report/compare_figure", "report/estimate_document",
+    "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map_figure", "report/map_text",
+    "report/pooled",
     # the live view says cautions alone, see below; recorder and import speak of a scan that has no size yet
-    "report/live_text", "report/record_text", "commands/import_", "commands/repair",
+    "report/live", "commands/import_", "commands/repair",
     # of draws, not of a size; names of files that were written
     "report/posterior_figures", "commands/campaign", "commands/demo", "commands/export", "commands/report",
     # of trials, calibrations, devices and studies
-    "api/trials", "commands/calibrate_array", "commands/compare_model", "commands/head", "commands/plan",
-    "commands/population", "commands/simulate", "commands/study", "commands/tables", "commands/tradeoff_forward",
-    "files/repeatability_json", "files/size_json", "files/size_population_json",
-    "files/size_site_json", "pipeline/trial", "presets", "report/calibration_text", "report/eq6_figure",
-    "report/head_figure", "report/head_text", "report/ladder_document", "report/ladder_figure", "report/ladder_text",
-    "report/model_figure", "report/model_text", "report/population_text", "report/repeatability_text",
-    "report/sbc_text", "report/site_text", "report/solid_figures", "report/study_figures", "report/tradeoff_figures",
-    "report/trial_html", "report/trial_text",
+    "api/trial_report", "api/trials", "commands/calibrate", "commands/compare_model", "commands/head",
+    "commands/plan", "commands/population", "commands/simulate", "commands/study", "commands/tables",
+    "commands/tradeoff_forward", "files/repeatability_json", "files/size_json", "presets", "report/calibration",
+    "report/calibration_text", "report/forward_tradeoff", "report/paper_head", "report/sbc", "report/solid_figures",
+    "report/study", "report/tradeoff", "report/trial", "report/trial_html",
 }  # fmt: skip
 
 
