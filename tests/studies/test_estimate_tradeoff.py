@@ -92,7 +92,7 @@ def exact_eq6() -> SizeCalibration:
     """Eq 6 without uncertainty: d = 2 sigma + 1 along both axes."""
     draws = np.tile([2.0, 1.0, 1.0, 0.0, 1e-9, 0.0], (16, 1))
     axis = AxisCalibration(draws, 0.3, {"amplitude": (0.01, 3.0), "sigma_mm": (1.0, 20.0), "d_mm": (1.0, 60.0)})
-    return SizeCalibration(axis, axis, 0.0, Recipe("mean", "fixed", 20.0))
+    return SizeCalibration(axis, axis, 0.0, Recipe("mean", "fixed", 20.0, declared=True))
 
 
 def test_the_reference_has_the_interval_that_theory_gives(monkeypatch: pytest.MonkeyPatch):
